@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, NoReturn
 
 import numpy as np
@@ -126,8 +126,12 @@ class RecordedSource:
     ) -> None:
         if not sweeps:
             raise SceneError("the recording holds no sweep; name a folder or file with raw cubes in it")
-        self.sweeps, self.camera, self.wavelength_nm = tuple(sweeps), camera, wavelength_nm
-        self.field_shape, self.name, self.notes = field_shape, name, tuple(notes)
+        self.sweeps = tuple(sweeps)
+        self.camera = camera
+        self.wavelength_nm = wavelength_nm
+        self.field_shape = field_shape
+        self.name = name
+        self.notes = tuple(notes)
         for one in self.sweeps:
             wanted = (camera.samples // one.sweep.binning, len(wavelength_nm))
             if one.references.dark.shape != wanted:
@@ -151,7 +155,7 @@ class RecordedSource:
         """
         picked = self.pick(sweep)
         for start in range(first, sweep.lines, BLOCK_LINES):
-            yield from self._lines_of(sweep, picked, np.arange(start, min(start + BLOCK_LINES, sweep.lines)))
+            yield from self._lines_of(picked, np.arange(start, min(start + BLOCK_LINES, sweep.lines)))
 
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames of the lines that serve a sweep; raises as `lines`."""
@@ -165,8 +169,9 @@ class RecordedSource:
         """
         if self._own(sweep) is not None:
             return sweep
-        found = (self._nearest(sweep, group) for group in self._groups)
-        place, line, _ = max(found, key=lambda one: np.count_nonzero(one[0] >= 0))
+        place, line, _ = max(
+            (self._nearest(sweep, group) for group in self._groups), key=lambda one: np.count_nonzero(one[0] >= 0)
+        )
         taken = np.flatnonzero(place >= 0)
         if not len(taken):
             return None
@@ -199,8 +204,7 @@ class RecordedSource:
         place, line, _ = min(whole, key=lambda one: round(float(one[2].mean()) / SAME_PX) if sweep.lines else 0)
         order = np.lexsort((line, place))
         place, line = place[order], line[order]
-        again = np.zeros(len(line), np.bool_)
-        again[1:] = (np.diff(place) == 0) & (np.diff(line) == 0)
+        again = (np.diff(place, prepend=-1) == 0) & (np.diff(line, prepend=-1) == 0)
         return PickedLines(place, line, again)
 
     def _own(self, sweep: Sweep) -> int | None:
@@ -276,7 +280,7 @@ class RecordedSource:
             f"{near.binning}, step {near.step}). Ask for lines on the recording's swaths, no finer than recorded"
         )
 
-    def _lines_of(self, sweep: Sweep, picked: PickedLines, numbers: Numbers) -> Iterator[Line]:
+    def _lines_of(self, picked: PickedLines, numbers: Numbers) -> Iterator[Line]:
         """Read some of the picked lines, once for each recorded sweep, and yield them in order."""
         data: dict[int, NDArray[np.uint16]] = {}
         for place in np.unique(picked.place[numbers]):
@@ -300,12 +304,9 @@ class RecordedSource:
     @cached_property
     def _begins_s(self) -> list[float]:
         """Return the start of each sweep, as if all were captured without a break [s]."""
-        begins, after_s = [], 0.0
-        for one in self.sweeps:
-            begins.append(after_s)
-            last = one.time_s[np.isfinite(one.time_s)]
-            after_s += (float(last[-1]) if len(last) else 0.0) + self.camera.frame_ms * 1e-3
-        return begins
+        known = (one.time_s[np.isfinite(one.time_s)] for one in self.sweeps)
+        spans_s = [(float(one[-1]) if len(one) else 0.0) + self.camera.frame_ms * 1e-3 for one in known]
+        return list(accumulate(spans_s[:-1], initial=0.0))
 
 
 def line_runs(numbers: Numbers) -> list[tuple[int, int]]:

@@ -62,8 +62,7 @@ class RecordedPasses:
 
         Its exposure is the camera's, as in every other survey.
         """
-        every_line = [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
-        own = every_line if len(self._kinds) == 1 else []
+        own = [one.sweep for one in self.source.sweeps] if [kind[1:] for kind in self._kinds] == [(1, 1)] else []
         return [replace(one, exposure_ms=None) for one in self.served(planned) or own or planned]
 
     def first_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
@@ -105,7 +104,8 @@ class RecordedPasses:
         """Return sweeps of the planned step and binning on every recorded swath, over its lines."""
         if not planned or len(self._kinds) > 1:  # runs of a fine pass are no scan of the field
             return []
-        like, found = planned[0], list[Sweep]()
+        like = planned[0]
+        found: list[Sweep] = []
         for one in (some for some in self.source.sweeps if some.valid_line.any()):
             scan_px = one.tangents[one.valid_line, 1] / self.source.camera.ifov_rad
             low, high = float(np.nanmin(scan_px)), float(np.nanmax(scan_px))

@@ -51,7 +51,8 @@ def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
 EDGE_PX = 0.05  # of their pixel that the outermost lines and samples of a field may lack
 MOST_BEND = 1 / 16  # largest distance of line centres from their swath, as a fraction of a line's length
 MOST_BACK = 8.0  # line spacings that a scan may go back before it counts as turned
-UNEVEN, MOST_EVEN = 0.1, 0.9  # of the line spacing, and fraction of the lines of a scan with gaps that keep to it
+UNEVEN = 0.1  # of the line spacing: lines off by less keep to it
+MOST_EVEN = 0.9  # of the lines: in a scan with gaps more than this keep to the spacing
 GAP = 1.5  # least distance of two consecutive lines with a gap between them, in line spacings
 STANDING_PX = 1e-3  # a scan that moves less from line to line stands still
 STATED_DIGITS = 6  # of derived coordinates [px], so that a planned sweep comes back as it was
@@ -94,20 +95,21 @@ def fit_sweep(
         )
     lines = np.arange(len(position)) if valid is None else np.flatnonzero(valid)
     if len(lines) < 2:
-        what = f"sweep {name} has too few valid lines ({len(lines)}), a scan takes at least 2"
-        raise SceneError(f"{what}: leave it out, record more lines, or survey its file with --scene")
+        raise SceneError(
+            f"sweep {name} has too few valid lines ({len(lines)}), a scan takes at least 2: leave it out, record more "
+            "lines, or survey its file with --scene"
+        )
     across, scan = (direction_to_scene(position_to_direction(position[lines])) / camera.ifov_rad).T
     distance, note = line_spacing(scan, lines)
     _check_path(name, lines, across, scan, distance, MOST_BEND * camera.samples)
     step = max(round(abs(distance)), 1)
     first = float(np.median(scan - distance * lines))
-    lowest = min(first, first + distance * (len(position) - 1))
     sweep = Sweep(
         name,
         "fine" if step == binning == 1 else "coarse",
         along,
         swath_px=_stated(float(np.median(across))),
-        start_px=_stated(lowest - (step - 1) / 2),
+        start_px=_stated(min(first, first + distance * (len(position) - 1)) - (step - 1) / 2),
         lines=len(position),
         step=step,
         binning=binning,
@@ -123,13 +125,14 @@ def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats
             "positions of a scan, with one sweep for each way that it goes"
         )
     way = scan if apart_px > 0 else -scan
-    back = np.maximum.accumulate(way) - way
-    if (turned := back > MOST_BACK * abs(apart_px)).any():
+    turned = np.maximum.accumulate(way) - way > MOST_BACK * abs(apart_px)
+    if turned.any():
         raise SceneError(
             f"sweep {name} turns back at line {lines[np.argmax(turned)]}; give each way of the scan a sweep of its "
             "own, by a column 'sweep' in the pointing table"
         )
-    swath, bend = float(np.median(across)), np.abs(across - np.median(across))
+    swath = float(np.median(across))
+    bend = np.abs(across - swath)
     if bend.max() > most:
         worst = int(np.argmax(bend))
         raise SceneError(
@@ -145,8 +148,9 @@ def line_spacing(scan: Floats, lines: NDArray[np.intp]) -> tuple[float, str]:
     It is the median over pairs half the scan apart, which averages noise. A gap would change it. If some lines lie
     farther apart and nearly all others are evenly spaced, it is the median of consecutive lines.
     """
-    half, steps = len(lines) // 2, np.diff(scan) / np.diff(lines)
+    half = len(lines) // 2
     distance = float(np.median((scan[half:] - scan[:-half]) / (lines[half:] - lines[:-half])))
+    steps = np.diff(scan) / np.diff(lines)
     near = float(np.median(steps))
     even = float(np.mean(np.abs(steps - near) <= UNEVEN * abs(near)))
     at = int(np.argmax(np.abs(steps)))
@@ -179,7 +183,8 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     if len(axes) != 1:
         raise SceneError("the recording has lines along x and along y; state the field's size in px")
     ends = np.array([-0.5, 0.5]) * camera.samples
-    parts, across = dict[int, list[tuple[float, float]]](), list[float]()
+    parts: dict[int, list[tuple[float, float]]] = {}
+    across: list[float] = []
     for sweep, centres in zip(sweeps, tangents, strict=True):
         known = centres[np.isfinite(centres).all(axis=1)] / camera.ifov_rad
         if not len(known):
@@ -195,10 +200,9 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     if end - begin < 1:
         raise SceneError("the swaths of the recording have no part of the scan in common; state the field's size in px")
     low, high = min(across) + ends[0], max(across) + ends[1]
-    size, centre = (int(end - begin + EDGE_PX), int(high - low + EDGE_PX)), ((begin + end) / 2, (low + high) / 2)
-    if axes == {"y"}:
-        size, centre = size[::-1], centre[::-1]
-    return CoveredField(size, centre)
+    size = (int(end - begin + EDGE_PX), int(high - low + EDGE_PX))
+    centre = ((begin + end) / 2, (low + high) / 2)
+    return CoveredField(size[::-1], centre[::-1]) if axes == {"y"} else CoveredField(size, centre)
 
 
 def flat_camera(camera: LineCamera, extent_px: float) -> LineCamera:

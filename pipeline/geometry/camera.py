@@ -78,9 +78,8 @@ class LineCamera:
 
     def pixel_slopes(self, binning: int = 1) -> NDArray[np.float64]:
         """Return the tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
-        centre = (self.samples - 1) / 2
         middle = (np.arange(self.samples // binning, dtype=np.float64) + 0.5) * binning - 0.5
-        return (middle - centre) * self.ifov_rad
+        return (middle - (self.samples - 1) / 2) * self.ifov_rad
 
     def sample_at(self, slopes: NDArray[np.float64], binning: int = 1) -> NDArray[np.float64]:
         """Return the continuous (binned) sample of each slope, integers at centres: the inverse of ``pixel_slopes``."""
@@ -188,10 +187,10 @@ def expose(
 
 def _convolve(image: NDArray[np.floating], kernel: NDArray[np.float64], axis: int) -> NDArray[np.float32]:
     """Convolve along one axis with the edge pixel repeated outside."""
-    half, pad = len(kernel) // 2, [(0, 0)] * image.ndim
-    pad[axis] = (half, half)
+    half = len(kernel) // 2
+    pad = [(half, half) if other == axis else (0, 0) for other in range(image.ndim)]
     padded = np.pad(image.astype(np.float32, copy=False), pad, mode="edge")
-    size, out = image.shape[axis], np.zeros(image.shape, np.float32)
+    out = np.zeros(image.shape, np.float32)
     for offset, weight in enumerate(kernel):
-        out += np.float32(weight) * np.take(padded, range(offset, offset + size), axis=axis)
+        out += np.float32(weight) * np.take(padded, range(offset, offset + image.shape[axis]), axis=axis)
     return out

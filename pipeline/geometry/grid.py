@@ -67,7 +67,8 @@ def cuts(size: int, step: int) -> Iterator[slice]:
 
 def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDArray[Kind]:
     """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; ``beyond`` fills the rest."""
-    (rows, columns), p = grid.patch_shape, grid.patch
+    rows, columns = grid.patch_shape
+    p = grid.patch
     padded = np.full(grid.padded_shape, beyond, image.dtype)
     padded[: grid.height, : grid.width] = image
     return padded.reshape(rows, p, columns, p).transpose(0, 2, 1, 3).reshape(rows * columns, p, p)
@@ -75,13 +76,13 @@ def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDAr
 
 def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
     """Extend the first two axes to ``shape`` by reflection; one single pixel is repeated."""
-    grown = image
     for axis, size in enumerate(shape):
-        while grown.shape[axis] < size:
-            have, pad = grown.shape[axis], [(0, 0)] * image.ndim
+        while image.shape[axis] < size:
+            have = image.shape[axis]
+            pad = [(0, 0)] * image.ndim
             pad[axis] = (0, size - have if have < 2 else min(size - have, have - 1))
-            grown = np.pad(grown, pad, mode="edge" if have < 2 else "reflect")
-    return grown
+            image = np.pad(image, pad, mode="edge" if have < 2 else "reflect")
+    return image
 
 
 def block_means(values: NDArray[np.float32], times: int) -> NDArray[np.float32]:

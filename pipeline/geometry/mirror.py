@@ -163,14 +163,16 @@ def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats)
     :func:`line_centre` for the same point.
     """
     c = np.asarray(across, _kept(along, scan, across))
-    r, ahead = np.sqrt(1 + c * c + centre * centre), 1 + along * c + scan * centre
+    r = np.sqrt(1 + c * c + centre * centre)
+    ahead = 1 + along * c + scan * centre
     slope: Floats = (along * r - (ahead - scan * r) * c / (r - centre)) / ahead
     return slope
 
 
 def _one_minus_z(o: Floats) -> Floats:
     """Return 1 - o_z of unit vectors without cancellation; PoseError where it is 0."""
-    z, across = o[..., 2], o[..., 0] ** 2 + o[..., 1] ** 2
+    z = o[..., 2]
+    across = o[..., 0] ** 2 + o[..., 1] ** 2
     _refuse((o[..., 0] == 0) & (o[..., 1] == 0) & (z > 0), o, "is the camera's own ray, which no mirror makes")
     return np.where(z > 0, across / (1 + np.maximum(z, 0)), 1 - z)
 
@@ -245,9 +247,8 @@ class Mounting:
         model = check_reach(position)
         if self == STRAIGHT:
             return model
-        device = model @ self._matrix().T + (self.offset_x, self.offset_y)
         try:
-            return check_reach(device)
+            return check_reach(model @ self._matrix().T + (self.offset_x, self.offset_y))
         except PoseError as error:
             raise PoseError(
                 f"as mounted (offset {self.offset_x:g}; {self.offset_y:g}), the device's {error}; survey less of the "

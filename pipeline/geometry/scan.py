@@ -156,7 +156,8 @@ def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slop
     N = sqrt(1 + xi0^2 + e^2) and q = N - e. The line is eta = e + (xi - xi0) xi0 / q; its slope is tan psi.
     """
     xi0 = swath_px * camera.ifov_rad
-    e, u = np.asarray(scan_px, np.float64) * camera.ifov_rad, np.asarray(slope, np.float64)
+    e = np.asarray(scan_px, np.float64) * camera.ifov_rad
+    u = np.asarray(slope, np.float64)
     size = np.sqrt(1 + xi0**2 + e**2)
     q = np.where(e > 0, (1 + xi0**2) / (size + np.maximum(e, 0)), size - np.minimum(e, 0))  # nothing cancels
     d = u * size * q / (q - u * xi0)
@@ -195,11 +196,6 @@ class Load:
         """Return the number of pairs in the memory."""
         return self.parts[-1].pairs[1]
 
-    def channels(self, part: MemoryPart) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Return the cells (start, stop) of a part's X and of its Y in the vector, half open."""
-        start, stop = part.pairs
-        return (start, stop), (self.pairs + start, self.pairs + stop)
-
 
 def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int, *, lead: int = 0) -> list[Load]:
     """Lay the positions of sweeps into a memory of ``vector_pairs`` pairs, each load as full as whole lines allow.
@@ -223,11 +219,13 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int, *, lead: int = 0) -
             room = (vector_pairs - lead - used) // sweep.positions
             if room == 0:
                 loads.append(Load(tuple(parts)))
-                parts, used = [], 0
+                parts = []
+                used = 0
                 continue
             taken = min(room, sweep.lines - line)
             parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.positions)))
-            line, used = line + taken, used + taken * sweep.positions
+            line += taken
+            used += taken * sweep.positions
     return [*loads, Load(tuple(parts))] if parts else loads
 
 

@@ -90,7 +90,8 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
     width, depth = np.ptp(away, axis=0).tolist()
     places = (np.linspace(at[0] - 0.5, at[-1] + 0.5, SAMPLES) for at in pixel_places(shape))
     points = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1)
-    sink, length = view.sink(points), np.sqrt(1 + np.sum((points * view.ifov_rad) ** 2, axis=-1))
+    sink = view.sink(points)
+    length = np.sqrt(1 + np.sum((points * view.ifov_rad) ** 2, axis=-1))
     ranges = (length * view.height_m)[sink >= least] / sink[sink >= least]  # from the pivot to the ground
     near, middle, far = float(ranges.min()), float(np.median(ranges)), float(ranges.max())
     x, y = corners.T
@@ -195,7 +196,8 @@ class PosedField:
 
     @property
     def outline(self) -> BaseGeometry:
-        seen, frame = shapely.segmentize(self._seen(0.0), max(self.shape) / EDGE_PARTS), self.grid.frame
+        seen = shapely.segmentize(self._seen(0.0), max(self.shape) / EDGE_PARTS)
+        frame = self.grid.frame
         return shapely.transform(seen, lambda points: frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1])))
 
     def _seen(self, border_px: float) -> BaseGeometry:

@@ -96,8 +96,9 @@ def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
     """Return the geocentric step (..., X, Y or Z, x or y) [m] of one unit of the map, at places in pixels."""
     assert geobox.crs is not None
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
-    geodetic, ellipsoid = crs.geodetic_crs, crs.get_geod()
+    geodetic = crs.geodetic_crs
     assert geodetic is not None
+    ellipsoid = crs.get_geod()
     assert ellipsoid is not None
     to_geodetic = pyproj.Transformer.from_crs(crs, geodetic, always_xy=True)
     a, b, c, d, e, f = geobox.affine[:6]
@@ -108,8 +109,9 @@ def _metres_of_units(geobox: GeoBox, column: Any, row: Any) -> Floats:
         lon, lat = np.multiply(to_geodetic.transform(x + dx, y + dy), geodetic.axis_info[0].unit_conversion_factor)
         normal = ellipsoid.a / np.sqrt(1 - ellipsoid.es * np.sin(lat) ** 2)  # radius of curvature
         across = normal * np.cos(lat)
-        places = across * np.cos(lon), across * np.sin(lon), (1 - ellipsoid.es) * normal * np.sin(lat)
-        return np.stack(places, axis=-1)
+        return np.stack(
+            [across * np.cos(lon), across * np.sin(lon), (1 - ellipsoid.es) * normal * np.sin(lat)], axis=-1
+        )
 
     return np.stack([place(*one) - place(-one[0], -one[1]) for one in ((step, 0.0), (0.0, step))], axis=-1) / (2 * step)
 

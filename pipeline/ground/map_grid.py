@@ -40,8 +40,7 @@ def default_epsg(pose: RigPose) -> int:
     south, north = UTM_LATITUDES
     if not south <= pose.lat_deg <= north:
         return POLAR[pose.lat_deg > 0]
-    zone = int((pose.lon_deg + 180) % 360 // 6) + 1
-    return (32600 if pose.lat_deg >= 0 else 32700) + zone
+    return (32600 if pose.lat_deg >= 0 else 32700) + int((pose.lon_deg + 180) % 360 // 6) + 1
 
 
 def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
@@ -57,25 +56,16 @@ def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
         raise PoseError(f"there is no EPSG:{code}; give the code of a projected CRS in metres, or {hint}") from None
     if not crs.is_projected or any(axis.unit_conversion_factor != 1 for axis in crs.axis_info[:2]):
         raise PoseError(f"EPSG:{code} ({crs.name}) is no projected CRS in metres; {hint}")
-    if not _made_for(crs, pose):
-        assert crs.area_of_use is not None
+    if crs.area_of_use is not None:
         west, south, east, north = crs.area_of_use.bounds
-        raise PoseError(
-            f"EPSG:{code} ({crs.name}) is made for longitudes {west:g} to {east:g}, latitudes {south:g} to {north:g}; "
-            f"the rig stands at lon_deg {pose.lon_deg:g}, lat_deg {pose.lat_deg:g}; {hint}"
-        )
+        # the area may cross the date line
+        beside = (pose.lon_deg - west + AREA_SLACK_DEG) % 360 > ((east - west) % 360 or 360.0) + 2 * AREA_SLACK_DEG
+        if beside or not south - AREA_SLACK_DEG <= pose.lat_deg <= north + AREA_SLACK_DEG:
+            raise PoseError(
+                f"EPSG:{code} ({crs.name}) is made for longitudes {west:g} to {east:g}, latitudes {south:g} to "
+                f"{north:g}; the rig stands at lon_deg {pose.lon_deg:g}, lat_deg {pose.lat_deg:g}; {hint}"
+            )
     return crs
-
-
-def _made_for(crs: pyproj.CRS, pose: RigPose) -> bool:
-    """Return whether the rig is in the CRS's area of use, which may cross the date line."""
-    if crs.area_of_use is None:
-        return True
-    west, south, east, north = crs.area_of_use.bounds
-    if not south - AREA_SLACK_DEG <= pose.lat_deg <= north + AREA_SLACK_DEG:
-        return False
-    width = (east - west) % 360 or 360.0
-    return (pose.lon_deg - west + AREA_SLACK_DEG) % 360 <= width + 2 * AREA_SLACK_DEG
 
 
 @dataclass(frozen=True)
@@ -197,7 +187,13 @@ def ground_grid(
             "and slope_deg"
         )
     least = least_mapped_sink(view, scene_shape)
-    left, bottom, right, top = _bounds(frame, view.outline_px(scene_shape, least))
+    outline = view.outline_px(scene_shape, least)  # its sides are lines on the ground, and curved on the map
+    sides = outline + np.linspace(0, 1, EDGE_POINTS)[:, None, None] * (np.roll(outline, -1, axis=0) - outline)
+    places = frame.ground_to_map(view.scene_to_ground(sides.reshape(-1, 2)))
+    if not np.isfinite(places).all():
+        raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {view.pose})")
+    left, bottom = places.min(axis=0).tolist()
+    right, top = places.max(axis=0).tolist()
     growth = USUAL_GROWTH if resolution_m is None else MOST_GROWTH
     finest = float(np.sqrt((right - left) * (top - bottom) / (growth * scene_shape[0] * scene_shape[1])))
     median = median_footprint_m(view, scene_shape)
@@ -245,23 +241,10 @@ def round_step(step_m: float) -> float:
     return float(f"{ROUND_STEPS[int(np.argmin(ratios))]:g}e{power}")
 
 
-def _bounds(frame: MapFrame, outline: Floats) -> tuple[float, float, float, float]:
-    """Return the box on the map around part of a scene, given by its corners [px].
-
-    Lines of the scene are lines on the ground.
-    """
-    sides = outline + np.linspace(0, 1, EDGE_POINTS)[:, None, None] * (np.roll(outline, -1, axis=0) - outline)
-    places = frame.ground_to_map(frame.view.scene_to_ground(sides.reshape(-1, 2)))
-    if not np.isfinite(places).all():
-        raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {frame.view.pose})")
-    left, bottom = places.min(axis=0).tolist()
-    right, top = places.max(axis=0).tolist()
-    return left, bottom, right, top
-
-
 def _between(exact: Floats, pixels: slice, axis: int) -> Floats:
     """Interpolate values at tie points linearly to the centres of the pixels along one axis."""
-    count, last = pixels.stop - pixels.start, exact.shape[axis] - 1
+    count = pixels.stop - pixels.start
+    last = exact.shape[axis] - 1
     place = (np.arange(count) + 0.5) * (last / count)
     index = np.minimum(place.astype(np.intp), last - 1)
     fraction = np.expand_dims(place - index, [other for other in range(exact.ndim) if other != axis])

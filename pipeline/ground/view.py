@@ -70,8 +70,10 @@ class RigPose:
         for name, words in misfits(self):
             raise PoseError(f"the rig's pose: {name} {words}")
         if (self.height_m is None) == (self.range_m is None):
-            got = f"height_m = {self.height_m}, range_m = {self.range_m}"
-            raise PoseError(f"the rig's pose needs height_m or range_m, one of the two; got {got}")
+            raise PoseError(
+                "the rig's pose needs height_m or range_m, one of the two; got "
+                f"height_m = {self.height_m}, range_m = {self.range_m}"
+            )
 
     def __str__(self) -> str:
         return ", ".join(f"{name} {value:g}" for name, value in asdict(self).items() if value is not None)
@@ -168,8 +170,10 @@ class GroundView:
         y, x = pixel_places(scene_shape)
         across = self.ifov_rad * self.sinks[1] * x
         down = self.sinks[0] + self.ifov_rad * self.sinks[2] * y
-        blocks = (down[first : first + ROWS_AT_ONCE, None] for first in range(0, len(y), ROWS_AT_ONCE))
-        return sum(int(np.count_nonzero(block + across > least_sink)) for block in blocks)
+        return sum(
+            int(np.count_nonzero(down[first : first + ROWS_AT_ONCE, None] + across > least_sink))
+            for first in range(0, len(y), ROWS_AT_ONCE)
+        )
 
     def outline_px(self, scene_shape: tuple[int, int], least_sink: float) -> Floats:
         """Return the corners (corner, 2) [px] of the part of a scene that sinks by ``least_sink`` or more, in order."""

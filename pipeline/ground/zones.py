@@ -59,11 +59,11 @@ def _unwrapped(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
     """Return a polygon with longitudes within 180 degrees of ``middle_deg``; unchanged if that is None."""
     if middle_deg is None:
         return shape
-
-    def wrapped(places: Floats) -> Floats:
-        return np.column_stack([(places[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg, places[:, 1:]])
-
-    return shapely.make_valid(shapely.transform(shape, wrapped))
+    return shapely.make_valid(
+        shapely.transform(
+            shape, lambda at: np.column_stack([(at[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg, at[:, 1:]])
+        )
+    )
 
 
 def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
@@ -147,9 +147,8 @@ def figures_of_plot(
 ) -> PlotFigures:
     """Return the figures of a plot whose outline is in pixels of a (y, x) class map. Plots may overlap."""
     rows, columns = _window(shape, classes.shape)
-    size = rows.stop - rows.start, columns.stop - columns.start
-    inside = pixels_inside([shape], size, origin=(rows.start, columns.start))
     drawn = classes[rows, columns]
+    inside = pixels_inside([shape], drawn.shape, origin=(rows.start, columns.start))
     mapped = inside & (drawn != UNLABELLED)
     ground = place.pixel_areas_m2(rows, columns)
     weight = np.where(mapped, 1.0 if ground is None else np.nan_to_num(ground), 0.0)

@@ -110,8 +110,7 @@ def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArra
 
     The rays at mid exposure are exact, with line rotation and stretch.
     """
-    height, width = shape
-    across, scan = (width, height) if sweep.along == "x" else (height, width)
+    across, scan = shape[::-1] if sweep.along == "x" else shape
     along_px, scan_px = sweep_to_scene(sweep, camera)
     inside = np.ones(along_px.shape, bool)
     for place, size in ((along_px, across), (scan_px, scan)):
@@ -139,8 +138,7 @@ def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overl
     name = "full" if step == 1 else "coarse"
     sweeps = []
     for number, swath in enumerate(_swath_centres((low, high), scan, camera, step, overlap_px)):
-        ends = swath + reach_px(swath, scan, camera, step)
-        seen = np.clip(ends, low + step / 2, high - step / 2)
+        seen = np.clip(swath + reach_px(swath, scan, camera, step), low + step / 2, high - step / 2)
         start, lines = _scan_range(float(swath), seen, scan, camera, step)
         sweeps.append(Sweep(f"{name}-{number}", kind, along, float(swath), start, lines, step, step))
     check_reach(sweeps, camera)
@@ -175,8 +173,7 @@ def _swath_centres(
 
 def reach_px(swath: float, scan: int, camera: LineCamera, binning: int) -> NDArray[np.float64]:
     """Return the least distance from a line's centre to the edges of its samples, (2,) below and above 0 [px]."""
-    count = camera.samples // binning
-    edges = np.array([-camera.samples / 2, count * binning - camera.samples / 2]) * camera.ifov_rad
+    edges = (np.array([0, camera.samples // binning * binning]) - camera.samples / 2) * camera.ifov_rad
     probes = np.append(np.linspace(-scan / 2, scan / 2, _PROBES), 0.0)
     along, _ = points_of_scan(swath, camera, probes[:, None], edges)
     return np.array([along[:, 0].max(), along[:, 1].min()]) - swath
@@ -258,7 +255,8 @@ def _corners_on(
 
     Both are monotone in either coordinate, so that a rectangle's corners hold its extremes.
     """
-    origin, size = grid.patch_origin(patch_index), np.array([grid.height, grid.width])
+    origin = grid.patch_origin(patch_index)
+    size = np.array([grid.height, grid.width])
     low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2
     along, scan = (1, 0) if sweep.along == "x" else (0, 1)
     corners_along = np.stack([low, low, high, high])[..., along]

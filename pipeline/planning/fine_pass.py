@@ -7,7 +7,7 @@ numbers count the positions of the full scan, 1 px apart.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -90,7 +90,8 @@ class SecondPass:
     def rows(self) -> PatchRows:
         """Return the rows of patches of the field in these sweeps: with the margin, from old line to old line."""
         found = PatchRows.of(self.swaths, self.grid, self.camera)
-        margin, apart = math.ceil(self.margin_px), self._apart
+        margin = math.ceil(self.margin_px)
+        apart = self._apart
         lines = np.array([sweep.lines for sweep in self.swaths])[:, None]
         first = np.maximum(found.first - margin, 0) // apart * apart
         stop = np.minimum(-(-(found.stop + margin - 1) // apart) * apart + 1, lines)
@@ -103,23 +104,25 @@ class SecondPass:
         """
 
         def sweeps_of(runs: Sequence[LineRun]) -> list[Sweep]:
-            found = [self._run(*run) for run in sorted(runs)]  # in the order of their names
+            found = [
+                replace(some_lines(self.swaths[number], first, stop), name=f"{self.swaths[number].name}-{first:05d}")
+                for number, first, stop in sorted(runs)  # in the order of their names
+            ]
             return lines_between(found, self._between, step=step, exposure_ms=exposure_ms)
 
         exposed = self.camera if exposure_ms is None else replace(self.camera, exposure_ms=exposure_ms)
-        new = 1 / step - (1 / self._apart if self.interlaces else 0)
-        sweeps_a_run = math.log2(self._apart / step) if self.interlaces else 1
         times = RunTimes(
-            exposed.frame_ms * 1e-3 * new,
-            self.cost.setup_seconds(exposed) * sweeps_a_run,
+            exposed.frame_ms * 1e-3 * (1 / step - (1 / self._apart if self.interlaces else 0)),  # of the new lines
+            self.cost.setup_seconds(exposed) * (math.log2(self._apart / step) if self.interlaces else 1),
             lambda runs: self.cost.seconds(sweeps_of(runs), self.camera),
         )
         chosen = choose_runs(self.rows, np.where(gain > 0, gain, 0.0), times, seconds=self.seconds, several=True)
         if chosen is None:
             return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
-        sweeps, patch_index = sweeps_of(chosen.runs), self.rows.patches(chosen.runs)
+        sweeps = sweeps_of(chosen.runs)
         if self.recorded is not None:
             sweeps = self.recorded(sweeps)
+        patch_index = self.rows.patches(chosen.runs)
         whole = len(patch_index) == np.count_nonzero(self.rows.row >= 0)
         what = "the whole field" if whole else f"{len(patch_index)} patches"
         reason = f"captured again: {what}, {format_scan(step, exposed.exposure_ms)}"
@@ -134,10 +137,11 @@ class SecondPass:
         """
         first = self.first_pass[0]
         shortest, longest = record.offered_ms(self.camera)
-        first_ms, plans = exposing(self.camera, first).exposure_ms, list[FinePlan]()
+        first_ms = exposing(self.camera, first).exposure_ms
         # Lines that score less than those of the first pass would replace better ones.
         known = first.step in record.steps
         least = record.expected(first.step, float(np.clip(first_ms, shortest, longest)))[MIOU] if known else 0.0
+        plans: list[FinePlan] = []
         for step in (step for step in record.steps if step < first.step):
             every = lines_between(self.full, self._between, step=step)
             last = longest_exposure(self.seconds, every, self.camera, self.cost, shortest, longest)
@@ -166,10 +170,6 @@ class SecondPass:
     def _apart(self) -> int:
         """Return the distance of the lines that new ones lie between; 1 with pointing errors."""
         return self.first_pass[0].step if self.interlaces else 1
-
-    def _run(self, number: int, first: int, stop: int) -> Sweep:
-        swath = self.swaths[number]
-        return replace(some_lines(swath, first, stop), name=f"{swath.name}-{first:05d}")
 
 
 def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
@@ -202,19 +202,18 @@ def lines_between(
         if coarse is None:
             held = None if step == 1 else 1
             found.append(replace(run, lines=-(-run.lines // step), step=step, held=held, exposure_ms=exposure_ms))
-        else:
-            found += _filling(run, coarse, step, exposure_ms)
+            continue
+        low = round(run.start_px - coarse.start_px)
+        first = max(low // coarse.step, 0)
+        stop = min(-(-(low + run.lines - 1) // coarse.step), coarse.lines - 1)  # the coarse line that the run ends at
+        apart = coarse.step
+        spaces = stop - first
+        while apart > step and spaces > 0:  # each sweep halves the distance of the lines
+            start = coarse.start_px + first * coarse.step + apart / 2
+            name = f"{run.name}-{apart // 2}"
+            found.append(
+                replace(run, name=name, start_px=start, lines=spaces, step=apart, held=1, exposure_ms=exposure_ms)
+            )
+            apart //= 2
+            spaces *= 2
     return found
-
-
-def _filling(run: Sweep, coarse: Sweep, step: int, exposure_ms: float | None) -> Iterator[Sweep]:
-    """Yield the sweeps that halve the distance of a pass's lines along a run until it is ``step``."""
-    low = round(run.start_px - coarse.start_px)
-    first = max(low // coarse.step, 0)
-    stop = min(-(-(low + run.lines - 1) // coarse.step), coarse.lines - 1)  # the coarse line that the run ends at
-    apart, spaces = coarse.step, stop - first
-    while apart > step and spaces > 0:
-        start = coarse.start_px + first * coarse.step + apart / 2
-        name = f"{run.name}-{apart // 2}"
-        yield replace(run, name=name, start_px=start, lines=spaces, step=apart, held=1, exposure_ms=exposure_ms)
-        apart, spaces = apart // 2, 2 * spaces

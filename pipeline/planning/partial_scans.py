@@ -91,7 +91,8 @@ def _nearest_sweep(
     sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, patch_index: NDArray[np.intp]
 ) -> NDArray[np.intp]:
     """Return (patch,) the sweep whose lines have their middle nearest to that of a patch; -1 if none shows it."""
-    size, origin = np.array([grid.height, grid.width]), grid.patch_origin(patch_index)
+    size = np.array([grid.height, grid.width])
+    origin = grid.patch_origin(patch_index)
     middle = (origin + np.minimum(origin + grid.patch, size)) / 2 - size / 2
     along, scan = (1, 0) if sweeps[0].along == "x" else (0, 1)
     beside = np.full((len(sweeps), len(patch_index)), np.inf)
@@ -99,8 +100,7 @@ def _nearest_sweep(
         at = scene_to_sweep(sweep, camera, middle[:, along], middle[:, scan])
         half = camera.samples / sweep.binning / 2
         off = np.abs(at[:, 1] - (half - 0.5)) / half
-        on_it = (off <= 1) & (at[:, 0] >= -0.5) & (at[:, 0] <= sweep.lines - 0.5)
-        beside[number] = np.where(on_it, off, np.inf)
+        beside[number] = np.where((off <= 1) & (at[:, 0] >= -0.5) & (at[:, 0] <= sweep.lines - 0.5), off, np.inf)
     return np.where(np.isfinite(beside.min(axis=0)), beside.argmin(axis=0), -1)
 
 
@@ -166,7 +166,8 @@ def choose_runs(
         if scan.seconds > seconds:
             low = price
         else:
-            high, best = price, scan
+            high = price
+            best = scan
     while (filled := _filled(rows, values, times, seconds, best)).expected_gain > best.expected_gain:
         best = filled
     return best if best.runs else None
@@ -186,7 +187,8 @@ def _filled(rows: PatchRows, values: Floats, times: RunTimes, seconds: float, sc
         if run is None:
             continue
         runs = tuple(sorted([*beside, (number, *run)]))
-        gain, taken_s = float(values[rows.within(runs)].sum()), times.seconds(runs)
+        gain = float(values[rows.within(runs)].sum())
+        taken_s = times.seconds(runs)
         if gain > best.expected_gain and taken_s <= seconds:
             best = PartialScan(runs, taken_s, gain)
     return best
@@ -208,10 +210,11 @@ def _longest_run(values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp]
 
 def _runs_at_price(rows: PatchRows, values: Floats, times: RunTimes, price: float, *, several: bool) -> PartialScan:
     """Return the best runs of each sweep at a price of a second in the unit of ``values``."""
-    line_price, run_price, runs = price * times.line_s, price * times.run_s, list[LineRun]()
+    prices = (price * times.line_s, price * times.run_s)
+    runs: list[LineRun] = []
     for number, (row, first, stop, there) in enumerate(zip(values, rows.first, rows.stop, rows.there, strict=True)):
         spans = zip(row[there].tolist(), first[there].tolist(), stop[there].tolist(), strict=True)
-        runs += [(number, *run) for run in _best_runs(spans, line_price, run_price, several=several)]
+        runs += [(number, *run) for run in _best_runs(spans, *prices, several=several)]
     return PartialScan(tuple(runs), times.seconds(runs), float(values[rows.within(runs)].sum()))
 
 
@@ -240,10 +243,9 @@ def cheapest_row_seconds(
     rows: PatchRows, expected_gain: Floats, camera: LineCamera, cost: CostModel, exposure_ms: float
 ) -> float:
     """Return the seconds of the fastest capture of a single row of patches with a gain; inf if no line shows any."""
-    gaining = rows.sums(expected_gain) > 0
     prices = [
         cost.seconds([replace(sweep, lines=int(lines[there].min()), exposure_ms=exposure_ms)], camera)
-        for sweep, lines, there in zip(rows.sweeps, rows.stop - rows.first, gaining, strict=True)
+        for sweep, lines, there in zip(rows.sweeps, rows.stop - rows.first, rows.sums(expected_gain) > 0, strict=True)
         if there.any()
     ]
     return min(prices, default=math.inf)

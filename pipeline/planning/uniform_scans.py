@@ -146,10 +146,14 @@ def priced_scan(
     """Return one scan with its costs and scores, by its sweeps and an exposure, of a step that the record has."""
     step = sweeps[0].step
     exposed = [replace(sweep, exposure_ms=exposure_ms) for sweep in sweeps]
-    size = raw_bytes(exposed, camera, bands)
-    expected = record.expected(step, exposure_ms)
-    spread = None if record.spread is None else record.between(record.spread, step, exposure_ms)
-    return UniformScan(step, exposure_ms, cost.seconds(exposed, camera), size, expected, spread)
+    return UniformScan(
+        step,
+        exposure_ms,
+        cost.seconds(exposed, camera),
+        raw_bytes(exposed, camera, bands),
+        record.expected(step, exposure_ms),
+        None if record.spread is None else record.between(record.spread, step, exposure_ms),
+    )
 
 
 def exposures_between(shortest: float, longest: float) -> list[float]:

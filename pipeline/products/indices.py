@@ -126,10 +126,13 @@ def find_index(name: str) -> SpectralIndex:
 
 def _listed(name: str) -> SpectralIndex:
     """Return an index of spyndex's list with its constants."""
-    about, bands, constants = spyndex.indices[name], [], {}
+    about = spyndex.indices[name]
+    bands: list[IndexBand] = []
+    constants: dict[str, float] = {}
     for symbol in about.bands:
         if symbol in spyndex.bands:
-            band, centre = spyndex.bands[symbol], _centre_nm(name, symbol)
+            band = spyndex.bands[symbol]
+            centre = _centre_nm(name, symbol)
             bands.append(IndexBand(symbol, band.long_name, centre, band.min_wavelength, band.max_wavelength))
         elif symbol.startswith(LAMBDA):  # of a band that the index itself may not want, as red in FDI
             constants[symbol] = _centre_nm(name, symbol.removeprefix(LAMBDA))
@@ -162,24 +165,20 @@ def pick_bands(index: SpectralIndex, wavelength_nm: ArrayLike) -> tuple[int, ...
     Raises WavelengthError: the cube has no wavelength in the range of one; names it, and the cube's wavelengths.
     """
     there = np.asarray(wavelength_nm, np.float64)
-    numbers, missing = [], []
-    for band in index.bands:
-        away = np.where((there >= band.low_nm) & (there <= band.high_nm), np.abs(there - band.centre_nm), np.inf)
-        numbers.append(int(np.argmin(away)))
-        if not np.isfinite(away.min()):
-            missing.append(band)
+    away = [
+        np.where((there >= band.low_nm) & (there <= band.high_nm), np.abs(there - band.centre_nm), np.inf)
+        for band in index.bands
+    ]
+    missing = [band for band, off_nm in zip(index.bands, away, strict=True) if not np.isfinite(off_nm.min())]
     if missing:
+        bands = f"bands lie at {', '.join(f'{one:g}' for one in there)} nm"
+        if len(there) > 6:
+            bands = f"{len(there)} bands lie from {there.min():g} to {there.max():g} nm"
         raise WavelengthError(
-            f"{index.name} wants {' and '.join(map(str, missing))}, and the cube has no such band: "
-            f"{_spread(there)}; leave {index.name} out of --indices"
+            f"{index.name} wants {' and '.join(map(str, missing))}, and the cube has no such band: its {bands}; leave "
+            f"{index.name} out of --indices"
         )
-    return tuple(numbers)
-
-
-def _spread(wavelength_nm: NDArray[np.float64]) -> str:
-    if len(wavelength_nm) <= 6:
-        return f"its bands lie at {', '.join(f'{one:g}' for one in wavelength_nm)} nm"
-    return f"its {len(wavelength_nm)} bands lie from {wavelength_nm.min():g} to {wavelength_nm.max():g} nm"
+    return tuple(int(np.argmin(off_nm)) for off_nm in away)
 
 
 def index_values(

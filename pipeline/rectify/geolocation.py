@@ -37,11 +37,6 @@ class KnotCurve:
     scan_path: ScanPath
 
     @cached_property
-    def even(self) -> bool:
-        """Return whether the knot coordinate has a closed form."""
-        return self.scan_path.straight and self.scan_path.uniform
-
-    @cached_property
     def scan(self) -> Floats:
         """Return (4, interval) polynomials of the tangent on the scan axis; interval k + 1 begins at knot k."""
         return _catmull_rom_pieces(self.scan_path.scan, self.scan_path.width)
@@ -54,7 +49,8 @@ class KnotCurve:
     def at(self, knot: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return scan tangent, its slope, tangent along the line, and its slope, at (n,) finite knot coordinates."""
         interval = np.clip(np.floor(knot), -1, len(self.scan_path) - 1)
-        u, number = knot - interval, interval.astype(np.intp) + 1
+        u = knot - interval
+        number = interval.astype(np.intp) + 1
         found: list[Floats] = []
         for pieces in (self.scan, self.across):
             piece = pieces[:, number]
@@ -85,8 +81,7 @@ def drop_unseen(found: Floats, seen: NDArray[np.bool_], samples: int) -> None:
     knot, sample = found[..., 0], found[..., 1]
     on = (knot >= -0.5) & (knot <= len(seen) - 0.5) & (sample >= -0.5) & (sample <= samples - 0.5)
     if not seen.all():
-        nearest = np.floor(np.where(on, knot, 0) + 0.5).astype(np.intp)
-        on &= seen[np.clip(nearest, 0, len(seen) - 1)]
+        on &= seen[np.clip(np.floor(np.where(on, knot, 0) + 0.5).astype(np.intp), 0, len(seen) - 1)]  # the nearest knot
     if not on.all():
         found[~on] = np.nan
 
@@ -97,9 +92,10 @@ def _knot_and_sample(curve: KnotCurve, camera: LineCamera, a: Floats, b: Floats,
     Extrapolated beyond the scan path's ends and the line's; NaN where no line passes or no solution was found.
     """
     scan_path = curve.scan_path
-    if curve.even:
+    if scan_path.straight and scan_path.uniform:  # the knot coordinate has a closed form
         across = np.float64(scan_path.across[len(scan_path) // 2])
-        centre, found = line_centre(a, b, across), np.empty((len(a), 2))
+        centre = line_centre(a, b, across)
+        found = np.empty((len(a), 2))
         np.multiply(centre - scan_path.scan[0], 1 / scan_path.width, out=found[:, 0])
         found[:, 1] = camera.sample_at(camera_slope(a, b, across, centre), binning)
         return found
@@ -130,8 +126,7 @@ def _catmull_rom_pieces(knots: Floats, alone: float) -> Floats:
 
 def _find_knots(curve: KnotCurve, a: Floats, b: Floats, tolerance: float) -> Floats:
     """Return the knot coordinate (n,) of the line that sees each point: by Newton, or by bisection if that fails."""
-    scan_path = curve.scan_path
-    rough = curve.rough_knot(line_centre(a, b, np.full_like(a, scan_path.across[len(scan_path) // 2])))
+    rough = curve.rough_knot(line_centre(a, b, np.full_like(a, curve.scan_path.across[len(curve.scan_path) // 2])))
     knot = rough.copy()
     left = np.flatnonzero(np.isfinite(knot))
     for turn in range(NEWTON_ROUNDS + 1):
@@ -154,7 +149,8 @@ def _miss(curve: KnotCurve, a: Floats, b: Floats, knot: Floats) -> tuple[Floats,
     reach = 1 + a * a - (a - across) ** 2
     reach = np.where(reach > 0, reach, np.nan)
     root = np.sqrt(reach + b * b)
-    product, grown = across * (across - a), (b + root) / reach
+    product = across * (across - a)
+    grown = (b + root) / reach
     need_slope = (2 * across - a) * grown + product * 2 * (a - across) * (0.5 / root - grown) / reach
     return scan - (b + product * grown), scan_slope - need_slope * across_slope
 
@@ -163,14 +159,15 @@ def _bisect(curve: KnotCurve, a: Floats, b: Floats, rough: Floats) -> Floats:
     """Halve the interval between two knots on either side of the centre, nearest to a rough start; NaN without one."""
     _, _, across, _ = curve.at(rough)
     rough = curve.rough_knot(line_centre(a, b, across))
-    known, found = np.isfinite(rough), np.full_like(a, np.nan)
+    found = np.full_like(a, np.nan)
+    known = np.isfinite(rough)
     a, b, rough = a[known], b[known], rough[known]
     knots = np.clip(np.floor(rough)[:, None] + np.arange(-SEARCH_KNOTS, SEARCH_KNOTS + 2), -1, len(curve.scan_path))
     beyond = np.stack([_miss(curve, a, b, column)[0] for column in knots.T], axis=-1)
     crosses = (beyond[:, :-1] <= 0) & (beyond[:, 1:] >= 0) & (knots[:, 1:] > knots[:, :-1])
     far = np.where(crosses, np.abs(knots[:, :-1] + 0.5 - rough[:, None]), np.inf)
-    rows, nearest = np.arange(len(a)), np.argmin(far, axis=1)
-    low, size = knots[rows, nearest], 1.0
+    low = knots[np.arange(len(a)), np.argmin(far, axis=1)]
+    size = 1.0
     for _ in range(HALVINGS):
         size /= 2
         low = np.where(_miss(curve, a, b, low + size)[0] <= 0, low + size, low)

@@ -129,13 +129,13 @@ class Unlocked:
 
     def __init__(self, array: NDArray[np.float32]) -> None:
         self.array = array  # keeps the memory
-        description = array.__array_interface__
-        self.__array_interface__ = {**description, "data": (description["data"][0], False)}
+        self.__array_interface__ = {**array.__array_interface__, "data": (array.__array_interface__["data"][0], False)}
 
 
 def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
     """Write the weights of the four taps around a fraction t in 0..1, (2, n) -> (2, 4, n) (Keys, 1981, a = -1/2)."""
-    half, s = np.float32(0.5), 1 - t
+    half = np.float32(0.5)
+    s = 1 - t
     first, second, third, last = (weight[:, tap] for tap in range(4))
     np.multiply(-half * t * s, s, out=first)
     np.multiply(-half * s * t, t, out=last)
@@ -146,5 +146,6 @@ def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
 @cache
 def _spread(taps: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return matrices (tap, tap * tap) of zeros and ones that repeat weights for every tap of the other axis."""
-    one, row = np.eye(taps, dtype=np.float32), np.ones((1, taps), np.float32)
+    one = np.eye(taps, dtype=np.float32)
+    row = np.ones((1, taps), np.float32)
     return torch.from_numpy(np.kron(one, row)), torch.from_numpy(np.kron(row, one))

@@ -81,21 +81,14 @@ def _blend_shared(blended: NDArray[np.float32], parts: Sequence[MosaicPart], poi
             here = np.flatnonzero(weight)
             mixed[here] += part.values[block[here]] * weight[here, None]
         torn = np.flatnonzero(np.isnan(mixed).any(axis=1))
-        if len(torn):
-            mixed[torn] = _by_band(parts, weights[:, first + torn], block[torn])
+        if len(torn):  # a part has no value in some bands: the others count there
+            values = np.stack([part.values[block[torn]] for part in parts])
+            counts = np.where(np.isnan(values), 0, weights[:, first + torn][..., None])
+            sums = reduce(np.add, counts)
+            found = np.full(sums.shape, np.nan)
+            np.divide(reduce(np.add, np.where(counts > 0, values, 0) * counts), sums, out=found, where=sums > 0)
+            mixed[torn] = found
         blended[block] = mixed
-
-
-def _by_band(
-    parts: Sequence[MosaicPart], weights: NDArray[np.floating], points: NDArray[np.intp]
-) -> NDArray[np.floating]:
-    """Return mixtures at points where a part has no value in some bands; the others count there."""
-    values = np.stack([part.values[points] for part in parts])
-    counts = np.where(np.isnan(values), 0, weights[..., None])
-    total, mixed = reduce(np.add, counts), np.where(counts > 0, values, 0) * counts
-    found: NDArray[np.floating] = np.full(total.shape, np.nan)
-    np.divide(reduce(np.add, mixed), total, out=found, where=total > 0)
-    return found
 
 
 @dataclass(frozen=True)
@@ -120,9 +113,9 @@ def read_part(
     box = _boxes(coordinates[None])[0]
     if np.isnan(box[0]):
         return None
-    signal, scan_path = located.placed.signal, located.scan_path
-    count = signal.samples
-    knots, samples = _span(box[0], box[1], len(scan_path)), _span(box[2], box[3], count)
+    signal = located.placed.signal
+    scan_path = located.scan_path
+    knots, samples = _span(box[0], box[1], len(scan_path)), _span(box[2], box[3], signal.samples)
     members = member_lines(scan_path, knots)
     values, valid = signal.values(located.read, members, samples, camera.full_scale_dn)
     starts = scan_path.starts[knots] - scan_path.starts[knots.start]
@@ -132,7 +125,7 @@ def read_part(
     if len(starts) < len(members):
         values, valid = merge_lines(values, valid, starts)
     values_at, weight = resample(values, valid, coordinates - np.array([knots.start, samples.start]), kernel)
-    edge_px = edge_distance(coordinates, len(scan_path), count)
+    edge_px = edge_distance(coordinates, len(scan_path), signal.samples)
     return MosaicPart(values_at, weight, edge_px, located.placed.lines.sweep.step)
 
 

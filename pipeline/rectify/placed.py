@@ -82,7 +82,8 @@ class TieTable:
         for row in range(first, last + 1):
             start, stop = max(row * self.spacing, rows.start), min((row + 1) * self.spacing, rows.stop)
             down = (np.arange(start, stop) - row * self.spacing) / self.spacing
-            block, above = out[start - rows.start : stop - rows.start], flat[row - first]
+            block = out[start - rows.start : stop - rows.start]
+            above = flat[row - first]
             np.multiply(flat[row - first + 1] - above, down[:, None], out=block)
             block += above
         return out.reshape(len(out), len(cell), 2)
@@ -108,7 +109,8 @@ def tie_table(
     finds a single line out of place between tie points. The error half-way between tie points is used instead if it is
     larger.
     """
-    curve, samples = KnotCurve(scan_path), camera.samples // binning
+    curve = KnotCurve(scan_path)
+    samples = camera.samples // binning
     corner, kept = _within_reach(curve, camera, along, (binning, origin_px, spacing_px, shape))
 
     def exact(first: float, step: int, counts: tuple[int, int]) -> Floats:
@@ -118,11 +120,13 @@ def tie_table(
 
     step_px = spacing_px * camera.ifov_rad / scan_path.width
     while tie > 1:
-        tie_points, bound = np.empty((0, 0, 2)), _knot_bound(scan_path, tie * step_px)
+        tie_points = np.empty((0, 0, 2))
+        bound = _knot_bound(scan_path, tie * step_px)
         if bound <= tolerance_px and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             tie_points = exact(0, tie, (rows, columns))
-            corners, ends = _corners(tie_points), np.array([len(scan_path), samples]) - 0.5
+            corners = _corners(tie_points)
+            ends = np.array([len(scan_path), samples]) - 0.5
             cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(axis=-1)  # with points of it
             bound = SAFETY * (bound + _tie_bound(tie_points, cells))
             if bound <= tolerance_px:
@@ -248,7 +252,8 @@ def place(
 
     Raises PoseError: a line's position is beyond the mirror's disk, or its path has no direction.
     """
-    sweep, usable = lines.sweep, lines.valid_line if usable is None else usable
+    sweep = lines.sweep
+    usable = lines.valid_line if usable is None else usable
     scan_paths = make_scan_paths(
         lines.position, camera, usable=usable, shift_px=shift_px, binning=sweep.binning, step_px=sweep.step
     )

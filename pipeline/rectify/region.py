@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,19 +60,24 @@ def mosaic_tile(
     """
     located = []
     for one, scan_paths in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
-        for number, near in enumerate(scan_paths):
+        for number, ((scan_path, _), near) in enumerate(zip(one.scan_paths, scan_paths, strict=True)):
             knots = slice(0, 0) if near is None else near.knots(rows)
             if near is None or knots.stop == knots.start:
                 continue
-            scan_path = one.scan_paths[number][0]
             coordinates = one.coordinates(number, camera, grid, rows, columns)
-            read = _reader(one, scan_path, coordinates, cache, near.samples)
-            located.append(LocatedSweep(one, scan_path, coordinates, read))
-    shape, bands = (rows.stop - rows.start, columns.stop - columns.start), placed[0].signal.bands
-    values, coverage = np.full((*shape, bands), np.nan, np.float32), np.zeros(shape, np.intp)
+            reader = _reader(one, scan_path, coordinates, cache, near.samples)
+            located.append(LocatedSweep(one, scan_path, coordinates, reader))
+    bands = placed[0].signal.bands
+    values = np.full((rows.stop - rows.start, columns.stop - columns.start, bands), np.nan, np.float32)
+    coverage = np.zeros(values.shape[:2], np.intp)
     for run in cut_runs([_column_groups(one.coordinates) for one in located], bands) if located else []:
-        part = np.s_[:, run.start * GROUP_COLUMNS : min(run.stop * GROUP_COLUMNS, shape[1])]
-        values[part], coverage[part] = _blend(located, part, camera, kernel)
+        part = np.s_[:, run.start * GROUP_COLUMNS : min(run.stop * GROUP_COLUMNS, values.shape[1])]
+        read = [read_part(one, one.coordinates[part].reshape(-1, 2), camera, kernel) for one in located]
+        parts = [found for found in read if found is not None]
+        if parts:
+            blended, counts = mosaic(parts)
+            values[part] = blended.reshape(values[part].shape)
+            coverage[part] = counts.reshape(coverage[part].shape)
     return values, coverage
 
 
@@ -90,25 +94,14 @@ def mosaic_rows(sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGri
         yield mosaic_tile(placed, camera, pixels, part, columns, reach=reach)[0]
 
 
-def _blend(located: Sequence[LocatedSweep], part: Any, camera: LineCamera, kernel: Kernel) -> tuple[Values, Counts]:
-    """Read every scan path at a part of the points and blend the values, (..., band), and count the sweeps, (...)."""
-    shape, bands = located[0].coordinates[part].shape[:-1], located[0].placed.signal.bands
-    read = [read_part(one, one.coordinates[part].reshape(-1, 2), camera, kernel) for one in located]
-    parts = [found for found in read if found is not None]
-    if not parts:
-        return np.full((*shape, bands), np.nan, np.float32), np.zeros(shape, np.intp)
-    values, counts = mosaic(parts)
-    return values.reshape(*shape, bands), counts.reshape(shape)
-
-
 def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
     """Group (y, x, 2) by 32 columns, (group, n, 2); the last group is filled with NaN."""
     rows, columns = coordinates.shape[:2]
     groups = -(-columns // GROUP_COLUMNS)
     if groups * GROUP_COLUMNS > columns:
-        filled = np.full((rows, groups * GROUP_COLUMNS, 2), np.nan)
-        filled[:, :columns] = coordinates
-        coordinates = filled
+        coordinates = np.pad(
+            coordinates, ((0, 0), (0, groups * GROUP_COLUMNS - columns), (0, 0)), constant_values=np.nan
+        )
     return coordinates.reshape(rows, groups, GROUP_COLUMNS, 2).swapaxes(0, 1)
 
 
@@ -165,7 +158,8 @@ def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int
             knots = slice(0, 0) if near is None else near.knots(tile.rows)
             if near is None or knots.start == knots.stop:
                 continue
-            members, held = member_lines(scan_path, knots), held_samples(one.lines, near.samples)
+            members = member_lines(scan_path, knots)
+            held = held_samples(one.lines, near.samples)
             for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
                 blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
     return blocks
@@ -211,11 +205,10 @@ def opened_work(open_work: OpenWork) -> MosaicWork:
 def opened_tiles(maker: TileMaker) -> tuple[MosaicWork, LineCache, Callable[[int, int], Reaches]]:
     """Return the work, the cache of lines and the reach of columns; only those of the last maker are kept."""
     work = opened_work(maker.open)
-
-    def reach(start: int, stop: int) -> Reaches:
-        return column_reach(work.placed, work.camera, work.grid, slice(start, stop))
-
-    return work, LineCache(maker.cache), lru_cache(maxsize=2)(reach)
+    reach = lru_cache(maxsize=2)(
+        lambda start, stop: column_reach(work.placed, work.camera, work.grid, slice(start, stop))
+    )
+    return work, LineCache(maker.cache), reach
 
 
 def free_tiles() -> None:

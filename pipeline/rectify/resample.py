@@ -45,7 +45,8 @@ class LineTable:
             fraction[:] = self._read_whole(placed, out)
             return
         points = np.flatnonzero(whole)
-        out[~whole], fraction[~whole] = np.nan, 0
+        out[~whole] = np.nan
+        fraction[~whole] = 0
         fraction[points] = self._read_whole(placed.chosen(points), out, points)
         points = np.flatnonzero(~whole & placed.touches(self.shape))
         flat, joint = self._usable_taps(placed.chosen(points))
@@ -96,7 +97,8 @@ class LineTable:
 
 def _table(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
     """Make a table of lines (line, sample, band), valid by sample or by element."""
-    shape, elements = (values.shape[0], values.shape[1]), None
+    shape = (values.shape[0], values.shape[1])
+    elements = None
     rows = np.ascontiguousarray(values, np.float32).reshape(-1, values.shape[2])
     if valid.ndim == 3:
         usable = np.asarray(valid.any(axis=2))
@@ -145,7 +147,8 @@ def resample(
     if low <= high:
         first, stop = np.clip((np.floor(low) - 1, np.floor(high) + 3), 0, len(values)).astype(int).tolist()
     table = _table(values[first:stop], valid[first:stop], kernel)
-    out, fraction = np.empty((len(coordinates), values.shape[2]), np.float32), np.zeros(len(coordinates), np.float32)
+    out = np.empty((len(coordinates), values.shape[2]), np.float32)
+    fraction = np.zeros(len(coordinates), np.float32)
     for start in range(0, len(out), BLOCK_PX):
         block = slice(start, start + BLOCK_PX)
         placed = windows(coordinates[block], kernel)

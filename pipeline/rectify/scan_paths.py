@@ -87,7 +87,8 @@ def make_scan_paths(
     scan, across, lines = line_centres(position, camera, usable, shift_px)
     if not len(lines):
         return ()
-    apart, steps = camera.ifov_rad * (step_px or binning), np.abs(np.diff(scan)) / np.diff(lines)
+    apart = camera.ifov_rad * (step_px or binning)
+    steps = np.abs(np.diff(scan)) / np.diff(lines)
     steps = steps[steps > STANDING_STEPS * apart]
     # The lower median: of one step and one gap, the step.
     own = float(np.percentile(steps, 50, method="lower")) if len(steps) else apart
@@ -128,14 +129,16 @@ def _runs(scan: Floats, most_back: float, still: float) -> list[slice]:
     """
     runs = []
     up, down = scan - np.minimum.accumulate(scan) > most_back, np.maximum.accumulate(scan) - scan > most_back
-    first, rising = 0, bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
+    rising = bool(up.any() and (not down.any() or np.argmax(up) < np.argmax(down)))
+    first = 0
     while first < len(scan):
         way = scan[first:] if rising else -scan[first:]
         back = np.maximum.accumulate(way) - way > most_back
         rise = way[: np.argmax(back)] if back.any() else way[:0]
         stop = first + int(np.argmax(rise > rise.max() - still)) + 1 if len(rise) else len(scan)
         runs.append(slice(first, stop))
-        first, rising = stop, not rising
+        first = stop
+        rising = not rising
     return runs
 
 
@@ -165,7 +168,8 @@ def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
     """Return first members of the groups of lines that lie less than ``reach`` beyond the first of their group."""
     if (np.diff(scan) >= reach).all():
         return np.arange(len(scan))
-    starts, following = [0], np.searchsorted(scan, scan + reach)
+    following = np.searchsorted(scan, scan + reach)
+    starts = [0]
     while (start := int(following[starts[-1]])) < len(scan):
         starts.append(start)
     return np.array(starts, np.intp)
@@ -180,7 +184,8 @@ def _with_stand_ins(
     empty = np.flatnonzero(~seen)
     before = np.searchsorted(at, empty) - 1
     nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
-    members, real = np.empty(sizes.sum(), np.intp), np.repeat(seen, sizes)
+    real = np.repeat(seen, sizes)
+    members = np.empty(len(real), np.intp)
     members[real] = lines
     members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
     return members, np.cumsum(sizes) - sizes
@@ -206,13 +211,18 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
     long. So one wild stamp costs one line, also at either end. A late frame is used, with the position at its own time.
     ``frame_s`` is the planned frame period.
     """
-    known, first = np.isfinite(time_s), np.zeros(len(time_s), np.bool_)
+    known = np.isfinite(time_s)
+    first = np.zeros(len(time_s), np.bool_)
     first[np.unique(time_s, return_index=True)[1]] = True
     repeated = int((known & ~first).sum())
     fresh = np.flatnonzero(known & first)
     usable = np.zeros(len(time_s), np.bool_)
     row = fresh[_longest_ascent(time_s[fresh])]
-    usable[row[_without_wild_ends(time_s[row], frame_s)]] = True
+    if len(row) >= LEAST_FRAMES:  # a first or last stamp is wild if it lies farther off than the others from each other
+        stamps = time_s[row]
+        far = max(WILD_FRAMES * frame_s, float(stamps[-2] - stamps[1]))
+        row = row[int(stamps[1] - stamps[0] > far) : len(row) - int(stamps[-1] - stamps[-2] > far)]
+    usable[row] = True
     count = _numbers(time_s[usable], frame_s)
     number = np.zeros(len(time_s), np.intp)
     if len(count):
@@ -244,15 +254,6 @@ def _longest_ascent(values: Floats) -> NDArray[np.intp]:
         row.append(index)
         index = int(below[index])
     return np.array(row, np.intp)
-
-
-def _without_wild_ends(time_s: Floats, frame_s: float) -> slice:
-    """Return ascending stamps without a first or last one that lies farther off than the others from each other."""
-    if len(time_s) < LEAST_FRAMES:
-        return slice(None)
-    far = max(WILD_FRAMES * frame_s, float(time_s[-2] - time_s[1]))
-    wild_first, wild_last = time_s[1] - time_s[0] > far, time_s[-1] - time_s[-2] > far
-    return slice(int(wild_first), len(time_s) - int(wild_last))
 
 
 def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:

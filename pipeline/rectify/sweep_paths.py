@@ -67,7 +67,8 @@ def sweep_paths(
     """Judge the lines of sweeps; ``found`` are a registration's corrections, by the sweeps' names."""
     paths = []
     for lines in sweeps:
-        name, period_s = lines.sweep.name, exposing(camera, lines.sweep).frame_ms * 1e-3
+        name = lines.sweep.name
+        period_s = exposing(camera, lines.sweep).frame_ms * 1e-3
         if lines.source == "recorded":  # lines may be selected from a recording
             apart = np.diff(lines.time_s[np.isfinite(lines.time_s)])
             period_s = float(np.median(apart[apart > 0])) if (apart > 0).any() else period_s
@@ -146,7 +147,8 @@ def interlaced_paths(
     Sweeps of one swath whose lines fill the same even positions make runs of closer lines. A sweep that repeats lines
     of the first pass lies by itself. The mosaic takes the closest lines that reach a pixel (`pipeline.rectify.mosaic`).
     """
-    placed, swaths = list[PlacedSweep](), dict[tuple[str, float], list[SweepPath]]()
+    placed: list[PlacedSweep] = []
+    swaths: dict[tuple[str, float], list[SweepPath]] = {}
     for one in sorted(paths, key=lambda path: path.lines.sweep.kind != "coarse"):
         sweep = one.lines.sweep
         same = swaths.get((sweep.along, sweep.swath_px))
@@ -200,12 +202,11 @@ def capture_numbers(placed: Sequence[PlacedSweep], camera: LineCamera, grid: Pix
 
     It is computed for the middle of every 4 x 4 px.
     """
-    height, width = grid.shape
-    places = (np.minimum(np.arange(0, size, CELL_PX) + CELL_PX // 2, size - 1) for size in (height, width))
+    places = (np.minimum(np.arange(0, size, CELL_PX) + CELL_PX // 2, size - 1) for size in grid.shape)
     centres = (first + grid.spacing_px * place for first, place in zip(grid.origin_px, places, strict=True))
     points = np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1)
     found = np.full(points.shape[:2], -1, np.int16)
     for number in sorted(range(len(placed)), key=lambda one: -placed[one].lines.sweep.step):  # the closest last
         for scan_path, _ in placed[number].scan_paths:
             found[np.isfinite(placed[number].locate_point(scan_path, camera, points)[..., 0])] = number
-    return found.repeat(CELL_PX, axis=0).repeat(CELL_PX, axis=1)[:height, :width]
+    return found.repeat(CELL_PX, axis=0).repeat(CELL_PX, axis=1)[: grid.shape[0], : grid.shape[1]]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction, wire_positions
-from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
+from pipeline.geometry.scan import Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.mirror_controller import MotionLog
 
@@ -61,8 +61,8 @@ def _followed(logged: MirrorScanPath, played: MirrorScanPath, begin_s: float, of
     position, and is linear between them. It is returned itself if any sample lies more than a step and a half beside.
     """
     held_s = float(played.time_s[1] - played.time_s[0])
-    wide, fine = math.ceil(off_s / held_s + 2), np.linspace(-1, 1, 2 * STEPS_A_POSITION + 1)
-    for steps in (np.arange(-wide, wide + 1), fine):
+    wide = math.ceil(off_s / held_s + 2)
+    for steps in (np.arange(-wide, wide + 1), np.linspace(-1, 1, 2 * STEPS_A_POSITION + 1)):
         shifts = begin_s + steps * held_s
         spread = np.array([np.var(logged.position - _at(played, logged.time_s - one), axis=0).sum() for one in shifts])
         alike = spread <= spread.min() + 1e-6 * np.ptp(spread)  # with one sample a position, many shifts are
@@ -164,7 +164,6 @@ LEAD = 1  # cells before the first line's: a triggered unit plays its first cell
 REFERENCES = "references"  # prefix of a capture for the dark and white frames in its folder
 _NUMBER = r"(-?\d+(?:p\d+)?(?:e-?\d+)?)"
 _FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)(?:x(\d+))?_(\d+)", re.DOTALL)
-_KINDS: dict[str, Literal["coarse", "fine"]] = {"c": "coarse", "f": "fine"}
 
 
 @dataclass(frozen=True)
@@ -194,12 +193,18 @@ def announced(prefix: str) -> Announced | None:
     if found is None:
         return None
     name, kind, along, strip, start, lines, step, binning, held, first = found.groups()
-    axis: Axis = "x" if along == "x" else "y"
     sizes = int(lines), int(step), int(binning)
     if min(sizes) < 1 or int(first) >= sizes[0] or held == "0":
         return None
-    of_exposure = None if held is None else int(held)
-    sweep = Sweep(name, _KINDS[kind], axis, _number(strip), _number(start), *sizes, held=of_exposure)
+    sweep = Sweep(
+        name,
+        "coarse" if kind == "c" else "fine",
+        "x" if along == "x" else "y",
+        _number(strip),
+        _number(start),
+        *sizes,
+        held=None if held is None else int(held),
+    )
     return Announced(sweep, int(first))
 
 
@@ -294,7 +299,8 @@ def locate_lines(captured: CapturedLines, path: CapturePath, taken: CaptureRecor
 
     Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction.
     """
-    held, number = len(captured.values), captured.times.frame
+    held = len(captured.values)
+    number = captured.times.frame
     if (number >= 0).any():
         number = np.where(number >= 0, number - captured.first_frame, -1)
     elif held == path.lines:  # no number, and no line is missing

@@ -14,7 +14,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,6 @@ from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
 JOURNAL = "captures.jsonl"  # beside the files fetched from the camera
-_HOW = ("method", "residual_px")
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may keep writing what it has after a stop
 POLL_S = 0.05
@@ -75,8 +74,8 @@ class CaptureJournal:
     def record_positions(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Record once how a capture's lines got their positions."""
         if taken.folder not in self._positions:
-            values = {name: getattr(how, name) for name in _HOW}
-            self._write({"what": "tied", "folder": taken.folder, **values, "notes": [*notes, *how.notes]})
+            found = {"method": how.method, "residual_px": how.residual_px, "notes": [*notes, *how.notes]}
+            self._write({"what": "tied", "folder": taken.folder, **found})
 
     @property
     def captures(self) -> list[dict[str, Any]]:
@@ -147,7 +146,7 @@ class CaptureJournal:
             case "spent":
                 self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
             case "tied":
-                self._positions[record["folder"]] = {name: record[name] for name in (*_HOW, "notes")}
+                self._positions[record["folder"]] = {name: record[name] for name in ("method", "residual_px", "notes")}
             case "references":
                 self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
@@ -162,21 +161,16 @@ def say_nothing(words: str) -> None:
     """Report no progress of the rig."""
 
 
+@dataclass(eq=False)
 class CaptureRunner:
     """Runs captures on connected devices, and records what they acknowledge."""
 
-    def __init__(
-        self,
-        devices: RigDevices,
-        journal: CaptureJournal,
-        camera: LineCamera,
-        rig: SurveyRig,
-        *,
-        say: Say = say_nothing,
-    ) -> None:
-        self.devices = devices
-        self._journal, self._camera, self._rig, self._say = journal, camera, rig, say
-        self._times_ms: tuple[float, float] | None = None  # exposure and frame period that the camera has
+    devices: RigDevices
+    journal: CaptureJournal
+    camera: LineCamera
+    rig: SurveyRig
+    say: Say = field(default=say_nothing, kw_only=True)
+    _times_ms: tuple[float, float] | None = field(default=None, init=False)  # exposure and period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
@@ -184,26 +178,27 @@ class CaptureRunner:
         Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are
         stopped.
         """
-        steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
-        exposed = exposing(self._camera, path.sweep)
+        steering = self.devices.steering
+        prefix = capture_prefix(path.sweep, path.first)
+        exposed = exposing(self.camera, path.sweep)
         self._configure(exposed)
-        self._say(f"path: {len(path.cells)} positions")
+        self.say(f"path: {len(path.cells)} positions")
         steering.load_path(path.cells)
         steering.goto(*(float(place) for place in path.cells[0]))
-        steering.settle(self._rig.settle_s)
+        steering.settle(self.rig.settle_s)
         with self._stopped_on_error():
             if path.triggered:
                 run_s = self._run(path)
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
             else:
-                most_hz = (self._rig.log_samples - 1) / (exposed.scan_seconds(path.lines) + SLACK_S)
-                log_hz = min(self._rig.log_rate_hz, most_hz)  # it must hold the whole capture
+                most_hz = (self.rig.log_samples - 1) / (exposed.scan_seconds(path.lines) + SLACK_S)
+                log_hz = min(self.rig.log_rate_hz, most_hz)  # it must hold the whole capture
                 steering.start_log(log_hz)
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
                 run_s = self._run(path)
             at_s = (capture.sent_s, capture.acknowledged_s)
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
-            self._journal.record_capture(taken)
+            self.journal.record_capture(taken)
             self.wait(taken)
         if taken.triggered:
             taken = replace(taken, index_at_end=steering.index())
@@ -211,7 +206,7 @@ class CaptureRunner:
             self.devices.clock.sleep(2 / log_hz)  # the log's last sample must be later than the last line
             taken = replace(taken, log=steering.read_log())
         steering.halt()
-        return self._journal.record_end(taken)
+        return self.journal.record_end(taken)
 
     def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that takes too long is stopped, and its frames count.
@@ -220,10 +215,11 @@ class CaptureRunner:
         """
         camera, clock = self.devices.camera, self.devices.clock
         began = clock.now()
-        wanted = exposing(self._camera, taken.sweep).scan_seconds(taken.stop - taken.first)
-        until, stopped = began + wanted + SLACK_S, False
+        wanted = exposing(self.camera, taken.sweep).scan_seconds(taken.stop - taken.first)
+        until = began + wanted + SLACK_S
+        stopped = False
         while camera.is_capturing():
-            self._say(f"capturing: {clock.now() - began:.0f} of {math.ceil(wanted)} s")
+            self.say(f"capturing: {clock.now() - began:.0f} of {math.ceil(wanted)} s")
             if clock.now() >= until:
                 if stopped:
                     raise RigError(
@@ -232,7 +228,8 @@ class CaptureRunner:
                     )
                 LOG.warning("the capture %s takes too long and is stopped", taken.folder)
                 camera.stop()
-                until, stopped = clock.now() + WRITING_S, True
+                until = clock.now() + WRITING_S
+                stopped = True
             clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
 
     def recovered(self, taken: CaptureRecord) -> CaptureRecord:
@@ -240,7 +237,7 @@ class CaptureRunner:
         self.wait(taken)
         if not taken.triggered or taken.index_at_end is not None:
             return taken
-        return self._journal.record_end(replace(taken, index_at_end=self.devices.steering.index()))
+        return self.journal.record_end(replace(taken, index_at_end=self.devices.steering.index()))
 
     def capture_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
         """Take one frame with the mirror at 0; 0 (if ``white_at_rest``), and return its folder.
@@ -248,10 +245,10 @@ class CaptureRunner:
         ``exposure_ms`` is the camera's own where it is None.
         """
         at_rest = replace(AT_REST, exposure_ms=exposure_ms)
-        self._configure(exposing(self._camera, at_rest))
-        if self._rig.white_at_rest:
+        self._configure(exposing(self.camera, at_rest))
+        if self.rig.white_at_rest:
             self.devices.steering.goto(0.0, 0.0)
-            self.devices.steering.settle(self._rig.settle_s)
+            self.devices.steering.settle(self.rig.settle_s)
         with self._stopped_on_error():
             capture = self.devices.camera.capture(1, prefix=prefix)
             at = (capture.sent_s, capture.acknowledged_s)
@@ -266,10 +263,9 @@ class CaptureRunner:
         self._times_ms = times_ms
 
     def _run(self, path: CapturePath) -> tuple[float, float]:
-        clock = self.devices.clock
-        sent = clock.now()
+        sent = self.devices.clock.now()
         self.devices.steering.run(path.rate_hz, Trigger.RISING_EDGE if path.triggered else Trigger.OFF)
-        return sent, clock.now()
+        return sent, self.devices.clock.now()
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

@@ -55,7 +55,8 @@ class FileServer:
         return f"the camera's file server {self.host}:{self.port}"
 
 
-LEAST_EXPOSURE_MS, MOST_PERIOD_MS = 0.5, 10_000.0  # assumed, from a data sheet
+LEAST_EXPOSURE_MS = 0.5  # assumed, from a data sheet
+MOST_PERIOD_MS = 10_000.0  # likewise
 
 
 def check_times(exposure_ms: float, frame_period_ms: float, most_rate_hz: float) -> None:
@@ -161,5 +162,4 @@ class SurveyRig:
     @property
     def files(self) -> FileServer:
         """Return the address of the camera's files."""
-        own = {name: getattr(self, name) for name in ("user", "password", "stall_s")}
-        return FileServer(self.host, self.file_port, **own)
+        return FileServer(self.host, self.file_port, self.user, self.password, self.stall_s)

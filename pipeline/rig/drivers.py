@@ -231,7 +231,7 @@ def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
 
 def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) -> object:
     """Return what the function opens, where it has every method of its protocol."""
-    protocol, name = _PROTOCOLS[setting], getattr(rig, setting)
+    name = getattr(rig, setting)
     try:
         device = factory(rig, clock)
     except TypeError as error:
@@ -239,8 +239,8 @@ def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) ->
             f"rig.{setting} = {name!r} does not open a driver ({error}). Expected a function of the table [rig] and a "
             "clock"
         ) from error
-    methods = [method for method in vars(protocol) if not method.startswith("_")]
-    missing = [method for method in methods if not callable(getattr(device, method, None))]
+    protocol = _PROTOCOLS[setting]
+    missing = [one for one in vars(protocol) if not one.startswith("_") and not callable(getattr(device, one, None))]
     if missing:
         raise SettingsError(
             f"rig.{setting} = {name!r} gives a {type(device).__name__} without {', '.join(missing)}. Expected every "

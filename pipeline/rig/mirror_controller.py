@@ -194,7 +194,6 @@ def frames_to_check(frames: int, read_back: ReadBack) -> list[int]:
 
 def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
     """Read cells of a vector, at most as many as one frame takes."""
-
     return link.ask(
         pro.get_vector(register, start, count),
         f"reading cells {start} to {start + count}",
@@ -232,7 +231,8 @@ class MirrorController(Closing):
     def __init__(
         self, transport: Transport, rig: SurveyRig, clock: Clock = SYSTEM_CLOCK, *, vector_pairs: int = 1500
     ) -> None:
-        self.rig, self.vector_pairs = rig, vector_pairs
+        self.rig = rig
+        self.vector_pairs = vector_pairs
         self.wire = Wire(transport, clock, Patience(rig.deadline_s, rig.retries, rig.quiet_s))
         self._link = ProLink(self.wire, rig.with_crc, rig.strict_crc)
         self._logging: tuple[float, float, float] | None = None  # rate; before the request and after its answer
@@ -251,7 +251,7 @@ class MirrorController(Closing):
                 LOG.info("%s does not answer in simple mode; it may be in pro mode", self.wire.port)
                 with suppress(DeadlinePassed):  # it may have changed; the greeting shows
                     # with a CRC: an earlier session may have had them checked
-                    ProLink(self.wire, with_crc=True).set(pro.go_simple(), "changing to simple mode")
+                    ProLink(self.wire, with_crc=True).set(pro.GO_SIMPLE, "changing to simple mode")
                 self._greet()
             self.identity = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
             self._check_identity()
@@ -285,7 +285,7 @@ class MirrorController(Closing):
 
     def status(self) -> pro.Status:
         """Return the present status bits."""
-        return pro.Status(self._link.ask(pro.ask_status(), "the status", pro.cell_int))
+        return pro.Status(self._link.ask(pro.ASK_STATUS, "the status", pro.cell_int))
 
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; return once that is acknowledged, not at rest.
@@ -339,16 +339,15 @@ class MirrorController(Closing):
             self.halt()
             for name, begin, channel in (("X", 0, pro.X), ("Y", self._pairs, pro.Y)):
                 start, end = device_range((begin, begin + self._pairs), self.rig.ends)
-                values: dict[pro.VectorRegister, pro.Value] = {
-                    pro.VectorRegister.UNIT: pro.UNIT_XY,
-                    pro.VectorRegister.START: start,
-                    pro.VectorRegister.END: end,
-                    pro.VectorRegister.FREQUENCY: float(rate_hz),
-                    pro.VectorRegister.CYCLES: 1,
-                    pro.VectorRegister.TRIGGER: int(trigger),
+                values: dict[int, pro.Value] = {
+                    channel.vector(pro.VectorRegister.UNIT): pro.UNIT_XY,
+                    channel.vector(pro.VectorRegister.START): start,
+                    channel.vector(pro.VectorRegister.END): end,
+                    channel.vector(pro.VectorRegister.FREQUENCY): float(rate_hz),
+                    channel.vector(pro.VectorRegister.CYCLES): 1,
+                    channel.vector(pro.VectorRegister.TRIGGER): int(trigger),
                 }
-                frame = pro.set_values({channel.vector(register): value for register, value in values.items()})
-                self._link.set(frame, f"setting up the path's {name}")
+                self._link.set(pro.set_values(values), f"setting up the path's {name}")
             follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
             self._move(follow | _run_values(1), "running the path")  # one frame: both begin together
 

@@ -133,7 +133,8 @@ def _read_frame(data: bytes) -> Frame | Damaged:
     """Read the bytes between two boundaries."""
     first, *rest = data.split(b"\x7d")
     plain = first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest if part)
-    size, escaped = len(plain) - _HEAD - _CRC, all(part[:1] in (b"\x5d", b"\x5e") for part in rest)
+    size = len(plain) - _HEAD - _CRC
+    escaped = all(part[:1] in (b"\x5d", b"\x5e") for part in rest)
     if not escaped or not 0 <= size <= MOST_PAYLOAD or plain[2] != size:
         return Damaged(data)
     body, check = plain[:-_CRC], int.from_bytes(plain[-_CRC:], "little")
@@ -142,7 +143,8 @@ def _read_frame(data: bytes) -> Frame | Damaged:
 
 CELL = 4  # bytes
 VECTOR_CELLS = 10  # in one frame, as the public software does; 11 would fit
-_NO_ARGUMENT = b"\x00\x00"
+ASK_STATUS = Frame(Command.STATUS, b"\x00\x00")  # without an argument; the reply is one cell
+GO_SIMPLE = Frame(Command.SET_MODE, b"\x00\x00")  # simple mode is communication mode 0
 
 Value = float | int
 
@@ -165,16 +167,6 @@ def cell_float(cell: bytes) -> float:
 def cell_int(cell: bytes) -> int:
     """Read a cell as an unsigned integer."""
     return int.from_bytes(checked(cell, CELL), "big")
-
-
-def ask_status() -> Frame:
-    """Return a request for the status bits; the reply is one cell."""
-    return Frame(Command.STATUS, _NO_ARGUMENT)
-
-
-def go_simple() -> Frame:
-    """Return a request for simple mode, which is communication mode 0."""
-    return Frame(Command.SET_MODE, _NO_ARGUMENT)
 
 
 def get_value(register: int) -> Frame:

@@ -24,7 +24,8 @@ Device = Literal["mirror", "camera"]
 SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
 FAR = 0.02  # of the disk's radius: errors of a position from which on it is wrong
 SETTLE_S = 2.0
-LOG_HZ, LOGGED = 1000.0, 8
+LOG_HZ = 1000.0
+LOGGED = 8  # samples
 CONNECT = "connect"
 
 

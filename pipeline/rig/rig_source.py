@@ -73,10 +73,14 @@ class RigSource:
         vector_pairs: int = 1500,
         say: Say = say_nothing,
     ) -> None:
-        self.camera, self.wavelength_nm, self.field_shape = camera, wavelength_nm, field_shape
+        self.camera = camera
+        self.wavelength_nm = wavelength_nm
+        self.field_shape = field_shape
         self.rig = SurveyRig() if rig is None else rig
         self.vector_pairs = vector_pairs
-        self._open, self._kept, self._say = open_devices, kept, say
+        self._open = open_devices
+        self._kept = kept
+        self._say = say
         self._journal = CaptureJournal(kept)
         self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
         self._runner: CaptureRunner | None = None
@@ -96,13 +100,16 @@ class RigSource:
     def keeping(self, kept: Kept) -> RigSource:
         """Return the same source with its files elsewhere."""
         other = self.saying(self._say)
-        other._kept, other._journal, other._whole = kept, CaptureJournal(kept), {}
+        other._kept = kept
+        other._journal = CaptureJournal(kept)
+        other._whole = {}
         return other
 
     def saying(self, say: Say) -> RigSource:
         """Return the same source with another report of the present step."""
         other = copy(self)
-        other._say, other._runner = say, None
+        other._say = say
+        other._runner = None
         return other
 
     @contextmanager
@@ -138,14 +145,16 @@ class RigSource:
         check_binning(sweep, self.camera)
         if first >= sweep.lines:
             return
-        line, barren = first, 0
+        line = first
+        barren = 0
         with self.session() as runner:
             while line < sweep.lines:
-                before, reason = line, "its files or positions end there"
+                before = line
+                reason = "its files or positions end there"
                 held = self._journal.holding(sweep, line)
                 if held is None:
-                    pulses = self.rig.pulses  # they step through the sweep if there is one per position
-                    triggered = pulses == "position" or (pulses == "frame" and sweep.positions == 1)
+                    # pulses step through the sweep if there is one per position
+                    triggered = self.rig.pulses == "position" or (self.rig.pulses == "frame" and sweep.positions == 1)
                     path = next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
                     taken = runner.take(path)
                 else:
@@ -170,7 +179,8 @@ class RigSource:
 
     def references(self, sweep: Sweep) -> References:
         """Return the dark and white frames with the sweep's binning; they are captured once for each exposure."""
-        exposure_ms, folders = sweep.exposure_ms, self._journal.references
+        exposure_ms = sweep.exposure_ms
+        folders = self._journal.references
         if folders.get(exposure_ms, "") not in self._whole:
             with self.session() as runner:
                 known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
@@ -226,14 +236,15 @@ class RigSource:
         path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
         located = locate_lines(captured, path, taken, self.camera)
         self._journal.record_positions(taken, located.positions, captured.notes)
-        values, sweep = captured.values, path.sweep
-        nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
+        sweep = taken.sweep
+        nothing = np.zeros((captured.values.shape[1] // sweep.binning, captured.values.shape[2]), np.uint16)
         for place in range(line - path.first, len(located.row)):
-            row, valid = int(located.row[place]), located.is_valid(place)
+            row = int(located.row[place])
+            valid = located.is_valid(place)
             x, y = located.positions.position[row] if valid else path.middle[place]
             yield Line(
                 number=path.first + place,
-                data=bin_samples(values[row], sweep.binning) if row >= 0 else nothing,
+                data=bin_samples(captured.values[row], sweep.binning) if row >= 0 else nothing,
                 mirror_x=float(x),
                 mirror_y=float(y),
                 time_s=self._time_s(sweep, path.first + place, int(located.stamp_us[row]) if row >= 0 else -1),
@@ -243,7 +254,8 @@ class RigSource:
 
     def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
         """Return the time of mid exposure since the sweep's start, by the camera's stamps, else by its frame rate."""
-        known, exposed = stamp_us >= 0, exposing(self.camera, sweep)
+        known = stamp_us >= 0
+        exposed = exposing(self.camera, sweep)
         origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
         if known and origin is not None:
             return (stamp_us - origin) * 1e-6 + exposed.mid_exposure_s(0.0)

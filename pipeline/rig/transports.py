@@ -313,7 +313,8 @@ class Wire:
         began = self.clock.now()
         self._unanswered += 1
         self.transport.write(data, deadline)
-        came, until = b"", min(began + silence_s, deadline)
+        came = b""
+        until = min(began + silence_s, deadline)
         while self.clock.now() < until:
             part = self.transport.read(4096, until)
             until = min(self.clock.now() + silence_s, deadline) if part else until
@@ -334,7 +335,8 @@ class Wire:
 
     def _empty_line(self, when: str, latest: float = math.inf) -> None:
         """Drop what is on the line. If an answer may still come, wait for silence: it would pass for the next one."""
-        stale, now = self.transport.drain(), self.clock.now()
+        stale = self.transport.drain()
+        now = self.clock.now()
         latest = min(latest, now + 5 * self.patience.quiet_s)  # some devices never stop
         until = min(now + self.patience.quiet_s, latest)
         while self._unanswered and (part := self.transport.read(4096, until)):

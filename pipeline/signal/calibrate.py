@@ -82,7 +82,8 @@ def judge_elements(references: References) -> Elements:
     span = references.white - references.dark
     if references.flat is not None:
         span = np.where(references.flat > 0, span * references.flat, np.nan)
-    gain, known = np.full(span.shape, np.nan, np.float32), np.isfinite(span) & (span > 0)
+    gain = np.full(span.shape, np.nan, np.float32)
+    known = np.isfinite(span) & (span > 0)
     with np.errstate(over="ignore"):
         np.divide(np.broadcast_to(references.white_reference, span.shape), span, out=gain, where=known)
     bad = np.zeros(gain.shape, np.bool_) if references.bad is None else references.bad
@@ -179,7 +180,8 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
     if position is None:
         raise PoseError("the white frame was taken at rest (by_mirror), which needs the lines' mirror positions")
     at = np.asarray(position, np.float64)
-    known, gain = np.isfinite(at).all(axis=1), np.full(len(raw), np.nan, np.float32)
+    known = np.isfinite(at).all(axis=1)
+    gain = np.full(len(raw), np.nan, np.float32)
     gain[known] = 1 / mirror_throughput(at[known])
     return gain
 
@@ -202,16 +204,16 @@ def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: 
 
 def _valid(raw: NDArray[np.integer[Any]], elements: Elements, saturated_dn: float) -> Bools:
     """Return (line, sample), or (line, sample, band) where only some bands of a sample are out."""
-    lit, fill, bad = elements.lit, elements.fill, elements.out[None]
+    fill = elements.fill
+    bad = elements.out[None]
     if raw.size and raw.max() >= saturated_dn:
-        hot = (raw >= saturated_dn) & lit
+        hot = (raw >= saturated_dn) & elements.lit
         if len(fill.element):
             flat = hot.reshape(len(hot), -1)
             flat[:, fill.element] = flat[:, fill.before] | flat[:, fill.after]
         bad = hot | elements.out
-    whole = np.all(bad | ~lit, axis=-1)  # every band with light is out
-    partly = bad.any(axis=-1) & ~whole
-    valid = ~(bad | whole[..., None]) if partly.any() else ~whole
+    whole = np.all(bad | ~elements.lit, axis=-1)  # every band with light is out
+    valid = ~(bad | whole[..., None]) if (bad.any(axis=-1) & ~whole).any() else ~whole
     return np.array(np.broadcast_to(valid, raw.shape[: valid.ndim]))
 
 
@@ -279,7 +281,8 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
     local: Floats = scipy.ndimage.median_filter(_without_gaps(response), around, mode="reflect")
     least = np.maximum(LIT_SIGMAS * noise, LIT_FRACTION * _median(response, axis=0))
-    judged, relative = np.isfinite(response) & (local > least), np.full(response.shape, np.nan)
+    judged = np.isfinite(response) & (local > least)
+    relative = np.full(response.shape, np.nan)
     np.divide(response, local, out=relative, where=judged)
     dead = judged & (relative < LEAST_RESPONSE)
     off = np.where(dead, np.nan, relative - 1)

@@ -74,7 +74,8 @@ class Components:
         spectra = np.asarray(values, np.float64) - self.mean
         there = np.isfinite(spectra)
         for pattern in np.unique(there, axis=0):
-            rows, have = (there == pattern).all(axis=1), np.flatnonzero(pattern)
+            rows = (there == pattern).all(axis=1)
+            have = np.flatnonzero(pattern)
             lack = np.flatnonzero(lit & ~pattern)
             law = np.linalg.lstsq(self.covariance[np.ix_(have, have)], self.covariance[np.ix_(have, lack)], rcond=1e-9)
             spectra[np.ix_(rows, lack)] = spectra[np.ix_(rows, have)] @ law[0]

@@ -26,7 +26,8 @@ from pipeline.source import Line, References, SweepLines
 WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; fewer than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together
 ALONE = 1e-3  # probability beyond which the residual of one spectrum is limited in tests with its neighbours
-LAW_ROUNDS, LAW_CLIP = 4, 4.0
+LAW_ROUNDS = 4  # of the fit of the law
+LAW_CLIP = 4.0  # spreads from the law beyond which a spectrum is left out of the fit
 LEAST_EXPECTED = 0.2  # of the mean residual: least prediction of the law, ...
 LEAST_RESIDUAL = 0.02  # ... and of the noise's variance: less is rounding
 CANCELLED = 1e-4  # of a spectrum's square: a smaller difference of squares has lost digits of float32
@@ -57,7 +58,8 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
     bands have a known covariance: there a missing band takes its expected value. ``valid`` is (line, sample) or (line,
     sample, band).
     """
-    lit, count = np.isfinite(components.mean), len(components)
+    lit = np.isfinite(components.mean)
+    count = len(components)
     bands = int(lit.sum())
     scores, left = _projected(values, components)
     quality = np.where(valid if valid.ndim == 2 else valid.any(axis=2), WHOLE, UNUSABLE).astype(np.uint8)
@@ -67,7 +69,8 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
         there = np.isfinite(values[broken]) & lit & (valid[broken] if valid.ndim == 3 else valid[broken][:, None])
         if components.covariance is not None:
             spectra = components.completed(np.where(there, values[broken], np.float32(np.nan)))
-            scores[broken], residual[broken] = components.white(spectra) @ components.axes.T.astype(np.float32), 0
+            scores[broken] = components.white(spectra) @ components.axes.T.astype(np.float32)
+            residual[broken] = 0
         else:
             white = np.where(there, components.white(values[broken]), np.float32(0))
             scores[broken], residual[broken] = _least_squares(white, there, components)
@@ -82,7 +85,8 @@ def score_lines(values: NDArray[np.float32], valid: Bools, components: Component
 
 def _projected(values: NDArray[np.float32], components: Components) -> tuple[Scores, Scores]:
     """Return scores (..., component) of spectra (..., band), and the squares of their residuals; NaN if broken."""
-    axes, flat = components.axes.T.astype(np.float32), values.reshape(-1, components.bands)
+    axes = components.axes.T.astype(np.float32)
+    flat = values.reshape(-1, components.bands)
     scores, left = np.empty((len(flat), len(components)), np.float32), np.empty(len(flat), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):
         for part in cuts(len(flat), SPECTRA_AT_ONCE):
@@ -103,9 +107,10 @@ def _least_squares(white: Scores, there: Bools, components: Components) -> tuple
     With the components' spread they are the most probable scores of normal laws; without it any is as likely.
     Missing bands count as noise in the residual, so that it has the spread of a whole spectrum's.
     """
-    axes, spread, count = components.axes.T.astype(np.float32), components.spread, len(components)
+    axes = components.axes.T.astype(np.float32)
+    count = len(components)
     bands = int(np.isfinite(components.mean).sum())
-    prior = np.diag(np.full(count, 1e-6) if spread is None else 1 / np.maximum(spread, 1.0))
+    prior = np.diag(np.full(count, 1e-6) if components.spread is None else 1 / np.maximum(components.spread, 1.0))
     products = (axes[:, :, None] * axes[:, None, :]).reshape(len(axes), -1)
     scores, residual = np.empty((len(white), count), np.float32), np.empty(len(white), np.float32)
     for part in cuts(len(white), 4096):
@@ -165,7 +170,8 @@ def find_rare(ratio: NDArray[np.float32], law: ResidualLaw, false_alarm: float) 
     for lines, samples in JOINT:
         if lines > ratio.shape[0] or samples > ratio.shape[1]:
             continue
-        size, high = lines * samples, np.zeros(ratio.shape, np.float32)
+        size = lines * samples
+        high = np.zeros(ratio.shape, np.float32)
         within = tuple(slice(side // 2, (side // 2 - side + 1) or None) for side in (lines, samples))
         high[within] = scipy.ndimage.uniform_filter(filled, (lines, samples))[within] > _limit(
             law.freedom * size, part / size
@@ -191,7 +197,8 @@ def whole_steps(scores: NDArray[np.floating], step: float) -> NDArray[np.floatin
     first (controlled rounding of tables: Cox 1987). No score is off by more than one step, and the mean of a block by
     more than 1/32. Blocks that are incomplete, or have a score that is not finite, are rounded score by score.
     """
-    side, steps = MEAN_SIDE, scores / np.float32(step)
+    side = MEAN_SIDE
+    steps = scores / np.float32(step)
     rounded: NDArray[np.floating] = np.rint(steps)
     lines, samples, count = (*(size // side * side for size in steps.shape[:2]), steps.shape[2])
     if step <= 1 or not lines * samples * count:
@@ -224,15 +231,15 @@ class LineStatistics:
     """Add a sweep's lines to the statistics of a field as they arrive, a block at a time."""
 
     def __init__(self, found: SignalStatistics, sweep: Sweep, references: References, camera: LineCamera) -> None:
-        self._found, self._elements = found, judge_elements(references)
+        self._found = found
+        self._elements = judge_elements(references)
         self._saturated = float(camera.full_scale_dn * sweep.binning)
 
     def add(self, lines: Sequence[Line], raw: NDArray[np.uint16]) -> None:
         """Add the next lines, at most 64, whose raw numbers are ``raw`` (line, sample, band)."""
         at = np.array([(line.mirror_x, line.mirror_y) if line.valid else (np.nan, np.nan) for line in lines])
         values, valid = calibrate(raw, self._elements, saturated_dn=self._saturated, position=at)
-        there = np.array([line.valid for line in lines])
-        self._found.add(values, valid & there.reshape(-1, *[1] * (valid.ndim - 1)))
+        self._found.add(values, valid & np.array([line.valid for line in lines]).reshape(-1, *[1] * (valid.ndim - 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +265,8 @@ class Condenser:
     def sweep(self, lines: SweepLines, store: Store, report: Report = lambda done: None) -> CondensedSweep:
         """Pass the scores of all lines to ``store``, and find the rare spectra."""
         count, samples = len(lines.valid_line), len(lines.references.dark)
-        ratio, missing = np.empty((count, samples), np.float32), np.zeros((count, samples), np.int32)
+        ratio = np.empty((count, samples), np.float32)
+        missing = np.zeros((count, samples), np.int32)
         for first, values, valid in calibrated_blocks(lines, self.camera):
             block = slice(first, first + len(values))
             seen = score_lines(values, valid, self.components)
@@ -311,7 +319,7 @@ def differing_lines(
     The rest of a spectrum is noise by the tests of condensing, or was stored. ``components`` are those that the lines
     were condensed by, if they hold more than what is stored.
     """
-    wrong = list[int]()
+    wrong: list[int] = []
     for first, values, valid in calibrated_blocks(lines, camera):
         last = first + len(values)
         seen = score_lines(values, valid, components or stored.components)

@@ -73,20 +73,18 @@ class Signal:
             values, valid = values[:, samples], valid[:, samples]
         return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))
 
-    def broad_image(
-        self, usable: NDArray[np.bool_], full_scale_dn: float, bands: int = BROAD_BANDS
-    ) -> NDArray[np.float32]:
-        """Return the mean of ``bands`` bands spread over all, (line, sample); NaN where one is not valid.
+    def broad_image(self, usable: NDArray[np.bool_], full_scale_dn: float) -> NDArray[np.float32]:
+        """Return the mean of 16 bands spread over all, (line, sample); NaN where one is not valid.
 
         Lines are read 64 at a time. ``usable`` (line,) are those with a trusted position.
         """
-        lines, chosen = self.lines, broad_bands(self.lines.references, bands)
-        references = of_bands(lines.references, chosen.tolist())
-        saturated = full_scale_dn * lines.sweep.binning
+        chosen = broad_bands(self.lines.references)
+        references = of_bands(self.lines.references, chosen.tolist())
+        saturated = full_scale_dn * self.lines.sweep.binning
         image = np.full((len(usable), self.samples), np.nan, np.float32)
         for part in cuts(len(usable), BLOCK_LINES):
-            raw = np.ascontiguousarray(lines.read(part.start, part.stop)[..., chosen])
-            at = np.where(usable[part, None], lines.position[part], np.nan)
+            raw = np.ascontiguousarray(self.lines.read(part.start, part.stop)[..., chosen])
+            at = np.where(usable[part, None], self.lines.position[part], np.nan)
             values, valid = calibrate(raw, references, saturated_dn=saturated, position=at)
             whole = valid if valid.ndim == 2 else valid.all(axis=2)
             image[part] = np.where(whole & usable[part, None], values.mean(axis=2), np.nan)
@@ -153,11 +151,9 @@ class CondensedSignal:
             scores = scores @ matrix + shift
         return scores, self._condensed.usable[numbers, samples] & self.lines.valid_line[numbers, None]
 
-    def broad_image(
-        self, usable: NDArray[np.bool_], full_scale_dn: float, bands: int = BROAD_BANDS
-    ) -> NDArray[np.float32]:
-        """Return the mean of ``bands`` bands spread over all, (line, sample); NaN where one is not valid."""
-        weights, offset = broad_weights(self._condensed.components, bands)
+    def broad_image(self, usable: NDArray[np.bool_], full_scale_dn: float) -> NDArray[np.float32]:
+        """Return the mean of 16 bands spread over all, (line, sample); NaN where one is not valid."""
+        weights, offset = broad_weights(self._condensed.components)
         image = np.full((len(usable), self.samples), np.nan, np.float32)
         for part in cuts(len(usable), BLOCK_LINES):
             scores = self.lines.read(part.start, part.stop).astype(np.float32) * np.float32(self._condensed.step)
@@ -232,10 +228,11 @@ class LineCache:
         with block.reading:
             if block.raw is None:
                 rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
-                if isinstance(lines, WindowedLines):
-                    raw = lines.read_window(rows, samples)
-                else:
-                    raw = lines.read(rows.start, rows.stop)
+                raw = (
+                    lines.read_window(rows, samples)
+                    if isinstance(lines, WindowedLines)
+                    else lines.read(rows.start, rows.stop)
+                )
                 with self._lock:
                     block.raw = raw
                     self.bytes_held += raw.nbytes

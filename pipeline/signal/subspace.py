@@ -75,21 +75,25 @@ class SignalStatistics:
         self.total, self.block_total, self.largest = np.zeros((3, self.bands))
         self.single, self.block = np.zeros((2, self.bands, self.bands))
         wanted = max(SPECTRA_A_BAND * self.bands, 4 * KEPT_SPECTRA)
-        sides = 2 ** round(np.log2(max(self.expected / wanted, 1)) / 2)  # they divide a block's: blocks all begin alike
-        self._stride = min(sides, BLOCK)
+        # powers of 2 divide a block's side: blocks all begin alike
+        self._stride = min(2 ** round(np.log2(max(self.expected / wanted, 1)) / 2), BLOCK)
         self._thin = max(1, round(self.expected / self._stride**2 / KEPT_SPECTRA))
 
     def add(self, values: Values, valid: Bools) -> None:
         """Add some neighbouring lines: (line, sample, band) scene values, and their validity by `calibrate`."""
         if not values.size or not valid.any():
             return
-        spectra, whole, origin = np.ascontiguousarray(values, np.float32), valid, self.origin
+        spectra = np.ascontiguousarray(values, np.float32)
+        whole = valid
+        origin = self.origin
         sums = np.zeros((*(size // BLOCK for size in valid.shape[:2]), self.bands), np.float32)
         largest = np.zeros(self.bands, np.float32)
         plain = self.bands > FEW_BANDS and valid.ndim == 2 and valid.all() and self.lit.all()
         if origin is None or not (plain and compiled_loops.sum_blocks(spectra, origin, largest, sums)):
-            (spectra, whole), origin = self._centred(values, valid), np.zeros_like(largest)
-            sums[:], largest[:] = 0, 0
+            spectra, whole = self._centred(values, valid)
+            origin = np.zeros_like(largest)
+            sums[:] = 0
+            largest[:] = 0
             compiled_loops.sum_blocks(spectra, origin, largest, sums)
         np.maximum(self.largest, largest, out=self.largest)
         lines, samples = sums.shape[:2]
@@ -122,7 +126,8 @@ class SignalStatistics:
         spectra = values - self.origin
         there = np.isfinite(spectra) & by_band
         spectra = np.where(there, spectra, np.float32(0))
-        seen, bands = there.sum(axis=2), max(int(self.lit.sum()), 1)
+        seen = there.sum(axis=2)
+        bands = max(int(self.lit.sum()), 1)
         whole, usable = seen == bands, 2 * seen >= bands
         return spectra, np.asarray(whole if 2 * whole.sum() >= usable.sum() else usable)
 
@@ -322,8 +327,7 @@ def _axes(
         means = BLOCK**2 * _covariance(found.block, found.block_total, max(found.means, 1))[0][np.ix_(lit, lit)] / scale
         largest = np.linalg.eigh(rest @ (white + means) @ rest)[1][:, ::-1]
         axes = np.concatenate([axes, largest[:, : wanted - axes.shape[1]]], axis=1)
-    turned = np.linalg.eigh(axes.T @ white @ axes)[1][:, ::-1]  # by falling variance
-    return np.linalg.qr(axes @ turned)[0]
+    return np.linalg.qr(axes @ np.linalg.eigh(axes.T @ white @ axes)[1][:, ::-1])[0]  # by falling variance
 
 
 def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, known: int = 0) -> Floats:
@@ -337,8 +341,7 @@ def significant_axes(covariance: Floats, spectra: int, false_alarm: float, *, kn
         return np.zeros((bands, 0))
     values, vectors = np.linalg.eigh(covariance)
     edge = noise_edge(np.maximum(values[known:], 0), min(1.0, bands / max(spectra, 1)), false_alarm)
-    count = int(np.count_nonzero(values > edge))
-    return vectors[:, ::-1][:, : min(count, bands - known, max(spectra - 1, 0))]
+    return vectors[:, ::-1][:, : min(int(np.count_nonzero(values > edge)), bands - known, max(spectra - 1, 0))]
 
 
 def with_shared(components: Components, residuals: Values, false_alarm: float) -> Components:
@@ -385,7 +388,7 @@ def _law_spreads() -> tuple[Floats, Floats]:
     """Return spreads of the Marchenko-Pastur law, and how far its lowest tenth is below its median, over the median."""
     tries = np.geomspace(1e-3, 1.0, 200)
     angle = (np.arange(2000) + 0.5) / 2000 * np.pi
-    found = list[float]()
+    found: list[float] = []
     for spread in tries:
         low, high = (1 - spread) ** 2, (1 + spread) ** 2
         at = (low + high) / 2 - (high - low) / 2 * np.cos(angle)

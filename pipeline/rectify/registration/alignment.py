@@ -7,7 +7,7 @@ move and leaves fall between two visits, so single windows may be wrong. The res
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Literal
@@ -36,7 +36,8 @@ FLAT_SPREAD = 1e-6  # of the mean; and of the whole variance
 UPSAMPLE = 20
 ROUNDS = 8
 SETTLED_PX = 1e-3
-REALIGN_PX, REALIGNMENTS = 0.75, 4  # a fit further off is made again from the next integer
+REALIGN_PX = 0.75  # a fit further off is made again from the next integer,
+REALIGNMENTS = 4  # at most so many times
 MOST_STEP_PX = 1.0
 SMOOTHING = np.array([1, 4, 6, 4, 1]) / 16
 SMOOTHED_NOISE = float(SMOOTHING @ SMOOTHING) ** 2  # fraction of white noise's variance that smoothing leaves
@@ -54,7 +55,8 @@ WINDOW_REACH_PX = 8.0  # largest difference of a window's shift from that of the
 AGREE_PX, LOOSELY_PX = 0.5, 1.5  # largest differences of windows that agree, and agree loosely
 LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # least loose estimates that count: growth causes smaller ones
 TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # rotations that are tried if windows show nothing without one
-LEAST_WINDOWS, LEAST_AGREEING = 4, 0.6  # number and fraction of windows that have to agree
+LEAST_WINDOWS = 4  # that have to agree
+LEAST_AGREEING = 0.6  # fraction of all windows that has to agree
 TRIALS = 200
 
 
@@ -105,8 +107,7 @@ def pair_shift(reference: NDArray[np.floating], moving: NDArray[np.floating], *,
     """
     first, second = _standardised(reference), _standardised(moving)
     if first is None or second is None:
-        none_seen = not (np.isfinite(reference).any() and np.isfinite(moving).any())
-        return nothing_found("empty" if none_seen else "flat")
+        return nothing_found("flat" if np.isfinite(reference).any() and np.isfinite(moving).any() else "empty")
     correlation, common = _correlate(first, second, int(np.ceil(prior_px)) + 1)
     if common.max() < 1:
         return nothing_found("empty")
@@ -193,15 +194,14 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
     return correlation, common
 
 
-def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
-    """Yield the integer shifts (2,) of the highest peaks, best first, none within another's lobe."""
-    reach = correlation.shape[0] // 2
+def _candidates(correlation: Floats) -> NDArray[np.intp]:
+    """Return the integer shifts (peak, 2) of the highest peaks, best first, none within another's lobe."""
     # The window is as wide as a lobe: noise on a broad peak makes no second one.
     peaks = np.argwhere(
         (correlation == scipy.ndimage.maximum_filter(correlation, 2 * int(LOBE_PX) + 1)) & (correlation > -1)
     )
-    ranked = peaks[np.argsort(-correlation[tuple(peaks.T)], kind="stable")] - reach
-    yield from ranked[: RIVALS + 1]
+    best = np.argsort(-correlation[tuple(peaks.T)], kind="stable")[: RIVALS + 1]
+    return np.asarray(peaks[best] - correlation.shape[0] // 2)
 
 
 def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | None:
@@ -220,8 +220,7 @@ def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | 
         start, *_ = skimage.registration.phase_cross_correlation(  # type: ignore[no-untyped-call]
             one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
         )
-        start = np.asarray(np.clip(start, -REALIGN_PX, REALIGN_PX))
-        fit = _least_squares(_smoothed(one), _smoothed(other), kept, start)
+        fit = _least_squares(_smoothed(one), _smoothed(other), kept, np.clip(start, -REALIGN_PX, REALIGN_PX))
         if fit is None:
             return None
         if np.abs(fit.shift).max() <= REALIGN_PX:
@@ -242,7 +241,8 @@ def _least_squares(one: Floats, other: Floats, kept: NDArray[np.bool_], shift: F
         answer, *_ = np.linalg.lstsq(system.T @ system, system.T @ target, rcond=SINGULAR)
         if answer[2] <= 0:  # a negative image is no match
             return None
-        change, left = answer[:2] / answer[2], target - system @ answer
+        change = answer[:2] / answer[2]
+        left = target - system @ answer
         if np.abs(change).max() < SETTLED_PX:
             break
         shift = shift + np.clip(change, -1, 1)
@@ -259,8 +259,7 @@ def _fit_of(shift: Floats, target: Floats, left: Floats, slopes: Floats, others:
     strength = float(np.linalg.norm(weakest @ slopes) * np.linalg.norm(weakest @ others))
     noise = float(np.var(left)) / SMOOTHED_NOISE
     error: Floats = np.sqrt(noise * np.sum(direction**2 / np.maximum(value, TINY), axis=1))
-    likeness = float(value.min()) / strength if strength > 0 else 0.0
-    return _Fit(shift, error, misfit, likeness, len(target))
+    return _Fit(shift, error, misfit, float(value.min()) / strength if strength > 0 else 0.0, len(target))
 
 
 def _slopes(image: Floats, kept: NDArray[np.bool_]) -> Floats:
@@ -345,8 +344,7 @@ def solve_sweeps(
     """
     held = reference
     if held is None:
-        groups = [sorted(tied_to(windows, sweep, len(names))) for sweep in range(len(names))]
-        largest = max(groups, key=len, default=[0])
+        largest = max((sorted(tied_to(windows, one, len(names))) for one in range(len(names))), key=len, default=[0])
         held = largest[len(largest) // 2]
     joined = tied_to(windows, held, len(names))
     untied = tuple(number for number in range(len(names)) if number not in joined)
@@ -374,7 +372,8 @@ def solve_sweeps(
 
 def tied_to(windows: Sequence[WindowShift], sweep: int, sweeps: int) -> frozenset[int]:
     """Return the sweeps that windows join to one, itself included."""
-    joined, waiting = {sweep}, [sweep]
+    joined = {sweep}
+    waiting = [sweep]
     while waiting:
         here = waiting.pop()
         for window in windows:
@@ -458,8 +457,7 @@ def _agreed(
     """Return how many windows agree, and on which motion; 0 and no motion if too few do."""
     if len(pairs) < LEAST_WINDOWS:
         return 0, FieldShift()
-    middle = np.array(shape[:2]) / 2
-    places = np.array([place - middle for place, _ in pairs])
+    places = np.array([place for place, _ in pairs]) - np.array(shape[:2]) / 2
     model, inliers = skimage.measure.ransac(  # type: ignore[no-untyped-call]
         (places, places + np.array([shift for _, shift in pairs])),
         skimage.transform.EuclideanTransform,

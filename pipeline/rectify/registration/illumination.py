@@ -110,13 +110,11 @@ def overlap_light(placed: Sequence[PlacedSweep], camera: LineCamera, windows: Se
 def _probe(placed: PlacedSweep, camera: LineCamera, window: Window) -> NDArray[np.float32]:
     """Return values of one sweep in a window, (row along the scan, column along the line, band)."""
     sweep = placed.lines.sweep
-    spacing = sweep.step
-    middle = sum(window.scan_px) / 2
-    rows = min(PROBE_ROWS, int((window.scan_px[1] - window.scan_px[0]) // spacing) + 1)
-    columns = int((window.along_px[1] - window.along_px[0]) // spacing) + 1
-    start = middle - (rows - 1) / 2 * spacing, window.along_px[0]
+    rows = min(PROBE_ROWS, int((window.scan_px[1] - window.scan_px[0]) // sweep.step) + 1)
+    columns = int((window.along_px[1] - window.along_px[0]) // sweep.step) + 1
+    start = sum(window.scan_px) / 2 - (rows - 1) / 2 * sweep.step, window.along_px[0]
     turned = sweep.along == "y"
-    grid = PixelGrid(start[::-1] if turned else start, spacing, (columns, rows) if turned else (rows, columns))
+    grid = PixelGrid(start[::-1] if turned else start, sweep.step, (columns, rows) if turned else (rows, columns))
     values, _ = mosaic_tile([placed], camera, grid, slice(0, grid.shape[0]), slice(0, grid.shape[1]), kernel="bilinear")
     values = placed.signal.spectra(values)
     return values.swapaxes(0, 1) if turned else values

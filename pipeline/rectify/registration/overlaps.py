@@ -63,16 +63,16 @@ class PlacedImage:
     @cached_property
     def scan_paths(self) -> tuple[tuple[ScanPath, NDArray[np.float32]], ...]:
         """Return every scan path with its image, (knot, sample); lines at one place are averaged."""
-        broad, found = self.broad, []
+        found = []
         for scan_path in make_scan_paths(
-            broad.position,
+            self.broad.position,
             self.camera,
-            usable=broad.usable,
+            usable=self.broad.usable,
             shift_px=self.shift_px,
-            binning=broad.sweep.binning,
-            step_px=broad.sweep.step,
+            binning=self.broad.sweep.binning,
+            step_px=self.broad.sweep.step,
         ):
-            values: NDArray[np.float32] = broad.image[scan_path.lines]
+            values: NDArray[np.float32] = self.broad.image[scan_path.lines]
             if len(scan_path.starts) < len(scan_path.lines):
                 count = np.diff(scan_path.starts, append=len(scan_path.lines))
                 values = (np.add.reduceat(values, scan_path.starts, axis=0) / count[:, None]).astype(np.float32)

@@ -81,15 +81,19 @@ def register_sweeps(
 
     Raises SettingsError: windows that are too short. Raises PoseError: a corrected position is beyond the mirror's rim.
     """
-    names, lines = [one.sweep.name for one in sweeps], [len(one.position) for one in sweeps]
-    shifts, among, reference = no_shifts(names), frozenset(range(len(sweeps))), None
+    names = [one.sweep.name for one in sweeps]
+    lines = [len(one.position) for one in sweeps]
+    shifts = no_shifts(names)
+    among = frozenset(range(len(sweeps)))
+    reference = None
     rounds: list[tuple[list[SeamWindow], SweepShifts]] = []
     for reach in (2 * prior_px, min(SETTLED_PRIOR_PX, 2 * prior_px)):
         seen = _measure_windows(place_images(sweeps, shifts, camera), reach, window_px, among)
         measured = [each.measured for each in seen if each.measured is not None]
         solved = solve_sweeps(measured, names, lines, reference=reference)
         shifts = tuple(old.plus(new) for old, new in zip(shifts, solved.shifts, strict=True))
-        reference, among = solved.reference, among - set(solved.untied)
+        reference = solved.reference
+        among -= set(solved.untied)
         left = iter(solved.residual)
         seen = [each if each.measured is None else replace(each, residual_px=next(left)) for each in seen]
         rounds.append((seen, solved))
@@ -172,11 +176,10 @@ def anchor_sweep(
     Raises PoseError: a corrected position is beyond the mirror's rim.
     """
     (shift,) = no_shifts([sweep.sweep.name])
-    lines = len(sweep.position)
     if not sweep.usable.any():
         return Anchor(shift, nothing_found("empty"))
     for reach in (prior_px, min(prior_px, SETTLED_PRIOR_PX)):
-        image = PlacedImage(sweep, camera, shift.of_lines(lines))
+        image = PlacedImage(sweep, camera, shift.of_lines(len(sweep.position)))
         found = _compare_with_mosaic(image, grid, mosaic, reach)
         if found.status != "found":
             return Anchor(no_shifts([sweep.sweep.name])[0], found)
@@ -189,7 +192,8 @@ def _compare_with_mosaic(
     image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float
 ) -> PairShift:
     """Compare a sweep with the mosaic at the scene's pixels that it may have seen."""
-    places, shown = image.edges.reshape(-1, 2), []
+    places = image.edges.reshape(-1, 2)
+    shown = []
     for axis, size in enumerate(field_px(grid, image.broad.sweep.along)):
         low, high = (float(end) + (size - 1) / 2 for end in (places[:, axis].min(), places[:, axis].max()))
         first, last = max(int(np.floor(low - reach_px)), 0), min(int(np.ceil(high + reach_px)), size - 1)

@@ -87,7 +87,9 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
         raise RigError(
             f"expected one cube with a whole line, got {', '.join(sorted(by_name)) or 'an empty folder'}; capture again"
         )
-    first, held, notes = int(parts[0][1]), len(cube.values), list[str]()
+    first = int(parts[0][1])
+    held = len(cube.values)
+    notes: list[str] = []
     if cube.lost:
         notes.append(f"raw_{first} is cut off: {held} of {held + cube.lost} lines are whole")
     times = _times(by_name, first, cube, read, notes) or LineTimes.unknown(held)
@@ -159,10 +161,10 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     """
     if lines.ndim != 3 or not lines.size:
         raise ShapeError(f"expected at least one frame (line, sample, band), got {lines.shape}; capture the reference")
-    count, stuck = len(lines), lines.min(axis=0) == lines.max(axis=0)
-    if count < FRAMES_FOR_STUCK or stuck.mean() > 0.5:  # most elements have some noise
+    stuck = lines.min(axis=0) == lines.max(axis=0)
+    if len(lines) < FRAMES_FOR_STUCK or stuck.mean() > 0.5:  # most elements have some noise
         stuck = np.zeros(stuck.shape, np.bool_)
-    return MeanFrame((lines.sum(axis=0, dtype=np.int64) / count).astype(np.float32), stuck)
+    return MeanFrame((lines.sum(axis=0, dtype=np.int64) / len(lines)).astype(np.float32), stuck)
 
 
 def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0) -> References:

@@ -147,7 +147,9 @@ def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress 
 
 def _transfer(session: ftplib.FTP, file: RemoteFile, kept: Kept, progress: Progress | None) -> None:
     """Read once from shortly before the end of the held bytes: compare with those, and add the rest."""
-    name, size, held = file.name, session.size(file.name), kept.size(file.name)
+    name = file.name
+    size = session.size(name)
+    held = kept.size(name)
     if size is None or file.size not in (None, size):
         raise RigError(f"{name} has {size} bytes, {file.size} when it was listed; fetch it when the capture has ended")
     another = RigError(f"the {held} bytes of {name} that are held are of another file; remove them and fetch again")

@@ -33,8 +33,7 @@ _WHOLE = re.compile(r"-?\d{1,19}")
 
 INTERLEAVES = ("bil", "bip", "bsq")
 # data type codes of the format's description
-_CODES = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15)
-DATA_TYPES = dict(zip(_CODES, ("u1", "i2", "i4", "f4", "f8", "c8", "c16", "u2", "u4", "i8", "u8"), strict=True))
+DATA_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 6: "c8", 9: "c16", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
 # words of a file type that is not plain numbers
 OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 
@@ -86,7 +85,8 @@ def _pairs(lines: list[str], where: str, notes: list[str]) -> Iterator[tuple[str
 
 def _braced(value: str, lines: list[str], number: int, where: str, notes: list[str]) -> tuple[str, int]:
     """Return the content of a value in braces, and the number of the line after its end."""
-    parts, depth = [value], _depth(value)
+    parts = [value]
+    depth = _depth(value)
     end = number
     while depth > 0 and end < len(lines):
         parts.append(lines[end])
@@ -96,7 +96,8 @@ def _braced(value: str, lines: list[str], number: int, where: str, notes: list[s
         ends = [at for at, part in enumerate(parts) if part.rstrip().endswith("}")]
         if not ends:
             raise SceneError(f"{where} opens a brace that is never closed; is the header cut off?")
-        parts, end = parts[: ends[0] + 1], number + ends[0]
+        parts = parts[: ends[0] + 1]
+        end = number + ends[0]
         notes.append(f"{where} {UNBALANCED}")
         if sum(note.endswith(UNBALANCED) for note in notes) > MOST_UNBALANCED:
             raise SceneError(f"{where} {UNBALANCED}, as do {MOST_UNBALANCED} values before it; correct the header")
@@ -131,19 +132,16 @@ def wavelengths_nm(
     if values is None:
         return None, 1.0
     unit = fields.get("wavelength units", "").strip().lower()
-    if unit in NANOMETRES:
-        scale = 1.0
-    elif unit in MICROMETRES:
-        scale = 1000.0
-    elif unit in UNSAID and 200 <= values.min() <= values.max() <= 20000:
-        scale = 1.0
+    if unit in UNSAID and 200 <= values.min() <= values.max() <= 20000:
+        unit = "nm"
         notes.append("the wavelengths have no unit, read as nm by their size")
     elif unit in UNSAID and 0.2 <= values.min() <= values.max() <= 20:
-        scale = 1000.0
+        unit = "micrometres"
         notes.append("the wavelengths have no unit, read as micrometres by their size")
-    else:
+    if unit not in NANOMETRES | MICROMETRES:
         notes.append(f"wavelength units = {unit!r} are no lengths that can be read; the wavelengths are left out")
         return None, 1.0
+    scale = 1.0 if unit in NANOMETRES else 1000.0
     return values * scale, scale
 
 
@@ -248,8 +246,7 @@ def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
     if finite_number(fields.get("file compression", "0")) != 0:
         raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
     for key in ("major frame offsets", "minor frame offsets"):
-        words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
-        if any(finite_number(word) != 0 for word in words):
+        if any(word and finite_number(word) != 0 for word in re.split(r"[,\s]+", fields.get(key, ""))):
             raise SceneError(
                 f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not supported; remove them"
             )
@@ -290,7 +287,9 @@ def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[st
 
     Raises SceneError: more than ``most`` lines are in no part.
     """
-    starts, end, missing = list[int](), 0, 0
+    starts: list[int] = []
+    end = 0
+    missing = 0
     for name, frame, lines in parts:
         start = frame - parts[0][1]
         missing += max(start - end, 0)
@@ -310,7 +309,8 @@ def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where
 
     Notes call it ``name``, messages ``where`` or ``name``. Raises SceneError: no line is a frame.
     """
-    frames, stamps, odd = array("q"), array("q"), 0
+    frames, stamps = array("q"), array("q")
+    odd = 0
     for number, line in enumerate(lines):
         words = [word for word in re.split(r"[\t ,;]+", line.strip()) if word]
         whole = [int(word) for word in words[:2] if _WHOLE.fullmatch(word)]
@@ -345,7 +345,8 @@ def times_of_lines(index: FrameIndex, first_frame: int, lines: int, lost: int = 
         dropped = int(frame[-1] - frame[0]) + 1 - len(frame)
         notes = (f"{dropped} frames between the first and the last were dropped by the camera",) if dropped else ()
         return LineTimes(frame[:lines], index.stamp_us[:lines], notes)
-    found, place = LineTimes.unknown(lines), frame - first_frame
+    found = LineTimes.unknown(lines)
+    place = frame - first_frame
     inside = (place >= 0) & (place < lines)
     found.frame[place[inside]] = frame[inside]
     found.stamp_us[place[inside]] = index.stamp_us[inside]

@@ -38,8 +38,7 @@ _NEGOTIATION = re.compile(rb"\xff[\xfb-\xfe].", re.DOTALL)  # of telnet; UTF-8 n
 
 def to_request(name: str, argument: Any = None) -> bytes:
     """Return the bytes of a command."""
-    text = name if argument is None else f"{name}({json.dumps(argument)})"
-    return text.encode("ascii") + b"\r"
+    return (name if argument is None else f"{name}({json.dumps(argument)})").encode("ascii") + b"\r"
 
 
 class ReplyReader:
@@ -61,10 +60,9 @@ def response_of(text: str, name: str, port: str) -> Any:
 
     Raises DeviceRefused: it reports a failure. Raises RigError: it is no such reply.
     """
-    # The command is repeated before a reply that does not begin as JSON.
-    body = text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2]
     try:
-        content = json.loads(body)
+        # The command is repeated before a reply that does not begin as JSON.
+        content = json.loads(text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2])
         success, response, reason = content["success"], content.get("response"), content.get("errorMessage")
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise RigError(
@@ -132,11 +130,12 @@ class HeadwallCamera:
     @classmethod
     def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
         """Return a camera on the network."""
-
-        def connect() -> SocketTransport:
-            return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
-
-        return cls(connect, server, clock=clock, **given)
+        return cls(
+            lambda: SocketTransport(address.host, address.port, clock, connect_s=address.connect_s),
+            server,
+            clock=clock,
+            **given,
+        )
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period; StateUnknown where a capture may be running, see ``capture``. [ms]"""
@@ -187,8 +186,7 @@ class HeadwallCamera:
 
         Raises RigError where the capture still runs, or its files do not belong together.
         """
-        files = self._finished(folder)
-        files.sort(key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
+        files = sorted(self._finished(folder), key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
         fetch_files(self.server, files, kept, progress, clock=self.clock)
         return read_capture([file.name for file in files], _reader(kept))
 
@@ -238,7 +236,8 @@ class HeadwallCamera:
             except RigError as error:
                 LOG.info("%s; connecting again", error)
                 self._hang_up()
-        self._line, self._reader = self._connect(), ReplyReader()
+        self._line = self._connect()
+        self._reader = ReplyReader()
         try:
             self._wait(self._line, "the greeting")
         except RigError:

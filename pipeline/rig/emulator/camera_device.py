@@ -65,10 +65,6 @@ class EmulatedCapture:
         first, stop = np.clip(bounds, 0, self.frames)
         return np.asarray(self.began_s + np.arange(first, stop) * self.period_s)
 
-    def running(self, now_s: float) -> bool:
-        """Return whether frames are still to come."""
-        return self.due(now_s) < self.frames
-
     def pending(self, now_s: float) -> Ints:
         """Return the numbers of some of the next frames that are exposed and not taken yet."""
         return np.arange(self._taken, max(min(self._taken + _BLOCK, self.due(now_s)), self._taken))
@@ -115,7 +111,8 @@ class CameraDevice:
     """
 
     def __init__(self, lines: Lines, clock: Clock, *, wavelength_nm: Sequence[float] = ()) -> None:
-        self.clock, self.wavelength_nm = clock, wavelength_nm
+        self.clock = clock
+        self.wavelength_nm = wavelength_nm
         self.exposure_ms, self.period_ms = 10.0, 10.0
         self.captures: list[EmulatedCapture] = []
         self._numbers = itertools.count()
@@ -139,7 +136,7 @@ class CameraDevice:
 
     def is_capturing(self) -> bool:
         """Return whether a capture runs."""
-        return bool(self.captures) and self.captures[-1].running(self.clock.now())
+        return bool(self.captures) and self.captures[-1].due(self.clock.now()) < self.captures[-1].frames
 
     def files(self) -> dict[str, bytes]:
         """Return all files by their whole names, as they are now."""
@@ -238,7 +235,6 @@ try:
 except ImportError as error:
     raise RigError("the emulated camera's files need pyftpdlib; install it: pip install 'pyftpdlib>=2'") from error
 
-LOG = logging.getLogger(__name__)
 _SLICE_S = 0.05  # how soon the thread sees that it is to end
 _MOST_READ = 4096  # bytes
 
@@ -311,7 +307,15 @@ class CameraServer(Closing):
     def __init__(self, device: CameraDevice, ports: tuple[int, int] = (0, 0)) -> None:
         self.device = device
         self._ended = threading.Event()
-        self._files = _file_server(device, (self.host, ports[1]), self.handler or FileHandler)
+        logger = logging.getLogger("pyftpdlib")
+        logger.setLevel(logging.ERROR)
+        if not logger.handlers:
+            logger.addHandler(logging.NullHandler())  # else it logs everything on stderr
+        authorizer = DummyAuthorizer()
+        authorizer.add_user(FileServer.user, FileServer.password, homedir=".", perm="elr")
+        attributes = {"device": device, "authorizer": authorizer}
+        handler = type("CameraFileHandler", (self.handler or FileHandler,), attributes)
+        self._files = FTPServer((self.host, ports[1]), handler, ioloop=IOLoop())
         control = _ControlPort(device, (self.host, ports[0]), self._files.ioloop)
         self.port = int(control.socket.getsockname()[1])
         self.file_port = int(self._files.socket.getsockname()[1])
@@ -327,17 +331,6 @@ class CameraServer(Closing):
         while not self._ended.is_set():
             self._files.serve_forever(timeout=_SLICE_S, blocking=False)
         self._files.close_all()
-
-
-def _file_server(device: CameraDevice, address: tuple[str, int], kind: type[FileHandler]) -> FTPServer:
-    logger = logging.getLogger("pyftpdlib")
-    logger.setLevel(logging.ERROR)
-    if not logger.handlers:
-        logger.addHandler(logging.NullHandler())  # else it logs everything on stderr
-    authorizer = DummyAuthorizer()
-    authorizer.add_user(FileServer.user, FileServer.password, homedir=".", perm="elr")
-    handler = type("CameraFileHandler", (kind,), {"device": device, "authorizer": authorizer})
-    return FTPServer(address, handler, ioloop=IOLoop())
 
 
 class _FilesInMemory(AbstractedFS):  # type: ignore[misc]

@@ -22,20 +22,18 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting, direction_to_scene, position_to_direction, wire_positions
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.capture_paths import REFERENCES, Announced, announced
 from pipeline.rig.device_settings import Pulses
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraServer, EmulatedCapture, Floats, Ints, Raw
+from pipeline.rig.emulator.camera_device import CameraDevice, CameraServer, EmulatedCapture, Floats, Raw
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.transports import BITS_PER_BYTE, SYSTEM_CLOCK, Clock, Closing
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
@@ -77,29 +75,29 @@ class SceneView:
         ``held`` are (line, step, 2) positions of the device during each exposure, ``times_ms`` exposure and frame
         period. Drifts count from ``started_s``, the sweep's start, unless the source's own clock has it.
         """
-        sweep, rig = replace(sweep, binning=1), self._rig(times_ms)
+        sweep = replace(sweep, binning=1)
+        rig = self._rig(times_ms)
         position = self.mounting.to_model(held)
-        number = self.numbers(sweep, position)
+        scan = self._place(position)[..., 1].mean(axis=1)
+        nearest = np.rint((scan - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step)
+        number = np.clip(nearest, 0, sweep.lines - 1).astype(np.int64)  # of the planned line nearest to each exposure
         planned = sweep_positions(sweep, rig.camera)[number]
         wired = wire_positions(planned.reshape(-1, 2), self.mounting).reshape(planned.shape)
         as_planned = (held.astype(np.float32) == wired).all(axis=(1, 2))
-        source, raw = self.source, []
+        source = self.source
+        raw = []
         known = source.clock is not None and sweep.name in source.clock
         started_s = source.started_s(sweep) if known else started_s
-        for run in _runs(number, as_planned):
-            lines = range(int(number[run][0]), int(number[run][-1]) + 1)
+        edges = np.flatnonzero((np.diff(number) != 1) | (np.diff(as_planned.astype(np.int8)) != 0)) + 1
+        for start, stop in zip([0, *edges], [*edges, len(number)], strict=True):
+            run = slice(start, stop)  # lines that follow each other and are all as planned, or all not
+            lines = range(int(number[start]), int(number[stop - 1]) + 1)
             choice = source.choice
-            if not as_planned[run][0]:
+            if not as_planned[start]:
                 aim = OffPlanAim(self._place(position[run]) - self._place(planned[run]), lines.start)
                 choice = Choice(((aim, "exact"), *choice.effects))
             raw.append(render_lines(source.scene, rig, choice, sweep, lines, seed=source.seed, started_s=started_s))
         return np.concatenate(raw)
-
-    def numbers(self, sweep: Sweep, position: Floats) -> Ints:
-        """Return the line (line,) of the sweep that each exposure (line, step, 2) is nearest to."""
-        scan = self._place(position)[..., 1].mean(axis=1)
-        number = np.rint((scan - sweep.start_px - (sweep.positions - 1) / 2) / sweep.step)
-        return np.asarray(np.clip(number, 0, sweep.lines - 1).astype(np.int64))
 
     def references(self, times_ms: tuple[float, float]) -> dict[str, Raw]:
         """Return dark and white frames (frame, sample, band) whose means are the source's."""
@@ -127,13 +125,6 @@ class SceneView:
         )
 
 
-def _runs(number: Ints, alike: NDArray[np.bool_]) -> Iterator[slice]:
-    """Yield consecutive exposures whose lines follow each other and that are all as planned, or all not."""
-    edges = np.flatnonzero((np.diff(number) != 1) | (np.diff(alike.astype(np.int8)) != 0)) + 1
-    for start, stop in zip([0, *edges], [*edges, len(number)], strict=True):
-        yield slice(int(start), int(stop))
-
-
 class SceneCamera(CameraDevice):
     """A camera that images a scene where a mirror was sent.
 
@@ -149,7 +140,9 @@ class SceneCamera(CameraDevice):
 
     def __init__(self, view: SceneView, mirror: MirrorDevice, clock: Clock, *, wired: Pulses = "position") -> None:
         super().__init__(self._scene_lines, clock, wavelength_nm=view.source.wavelength_nm.tolist())
-        self.view, self.mirror, self.wired = view, mirror, wired
+        self.view = view
+        self.mirror = mirror
+        self.wired = wired
         self.aside = False
 
     def pulses(self, from_s: float, to_s: float) -> Floats:

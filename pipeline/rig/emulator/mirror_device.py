@@ -33,8 +33,7 @@ Floats = NDArray[np.float64]
 Pulses = Callable[[float, float], Floats]  # start and end of a time span -> times of the rising edges in it
 
 # properties of the emulated controller; none of them was read from a real one
-MODEL = "MR-E-2"
-TEXTS = {ID: MODEL, VERSION: "EMULATOR 1.0", SERIAL: "EMUL0001"}
+TEXTS = {ID: "MR-E-2", VERSION: "EMULATOR 1.0", SERIAL: "EMUL0001"}
 CELLS = 3000  # of the vector memory, X and Y
 LOG_ROWS = 16_000
 TURNAROUND_S = 2e-4  # from a request's last byte to the reply
@@ -68,29 +67,24 @@ class Register:
         return value
 
 
-def _registers() -> dict[int, Register]:
-    """Return the registers of a controller that take a value, by id."""
-    found = {pro.log_slot(slot): Register() for slot in range(pro.LOG_SLOTS)} | {
-        pro.LOG_RUN: Register(most=1),
-        pro.LOG_RATE: Register(1.0, HIGHEST_HZ, HIGHEST_HZ, whole=False),
+# the registers of a controller that take a value, by id
+REGISTERS = {pro.log_slot(slot): Register() for slot in range(pro.LOG_SLOTS)} | {
+    pro.LOG_RUN: Register(most=1),
+    pro.LOG_RATE: Register(1.0, HIGHEST_HZ, HIGHEST_HZ, whole=False),
+}
+for _channel in (pro.X, pro.Y):
+    REGISTERS |= {
+        _channel.vector(VectorRegister.UNIT): Register(most=2),
+        _channel.vector(VectorRegister.RUN): Register(most=1),
+        _channel.vector(VectorRegister.START): Register(most=CELLS),
+        _channel.vector(VectorRegister.END): Register(most=CELLS),
+        _channel.vector(VectorRegister.FREQUENCY): Register(1e-3, HIGHEST_HZ, HIGHEST_HZ, whole=False),
+        _channel.vector(VectorRegister.CYCLES): Register(1, 2**31 - 1, 1),
+        _channel.vector(VectorRegister.TRIGGER): Register(most=2),
+        _channel.input: Register(most=0xFF, start=_channel.static_system),
+        _channel.control: Register(most=0xFF, start=_channel.xy_system),
+        _channel.static_xy: Register(-1.0, 1.0, whole=False),
     }
-    for channel in (pro.X, pro.Y):
-        unit = {
-            VectorRegister.UNIT: Register(most=2),
-            VectorRegister.RUN: Register(most=1),
-            VectorRegister.START: Register(most=CELLS),
-            VectorRegister.END: Register(most=CELLS),
-            VectorRegister.FREQUENCY: Register(1e-3, HIGHEST_HZ, HIGHEST_HZ, whole=False),
-            VectorRegister.CYCLES: Register(1, 2**31 - 1, 1),
-            VectorRegister.TRIGGER: Register(most=2),
-        }
-        found |= {channel.vector(name): register for name, register in unit.items()}
-        found |= {
-            channel.input: Register(most=0xFF, start=channel.static_system),
-            channel.control: Register(most=0xFF, start=channel.xy_system),
-            channel.static_xy: Register(-1.0, 1.0, whole=False),
-        }
-    return found
 
 
 class Axis:
@@ -151,8 +145,7 @@ class MirrorState:
         self.clock = clock
         self.flags = Status(0)  # further status bits
         self.memory = np.zeros(CELLS, np.float32)
-        self.registers = _registers()
-        self.values = {number: register.start for number, register in self.registers.items()}
+        self.values = {number: register.start for number, register in REGISTERS.items()}
         self.axes = [Axis(-math.inf), Axis(-math.inf)]
         self.playbacks = [Playback(), Playback()]
         self._log_s: tuple[float, float] | None = None  # start and stop of the log
@@ -265,9 +258,9 @@ class MirrorState:
         return min(int(seconds * self.values[pro.LOG_RATE] + 1e-9) + 1, LOG_ROWS)
 
     def _register(self, number: int) -> Register:
-        if number not in self.registers:
+        if number not in REGISTERS:
             raise RefusedError(ErrorCode.NO_REGISTER)
-        return self.registers[number]
+        return REGISTERS[number]
 
 
 def _check_within(stop: int, size: int) -> None:
@@ -347,7 +340,9 @@ class MirrorDevice:
 
     def set_mode(self, mode: Mode) -> None:
         """Speak another mode from the next byte on."""
-        self.mode, self._line, self._reader = mode, b"", pro.FrameReader()
+        self.mode = mode
+        self._line = b""
+        self._reader = pro.FrameReader()
 
     def _take_line(self, data: bytes, out: list[Chunk]) -> bytes:
         """Take bytes up to the end of a line, and return those behind it: a line may change the mode."""
@@ -375,8 +370,7 @@ class MirrorDevice:
     def carry_out(self, request: Request) -> bytes:
         """Do what a request asks for and return the bytes of the reply."""
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
-            command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
-            return _refusal(command, ErrorCode.FRAME_INVALID)
+            return _refusal(request.damaged.data[1] if len(request.damaged.data) > 1 else 0, ErrorCode.FRAME_INVALID)
         if request.frame is None:
             return self._simple(request.line).encode("ascii") + END
         frame = request.frame

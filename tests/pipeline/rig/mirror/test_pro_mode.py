@@ -104,8 +104,8 @@ def test_a_wrong_crc_is_reported_with_its_frame():
 HALF, MINUS_QUARTER = b"\x3f\x00\x00\x00", b"\xbe\x80\x00\x00"
 REQUESTS = [
     (ASK_FIRMWARE, "7E 00 01 02 00 00 A0 3C 7E"),
-    (pro.ask_status(), "7E 00 02 02 00 00 A0 78 7E"),
-    (pro.go_simple(), "7E 00 06 02 00 00 A1 48 7E"),
+    (pro.ASK_STATUS, "7E 00 02 02 00 00 A0 78 7E"),
+    (pro.GO_SIMPLE, "7E 00 06 02 00 00 A1 48 7E"),
     (set_value(0x5002, 0.5), "7E 00 10 06 50 02 3F 00 00 00 1E 88 7E"),
     (pro.get_value(0x680A), "7E 00 11 02 68 0A 0B 3B 7E"),
     (pro.set_values({0x6801: 1, 0x6901: 1}), "7E 00 12 0E 00 02 68 01 69 01 00 00 00 01 00 00 00 01 42 49 7E"),
