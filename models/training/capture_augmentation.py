@@ -118,8 +118,8 @@ class CaptureAugmentation:
         self.darkest_ms = darkest_ms
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
-    def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Return a crop (y, x, column) by a random capture, as inputs of the overview and the full network.
+    def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> Tensor:
+        """Return a crop (y, x, column) by a random capture, as input of the networks.
 
         It is a uniform scan, or a first pass with closer lines in some areas. Exposures are log-uniform.
         """
@@ -127,10 +127,8 @@ class CaptureAugmentation:
         step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
         least_power = float(np.exp(rng.uniform(*np.log(LEAST_POWERS)))) if rng.random() < CONDENSED else 0.0
         if step > 1 and rng.random() < INTERLACED:
-            image = self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
-        else:
-            image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng, least_power=least_power)
-        return image, image
+            return self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
+        return self.scan(columns, noise, light=self._light(rng), step=step, rng=rng, least_power=least_power)
 
     def _light(self, rng: np.random.Generator) -> float:
         """Draw an exposure between the darkest and the reference, as a fraction of the latter."""

@@ -272,7 +272,7 @@ FEW = 4  # components that are summed one by one
 
 
 class PartedKernels(NamedTuple):
-    """PartedKernels and their parts: shifts (2, kernel) [px], variances (2, kernel) [px^2], places (2, part) [px]."""
+    """Kernels and their parts: shifts (2, kernel) [px], variances (2, kernel) [px^2], places (2, part) [px]."""
 
     shift: Radiance
     variance: Floats

@@ -102,7 +102,7 @@ def _binomial(planes: NDArray[np.float32], firsts: NDArray[np.intp], axis: int) 
 
 @dataclass(frozen=True)
 class SceneRadiance:
-    """Return electrons at the default exposure: (component, band) per unit, and (band,) of the white reference."""
+    """Electrons at the default exposure: (component, band) per unit, and (band,) of the white reference."""
 
     electrons: NDArray[np.float32]
     white_reference_electrons: NDArray[np.float32]

@@ -9,9 +9,9 @@ s about 1. Every part draws from its own stream of the seed. Parts, and the modu
   lacks most. Each use comes at least once where there are enough parcels. Lines between parcels go by
   ``BORDER_FRACTIONS``, likewise.
 * ``farm_plan``: heading and period of each field's rows, tramlines, weeds, lodging.
-* ``seasons``: calendars, cover, stages, lodging, weeds' growth, leaves of trees, water in the soil, the sun's place.
+* ``land``: calendars, cover, stages, lodging, weeds' growth, leaves of trees, water in the soil, the sun's place.
 * ``spectra``: materials at their stages, the soil line.
-* ``fields``, ``weeds``, ``borders``: the painting. Shadows fall away from the sun, cot(elevation) long. ``wheat_b`` is
+* ``fields``: the painting. Shadows fall away from the sun, cot(elevation) long. ``wheat_b`` is
   ``wheat_a`` but for 690-740 nm. A fraction of 0.80 of a pixel's wheat has its own variety's red edge, the rest the
   other's. It varies by 0.17 (sd) from pixel to pixel, by 0.05 over 55 px.
 * Light: 0.95 with sd 0.03 (260 px wide), at most 1. The material shade stands for light that is missing, so that
