@@ -51,7 +51,8 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         sums += np.bincount(classes[known], sure[known], 256)
         sure_pixels += np.bincount(classes[known], minlength=256)
     confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
-    pixels, areas = counts[: len(names)], hectares_of_classes(run.receipt)
+    pixels = counts[: len(names)]
+    areas = hectares_of_classes(run.receipt)
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     unknown = np.full(len(names), np.nan)
@@ -90,7 +91,8 @@ class MosaicView:
         """Return the map's grid with its rays, by the pose in the map's store; None without one."""
         if self.run.store("ground_map") is None:
             return None
-        path, scene = self.run.path("ground_map"), grid_of(open_image(self.run.path("class_map"), "classes").about)
+        path = self.run.path("ground_map")
+        scene = grid_of(open_image(self.run.path("class_map"), "classes").about)
         geobox = load_geobox(path)
         assert scene is not None
         assert geobox is not None
@@ -120,9 +122,8 @@ def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], bands: Sequence[int]
     known = pixels[np.isfinite(pixels).all(axis=-1)]
     if not len(known):
         return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
-    size = mosaic.shape
-    first = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, size)
-    last = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, size)
+    first = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, mosaic.shape)
+    last = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, mosaic.shape)
     window = mosaic.values(slice(first[0], last[0]), slice(first[1], last[1]), bands)
     return image_at(np.ascontiguousarray(window), pixels - first)
 

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     import flows.publish.panels as panels
     import flows.publish.report as pages
 else:
-    mpl_figure, panels = deferred("matplotlib.figure"), deferred("flows.publish.panels")
+    mpl_figure = deferred("matplotlib.figure")
+    panels = deferred("flows.publish.panels")
     pages = deferred("flows.publish.report")
 
 LEADING_CLASSES = 3  # of a run in the table

@@ -80,7 +80,8 @@ def serve(
     port
         Port of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
     """
-    schedule, served = schedule_of(cron, every, timezone), load_fields(fields, out)
+    schedule = schedule_of(cron, every, timezone)
+    served = load_fields(fields, out)
     archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
     try:
         with terminable(), ExitStack() as held:

@@ -69,7 +69,9 @@ def opened_first(settings: Settings) -> Iterator[None]:
 
 
 def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
-    observer, requested, due = current_observer(), settings.settings(), _due_time()
+    observer = current_observer()
+    requested = settings.settings()
+    due = _due_time()
     first, run = next(iter(_opened.get() or ()), (None, None))
     if run is None or first is not requested:
         try:
@@ -112,7 +114,8 @@ def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef
 
 def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
     """Return the condensed sweeps of a pass; capture only what the archive lacks. Raises as `capture_pass`."""
-    condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], survey.run.archive
+    condense, stage = CONDENSED[sweeps], PASSES[sweeps]
+    archive = survey.run.archive
     before = survey.products.there("capture_coarse") if sweeps == "fine" else []
     found = None
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the capture
@@ -132,7 +135,8 @@ def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> Stage
 
 def first_mosaic(survey: OpenSurvey, *inputs: StageRef | None) -> StageRef:
     """Return the mosaic of the first pass; one that was cleared after the second pass is not made again."""
-    archive, given = survey.run.archive, [ref for ref in inputs if ref is not None]
+    archive = survey.run.archive
+    given = [ref for ref in inputs if ref is not None]
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the stage
         mosaic = archive.ref(rectify.product.name, rectify.key(rectify.wants(survey.run, *given)))
         cleared = archive.is_known(mosaic) and archive.find(mosaic.stage, mosaic.key) is None

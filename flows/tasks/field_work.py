@@ -179,7 +179,8 @@ def coarse_region(weights: Weights, mosaic: StageRef, region: Region, capture: L
     """
     free_tiles()
     give_back_freed_memory()  # regions differ in size: their remainders would add up over a large field
-    coarse, window = open_mosaic(mosaic.path / "mosaic.zarr"), (region.read.rows, region.read.columns)
+    coarse = open_mosaic(mosaic.path / "mosaic.zarr")
+    window = (region.read.rows, region.read.columns)
     mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(

@@ -146,10 +146,9 @@ class CaptureRun:
     @property
     def recorder(self) -> SweepRecorder:
         """Return the recorder of sweeps."""
-        scene, settings = self.scene, self.settings
-        bands = scene.wavelength_nm, scene.fwhm_nm
+        bands = self.scene.wavelength_nm, self.scene.fwhm_nm
         return SweepRecorder(
-            self.archive, self.source, self.source_key, *bands, self.camera, settings.cost, settings.pool
+            self.archive, self.source, self.source_key, *bands, self.camera, self.settings.cost, self.settings.pool
         )
 
 
@@ -203,10 +202,10 @@ class SurveyRun(CaptureRun):
 
         It follows from the accepted loss, unless the settings limit multiply-adds. A prior map leaves less to gain.
         """
-        settings, cascade = self.settings, self.cascade
-        if cascade is None or settings.macs is not None or settings.policy != "gain":
+        cascade = self.cascade
+        if cascade is None or self.settings.macs is not None or self.settings.policy != "gain":
             return None
-        least = cascade.within(settings.expected_loss / 100)
+        least = cascade.within(self.settings.expected_loss / 100)
         return least if least is None or self.prior is None else PRIOR_MAP_GAIN * least
 
     @property
@@ -233,9 +232,8 @@ class SurveyRun(CaptureRun):
     @property
     def frame(self) -> FieldFrame:
         """Return the frame of all images of the survey."""
-        scene = self.scene
-        bands = scene.wavelength_nm, scene.fwhm_nm
-        return FieldFrame(self.grid, self.camera.ifov_rad, *bands, scene.missing, scene.geobox)
+        bands = self.scene.wavelength_nm, self.scene.fwhm_nm
+        return FieldFrame(self.grid, self.camera.ifov_rad, *bands, self.scene.missing, self.scene.geobox)
 
     @property
     def work(self) -> FieldWork:
@@ -251,10 +249,9 @@ class SurveyRun(CaptureRun):
     @property
     def capture(self) -> LineSpec:
         """Return line spacing and light of the first pass or of the uniform scan."""
-        settings = self.settings
-        exposure_ms, step = settings.scan_exposure_ms, settings.scan_step or 1
+        exposure_ms, step = self.settings.scan_exposure_ms, self.settings.scan_step or 1
         if not self.plan.plain:
-            exposure_ms, step = settings.coarse_exposure_ms, self.plan.coarse[0].step
+            exposure_ms, step = self.settings.coarse_exposure_ms, self.plan.coarse[0].step
         return LineSpec(self.light.light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
 
     @property
@@ -272,9 +269,10 @@ class SurveyRun(CaptureRun):
     @property
     def second_pass(self) -> SecondPass | None:
         """Return the planner of the second pass; None for a uniform scan or a raster."""
-        plan, field = self.plan, (self.grid, self.camera, self.settings.cost)
+        plan = self.plan
         if plan.plain:
             return None
+        field = (self.grid, self.camera, self.settings.cost)
         of_recording = () if self.recorded is None else (self.recorded.fine_pass, self.recorded.exposures_ms)
         return SecondPass(*field, plan.coarse, plan.full, plan.fine_s, plan.margin_px, *of_recording)
 
@@ -337,7 +335,8 @@ class SurveyRun(CaptureRun):
         self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None
     ) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
-        settings, everything = self.settings, self.kept_patches
+        settings = self.settings
+        everything = self.kept_patches
         return {
             "asked": {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss},
             "patches": len(patch_index),
@@ -359,7 +358,9 @@ class SurveyRun(CaptureRun):
         """Return as many patches as are expected to be read at full resolution, or as the budget pays for."""
         if self.budget is not None:
             return self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel())  # all gain the same
-        cascade, least, every = self.cascade, self.least_gain, self.kept_patches
+        cascade = self.cascade
+        least = self.least_gain
+        every = self.kept_patches
         if self.part:
             every = np.intersect1d(every, self.scanned.patch_index)
         return every if cascade is None or least is None else every[: round(cascade.fraction_at(least) * len(every))]
@@ -379,7 +380,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     settings = replace(settings, device=choose_device(settings.device))
     path = weights_path(settings)
     model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
-    described, refused = model.described, farm_refusal(settings)
+    described = model.described
+    refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
@@ -387,21 +389,23 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     ood_detector = model.asked_ood(settings.unknown)
-    name, found = settings.name or Path(scene.name).stem, None
+    name = settings.name or Path(scene.name).stem
+    found = None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         asked = (settings, name, grid, described.class_names, scene)
         found = (None, ()) if archive is None else find_prior(archive, *asked)
-    passes, planned = None if recorded is None else recorded.passes, _PlannedCapture(settings)
+    passes = None if recorded is None else recorded.passes
+    planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
         planned = _plan_capture(settings, scene, zones, path, described, prior, passes, planning=planning)
-    settings, plan = planned.settings, planned.plan
+    settings = planned.settings
     read = min(len(scene.wavelength_nm), SMOOTH)  # components that a plan assumes; most mosaics have 11 to 33
     costs = ReadingCosts(described.config, grid, read)
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
-    source, simulated, raster = _open_source(settings, scene, grid, plan, recorded, pixels)
+    source, simulated, raster = _open_source(settings, scene, grid, planned.plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
     if raster is not None and not planning:
         outside += other_unit(raster, scene.wavelength_nm, model.load(), path)
@@ -414,12 +418,12 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=_representative_sweeps(plan, settings, scene, described),
+        planned=_representative_sweeps(planned.plan, settings, scene, described),
         described=described,
         load=model.load,
         grid=grid,
         costs=costs,
-        plan=plan,
+        plan=planned.plan,
         recorded=passes,
         scans=planned.scans,
         zones=zones,
@@ -440,7 +444,8 @@ def _representative_sweeps(
     """Return the sweeps of a uniform scan, or of a first pass and full scans of exposures that a second may have."""
     if plan.plain:
         return tuple(plan.coarse)
-    record, exposures = described.record.get("scans"), [None]
+    record = described.record.get("scans")
+    exposures = [None]
     if record is not None and plan.by_record:
         ends = ScanPerformance.read(record, scene.light_fraction).offered_ms(settings.camera)
         exposures = np.geomspace(*ends, REPRESENTATIVE).tolist()
@@ -499,7 +504,9 @@ def _plan_capture(
     Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise. With ``planning``, a visit that a
     survey would skip has a note.
     """
-    extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
+    extent = None
+    extent_notes: tuple[str, ...] = ()
+    is_part = settings.extent == EXTENT_PART
     if is_part and prior is None:
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
         extent_notes = ("there is no prior map: the whole field is captured",)
@@ -560,7 +567,8 @@ def noise_seed(settings: Settings) -> int:
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
     """Return the simulated rig in front of a scene, without effects."""
-    pointing, seed = None, noise_seed(settings)
+    pointing = None
+    seed = noise_seed(settings)
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, seed=seed)
     return SimulatedSource(scene, settings.simulated_rig, seed, {}, name=settings.source, pointing=pointing)

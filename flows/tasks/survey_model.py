@@ -50,7 +50,8 @@ class SurveyModel:
 
         Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
         """
-        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(device)))
+        described = describe_weights(path)
+        load = Once(lambda: load_weights(path).on(choose_device(device)))
         if not planning:
             load()
             if described.reader is not None:
@@ -106,7 +107,8 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
-OTHER_UNIT, SAMPLED_ROWS = 20.0, 64  # largest ratio of medians, and rows of which it is measured
+OTHER_UNIT = 20.0  # largest ratio of medians
+SAMPLED_ROWS = 64  # of which it is measured
 DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # tolerances of the ranges of training
 
 
@@ -129,13 +131,15 @@ def beyond_training(
         if 2 * beyond.sum() > len(beyond):
             found.append(f"bands outside of {low:.0f}-{high:.0f} nm: {beyond.sum()} of {len(beyond)}")
         found += _season(settings.moment, trained, now=settings.source == "rig")
-        usual, least = settings.camera.exposure_ms, trained.exposure_ms[0]
+        usual = settings.camera.exposure_ms
+        least = trained.exposure_ms[0]
         one, other = settings.scan_exposure_ms or usual, settings.coarse_exposure_ms or usual
         shortest = (one if settings.plain else min(usual, other)) * scene.light_fraction
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
             under = "" if scene.light_fraction == 1 else " under a clear sky, by their light"
             found.append(f"exposures of {shortest:g} ms{under} (training: {least:g} ms and more, by --min-exposure-ms)")
-        pixel_m, known_m = None, trained.ground_pixel_m
+        pixel_m = None
+        known_m = trained.ground_pixel_m
         if settings.scene in BUILT_IN_SCENES:
             pixel_m = FARM_PIXEL_M  # independent of the pose
         elif settings.pose is not None:
@@ -188,7 +192,8 @@ def _season(moment: tuple[int, float] | None, trained: TrainedOn, *, now: bool) 
             of_day, *seen = [f"{date(2025, 1, 1) + timedelta(days=one - 1):%B}" for one in (day, first, last)]
             found.append(f"day {day} of the year ({of_day}; training: {' to '.join(seen)})")
     if moment is not None and trained.sun_elevation_deg is not None:
-        height, (low, _) = sun_over_farm(*moment).elevation_deg, trained.sun_elevation_deg
+        height = sun_over_farm(*moment).elevation_deg
+        low, _ = trained.sun_elevation_deg
         if height < low - SUN_DEG:
             found.append(f"a sun elevation of {height:.0f} degrees (training: {low:.0f} and more)")
     return found

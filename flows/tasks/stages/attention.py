@@ -66,7 +66,8 @@ class PatchGains:
 
     def within_zones(self, scores: Scores) -> Scores:
         """Return (patch,) scores times the fraction of each patch that zones leave; 0 outside of the scene."""
-        grid, fractions = self.frame.grid, self.zones.fractions
+        grid = self.frame.grid
+        fractions = self.zones.fractions
         if self.frame.missing is not None:
             void = patch_pixels(grid, self.frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
             scores = np.where(void, 0.0, scores)
@@ -108,8 +109,7 @@ def score(
             return scores, second_pass.plan(scores)
         assert budget is not None
         components = len(open_mosaic(mosaic.path / "mosaic.zarr").components)
-        paid = replace(budget, costs=replace(budget.costs, bands=components))
-        chosen = paid.choose(scores)
+        chosen = replace(budget, costs=replace(budget.costs, bands=components)).choose(scores)
         reason = f"{scanned.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
         gain = float(np.where(np.isfinite(scores), scores, 0.0)[chosen].sum())
         return scores, replace(scanned, patch_index=np.sort(chosen), reason=reason, expected_gain=gain)

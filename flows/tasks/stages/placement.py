@@ -190,7 +190,8 @@ def register_coarse(
         found = register_sweeps(broad, camera, prior_px=pointing_px)
         report(0.8)
         placed = [replace(one, shift=found.of(one.lines.sweep.name)).placed(camera) for one in sweeps]
-        gains, names = light_gains(found, placed, camera, frame.wavelength_nm), [shift.name for shift in found.shifts]
+        gains = light_gains(found, placed, camera, frame.wavelength_nm)
+        names = [shift.name for shift in found.shifts]
         record = {
             "method": "seams",
             "reference": found.reference,
@@ -269,7 +270,8 @@ def locate(
     signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Compute the geolocation grid, which all surveys along the same path share."""
-    grid, sweeps = PixelGrid.of_scene(frame.grid), open_sweeps(signal, registration, camera)
+    grid = PixelGrid.of_scene(frame.grid)
+    sweeps = open_sweeps(signal, registration, camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
         "grid": asdict(grid),
