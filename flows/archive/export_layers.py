@@ -281,10 +281,9 @@ def _picture(run: ExportedRun) -> Layer:
     if run.map_product == "ground_map":
         drawn = image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, nodata=0)
         return replace(drawn, image=replace(drawn.image, bands=RGB))
-    stored = open_image(run.path("mosaic"), "coverage")
+    geobox = geobox_of(run, open_image(run.path("mosaic"), "coverage"))
     ref = run.store("mosaic")
     assert ref is not None
-    geobox = geobox_of(run, stored)
 
     def rows() -> Rows:
         yield 0, np.nan_to_num(np.rint(colours_of(ref))).astype(np.uint8)

@@ -267,18 +267,16 @@ def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
     }
     now: Any = datetime.now(UTC)
     due = filters.FlowRunFilterExpectedStartTime(before_=now)
-    crashed: Any = Crashed(message="the process that ran it is gone")
-    missed: Any = Cancelled(message="no serve was running when it was due")
-    gone: Any = Cancelled(message="cancelled; the process that ran it is gone")
+    states: Any = (
+        ([StateType.SCHEDULED], Cancelled(message="no serve was running when it was due"), due),
+        ([StateType.PENDING, StateType.RUNNING], Crashed(message="the process that ran it is gone"), None),
+        ([StateType.CANCELLING], Cancelled(message="cancelled; the process that ran it is gone"), None),
+    )
     with get_client(sync_client=True) as client:
         for one in deployments if shared else ():
             _check_other(client, one)
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        for kinds, ended, when in (
-            ([StateType.SCHEDULED], missed, due),
-            ([StateType.PENDING, StateType.RUNNING], crashed, None),
-            ([StateType.CANCELLING], gone, None),
-        ):
+        for kinds, ended, when in states:
             left = filters.FlowRunFilter(
                 state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=kinds)),
                 expected_start_time=when,

@@ -108,8 +108,7 @@ def is_outlived(run: Run, now: datetime) -> bool:
         days = raw_days(parse_keep(run.settings["keep"]))
     except (KeyError, ValueError):
         return False
-    old = made is not None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
-    return run.problem is None and old
+    return run.problem is None and made is not None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
 
 
 def _removal(one: OutlivedLines) -> Removal:

@@ -224,6 +224,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     bands, caption = choose_bands(run.scene.wavelength_nm)
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
+    changed = attention.changed
     order = np.argsort(attention.rank.ravel(), kind="stable")
     found = load_class_map(products["segment"].path / "class_map.zarr")
     prior = prior_map_figures(products["segment"].path)
@@ -237,10 +238,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         raster=run.raster is not None,
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thinned(found.classes)[0].step, [*bands]),
         caption=caption,
-        score=attention.score
-        if attention.changed is None
-        else np.where(attention.rank >= 0, attention.changed, np.nan),
-        changed=attention.changed is not None,
+        score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
+        changed=changed is not None,
         patch_px=run.grid.patch,
         patch_index=order[attention.rank.ravel()[order] >= 0],
         blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),

@@ -360,9 +360,7 @@ class SurveyRun(CaptureRun):
             return self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel())  # all gain the same
         cascade = self.cascade
         least = self.least_gain
-        every = self.kept_patches
-        if self.part:
-            every = np.intersect1d(every, self.scanned.patch_index)
+        every = np.intersect1d(self.kept_patches, self.scanned.patch_index) if self.part else self.kept_patches
         return every if cascade is None or least is None else every[: round(cascade.fraction_at(least) * len(every))]
 
 
@@ -527,8 +525,7 @@ def _plan_capture(
     scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
     scans = replace(scans, chosen=None) if settings.zooms else scans
-    settings = replace(settings, extent=layout.extent)
-    return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
+    return _PlannedCapture(replace(settings, extent=layout.extent), plan, scans, extent, (*plan_notes, *extent_notes))
 
 
 def _scene_for(

@@ -76,8 +76,7 @@ def error_matrix(accuracy: Mapping[str, Any]) -> dict[str, list[Any]] | None:
         for one in range(size)
         if label[one] or mapped[one]
     ]
-    producers = [_right(counts[one][one], label[one]) for one in columns]
-    rows.append(["producer's accuracy", *producers, ""])
+    rows.append(["producer's accuracy", *(_right(counts[one][one], label[one]) for one in columns), ""])
     return {"labels": [spaced(names[one]) for one in columns], "rows": rows}
 
 

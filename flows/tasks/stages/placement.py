@@ -95,9 +95,7 @@ class MosaicRecipe:
             return MosaicWork(
                 interlaced_paths(self.sweeps(), self.camera, self.grid), self.camera, self.grid, self.kernel
             )
-        tables: Tables = {}
-        if self.geolocation is not None:
-            tables = open_geolocation(self.geolocation.path / TIE_POINTS)
+        tables: Tables = {} if self.geolocation is None else open_geolocation(self.geolocation.path / TIE_POINTS)
         placed = []
         for one in self.sweeps():  # no stored tie points if lines are too uneven
             stored = tables.get(one.lines.sweep.name)
@@ -323,7 +321,7 @@ def rectify(
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
-    return Wanted(build, params, [signal, geolocation, *_there(registration)])
+    return Wanted(build, params, [signal, geolocation, *([] if registration is None else [registration])])
 
 
 @stage("rectify_fine", "mosaic of all passes", MERGED)
@@ -355,7 +353,7 @@ def rectify_fine(
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, "light": light.light, **frame.key}
-    return Wanted(build, params, [signal, *_there(registration)])
+    return Wanted(build, params, [signal, *([] if registration is None else [registration])])
 
 
 def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
@@ -373,7 +371,3 @@ def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicW
         grid=frame.angular_grid(),
         simulation=sweeps[0].simulation if sweeps else None,
     )
-
-
-def _there(registration: StageRef | None) -> list[StageRef]:
-    return [] if registration is None else [registration]
