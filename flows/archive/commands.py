@@ -337,12 +337,13 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
     state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
     learned = "" if run["training_scene"] is None or miou is None else "*"
-    figures = [
+    return [
+        *map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)),
         "not yet" if is_pending(run) else format_points(miou) + learned,
         format_bytes(run["own_bytes"]),
         _age(run["age_s"]),
+        state,
     ]
-    return [*map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)), *figures, state]
 
 
 def _shown_stores(stage: str, stores: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:

@@ -224,8 +224,7 @@ def _add_stores(export: Export) -> None:
 def describe_item(export: Export) -> Item:
     """Return the run's item with all assets that were added."""
     receipt = export.run.receipt
-    geobox = export.run.geobox
-    where = NOT_PLACED if geobox is None else "Images lie on a map."
+    where = NOT_PLACED if export.run.geobox is None else "Images lie on a map."
     properties: dict[str, Any] = {
         "title": f"Survey of {receipt['survey']}",
         "description": f"Survey of {receipt['survey']} ({receipt['source']} source). {where}",
@@ -235,7 +234,7 @@ def describe_item(export: Export) -> Item:
         "processing:software": dict(receipt["versions"]),
     }
     outline = None
-    if geobox is not None:
-        properties |= {"proj:code": projection(geobox)["proj:code"], "gsd": pixel_side_m(geobox)}
-        outline = footprint(geobox)
+    if export.run.geobox is not None:
+        properties |= {"proj:code": projection(export.run.geobox)["proj:code"], "gsd": pixel_side_m(export.run.geobox)}
+        outline = footprint(export.run.geobox)
     return Item(export.run.id, *export.run.observed, properties, export.assets, outline)

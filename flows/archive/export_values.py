@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
@@ -19,7 +18,7 @@ from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.indices import Floats, SpectralIndex, index_values, pick_bands, white_level
+from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
 from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import open_image
@@ -113,19 +112,15 @@ class MosaicView:
             last = min(first + at_once, height)
             out = np.full((last - first, width, len(bands)), np.nan, np.float32)
             for _, columns in map_blocks((last - first, width), (last - first, COLUMNS_AT_ONCE)):
-                out[:, columns] = _window_at(self.mosaic, self.ground.scene_pixels(slice(first, last), columns), bands)
+                pixels = self.ground.scene_pixels(slice(first, last), columns)
+                known = pixels[np.isfinite(pixels).all(axis=-1)]
+                if not len(known):
+                    continue
+                low = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, self.mosaic.shape)
+                high = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, self.mosaic.shape)
+                window = self.mosaic.values(slice(low[0], high[0]), slice(low[1], high[1]), bands)  # around the pixels
+                out[:, columns] = image_at(np.ascontiguousarray(window), pixels - low)
             yield first, out
-
-
-def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], bands: Sequence[int]) -> Floats:
-    """Return the values at scene places (row, column, 2), reading only the window around them."""
-    known = pixels[np.isfinite(pixels).all(axis=-1)]
-    if not len(known):
-        return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
-    first = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, mosaic.shape)
-    last = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, mosaic.shape)
-    window = mosaic.values(slice(first[0], last[0]), slice(first[1], last[1]), bands)
-    return image_at(np.ascontiguousarray(window), pixels - first)
 
 
 def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:

@@ -179,12 +179,11 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         for row in content["stages"]
     ]
     console.print(table(("stage", "state", "why"), rows, left=3, whole=("stage", "state")))
-    figures = content["field"]
-    size = f"{' x '.join(map(format_count, figures['size_px']))} px"
-    told = [size, *(text for _, text in finding_rows({"field": figures}))]
-    if figures["ground_pixel_m"] is None:
+    size = f"{' x '.join(map(format_count, content['field']['size_px']))} px"
+    told = [size, *(text for _, text in finding_rows({"field": content["field"]}))]
+    if content["field"]["ground_pixel_m"] is None:
         told.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
-    if figures["camera_s"] is None:
+    if content["field"]["camera_s"] is None:
         told.append("no camera: the pixels of the raster are taken as they are")
     console.print(escape(f"field: {'; '.join(told)}"), soft_wrap=True)
     if content["to_make"]:
@@ -298,13 +297,12 @@ def _score(run: SurveyRun) -> Estimate:
     """Return the score by the weights' table of scans, else by the scenes that were kept for validation."""
     if run.part:
         return Estimate(None, "a part of the field is captured, the prior map shows the rest")
-    record = run.described.record
     if (scan := run.scans.chosen) is not None:
-        source = f"the weights' record of such scans, {counted(int(record['scans']['scenes']), 'scene')}"
+        source = f"the weights' record of such scans, {counted(int(run.described.record['scans']['scenes']), 'scene')}"
         if scan.spread is not None and scan.spread > MOST_ERROR:
             return Estimate(None, f"{source}; the scenes differ too much")
         return Estimate(scan.expected["mIoU"], source, at_most=run.budget is not None, spread=scan.spread)
-    validation = record.get("validation") or {}
+    validation = run.described.record.get("validation") or {}
     whole = known_number((validation.get("all") or {}).get("miou"))
     if whole is None:
         return Estimate(None, "no scene was kept for validation when the weights were trained")

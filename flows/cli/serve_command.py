@@ -274,7 +274,14 @@ def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
     )
     with get_client(sync_client=True) as client:
         for one in deployments if shared else ():
-            _check_other(client, one)
+            name = f"{one.flow_name}/{one.name}"
+            with suppress(ObjectNotFound):
+                known = client.read_deployment_by_name(name).parameters.get("settings", {}).get("out")
+                if known is not None and known != one.parameters.get("settings", {}).get("out"):
+                    raise SettingsError(
+                        f"the Prefect server has a field {one.name} of the archive {known}: give this field another "
+                        f"name, or delete the deployment {name} there"
+                    )
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
         for kinds, ended, when in states:
             left = filters.FlowRunFilter(
@@ -284,17 +291,6 @@ def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
             while found := client.read_flow_runs(**own, flow_run_filter=left):  # a page at a time
                 for run in found:
                     client.set_flow_run_state(run.id, ended, force=True)
-
-
-def _check_other(client: Any, one: Any) -> None:
-    """Raise SettingsError where the server has a deployment of this name whose surveys go into another archive."""
-    with suppress(ObjectNotFound):
-        known = client.read_deployment_by_name(f"{one.flow_name}/{one.name}").parameters.get("settings", {}).get("out")
-        if known is not None and known != one.parameters.get("settings", {}).get("out"):
-            raise SettingsError(
-                f"the Prefect server has a field {one.name} of the archive {known}: give this field another name, or "
-                f"delete the deployment {one.flow_name}/{one.name} there"
-            )
 
 
 def _wait_for_server() -> None:

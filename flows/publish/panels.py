@@ -189,8 +189,7 @@ def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> N
 
     ``classes`` (y, x) are of the same pixels.
     """
-    sums = np.zeros((count, len(mosaic.components)))
-    pixels = np.zeros(count)
+    sums, pixels = np.zeros((count, len(mosaic.components))), np.zeros(count)
     top = 0
     for scores in mosaic.row_blocks():
         under = classes[top : top + len(scores)]

@@ -106,21 +106,19 @@ _DRAWN: WeakKeyDictionary[OpenSurvey, _Drawn] = WeakKeyDictionary()  # of survey
 
 
 def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
-    products = survey.products
-    shown = quicklook_data(survey.run, products, plan)
-    maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
+    shown = quicklook_data(survey.run, survey.products, plan)
+    maps = (load_ground_map(ref.path / STORE) for ref in survey.products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    drawn = load_class_map(products["segment"].path / "class_map.zarr")
-    if (spectra := draw_spectra(open_mosaic(products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
+    drawn = load_class_map(survey.products["segment"].path / "class_map.zarr")
+    if (spectra := draw_spectra(open_mosaic(survey.products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
         pictures.append(Picture(spectra, SPECTRA_CAPTION))
-    field = field_map(survey.run, plan, shown, prior_map(survey.run.prior, products["segment"], receipt))
+    field = field_map(survey.run, plan, shown, prior_map(survey.run.prior, survey.products["segment"], receipt))
     return _Drawn(draw_quicklook(shown), tuple(pictures), field)
 
 
 def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
     """Publish a draft as a run folder with receipt.json, quicklook.png and report.html."""
-    run = survey.run
-    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
+    again = None if survey.run.plan.plain else len(plan.patch_index) / len(survey.run.grid.every_patch())
     drawn = _DRAWN.pop(survey, None) or _draw(survey, plan, receipt)
     if not draft.extends:
         _DRAWN[survey] = drawn
@@ -128,12 +126,12 @@ def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: 
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     receipt = publish_counted(
-        run.archive,
+        survey.run.archive,
         draft,
         receipt,
         lambda told: render_report(told, drawn.quicklook, drawn.pictures, captured_again=again, field=drawn.field),
-        rests_on=run.archive.manifest_hashes(survey.products.values()),
-        of_earlier=() if run.prior is None else run.archive.manifest_hashes(run.prior.stores),
+        rests_on=survey.run.archive.manifest_hashes(survey.products.values()),
+        of_earlier=() if survey.run.prior is None else survey.run.archive.manifest_hashes(survey.run.prior.stores),
         written=survey.take_written(),
     )
     return Published(receipt, draft.published, again)
@@ -297,9 +295,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     drawn = load_class_map(products["segment"].path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     probabilities = ProbabilityStore(products["segment"].path / "class_probabilities.zarr")
-    found |= find_areas(run, posed, drawn)
-    found |= find_ground(run, posed, drawn, probabilities, prior) | find_zones(run, drawn)
-    found |= find_map(run, products["segment"], drawn)
+    found |= find_areas(run, posed, drawn) | find_ground(run, posed, drawn, probabilities, prior)
+    found |= find_zones(run, drawn) | find_map(run, products["segment"], drawn)
     if run.raster is not None:
         return found
     record = products.mosaic.path / SIGNAL_RECORD

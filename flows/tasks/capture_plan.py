@@ -54,11 +54,6 @@ class CapturePlan:
     plain: bool = False  # one uniform scan, or a raster
     by_record: bool = False  # scan performance chooses the lines of the second pass
 
-    @staticmethod
-    def of_map() -> CapturePlan:
-        """Return the plan of a raster, without sweeps."""
-        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True)
-
 
 @dataclass(frozen=True)
 class PassLayout:
@@ -145,12 +140,11 @@ class PassLayout:
         grid = self.grid
         camera = self.camera
         apart = 2 * self.pointing_px
-        recorded = self.recorded
 
         def cut(sweeps: list[Sweep]) -> list[Sweep]:
             return sweeps if self.shown is None or apart else sweeps_over(sweeps, grid, camera, self.shown)
 
-        axes: tuple[Axis, ...] = ("x", "y") if recorded is None else recorded.axes
+        axes: tuple[Axis, ...] = ("x", "y") if self.recorded is None else self.recorded.axes
         along, full, _ = cheapest_full(grid, camera, self.cost, overlap_px=self._overlap(1), cut=cut, axes=axes)
         if self.step is not None:
             scan_passes = uniform_sweeps(
@@ -163,10 +157,10 @@ class PassLayout:
         if self.extent != EXTENT_WHOLE:
             scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))
         scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
-        if recorded is None:
+        if self.recorded is None:
             return along, scan_passes, full
-        taken = recorded.uniform_scan() if self.as_taken else recorded.first_pass(scan_passes)
-        return along, taken, recorded.full_scan(full)
+        taken = self.recorded.uniform_scan() if self.as_taken else self.recorded.first_pass(scan_passes)
+        return along, taken, self.recorded.full_scan(full)
 
     def _overlap(self, step: int) -> float:
         """Return the overlap of neighbouring sweeps that leaves 64 pixels at the greatest pointing error [px]."""
@@ -243,16 +237,13 @@ def choose_uniform_scan(
         chosen = priced_scan(record, sweeps[layout.step], camera, layout.cost, bands, exposure_ms)
     elif settings.plain and layout.step is None:
         if not scans:
-            offered = f"camera.exposure_ms = {camera.exposure_ms:g}"
-            longer = "longer exposures, or "
-            if recorded_ms is not None:
-                exposures = ", ".join(f"{one:g}" for one in sorted({*recorded_ms.values()}))
-                offered = f"recorded lines of {exposures} ms"
-                longer = ""
-            raise SettingsError(
-                f"{offered}: the scan performance of the weights starts at "
-                f"{record.exposures_ms[0]:g} ms; give {longer}--scan-step instead of --seconds and --goal"
-            )
+            start = f"the scan performance of the weights starts at {record.exposures_ms[0]:g} ms"
+            advice = "--scan-step instead of --seconds and --goal"
+            if recorded_ms is None:
+                offered = f"camera.exposure_ms = {camera.exposure_ms:g}"
+                raise SettingsError(f"{offered}: {start}; give longer exposures, or {advice}")
+            exposures = ", ".join(f"{one:g}" for one in sorted({*recorded_ms.values()}))
+            raise SettingsError(f"recorded lines of {exposures} ms: {start}; give {advice}")
         chosen = choose_scan(scans, settings.seconds, goals)
     elif scans and not settings.plain and not settings.zooms:
         chosen = reference_scan(scans)

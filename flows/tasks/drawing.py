@@ -126,8 +126,7 @@ class Drawing:
             other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
             changed = np.zeros(gain.shape, np.float32)
             changed[patch_index] = changed_fractions(other, region.grid).ravel()[patch_index]
-            kept = region.crop_patches
-            reading = FullReading(kept(gain), kept(read), kept(changed))
+            reading = FullReading(region.crop_patches(gain), region.crop_patches(read), region.crop_patches(changed))
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return DrawnRegion(
             region.crop(classes),

@@ -105,10 +105,12 @@ def choose_extent(
             f"the weights {path.name} have no record of uniform scans to choose a part of the field by: capture all of "
             f"it ({WHOLE}), or train weights with --min-exposure-ms 3 and validation scenes"
         )
-    swaths = _swaths(prior, layout.grid, weights, path)
-    classes = len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
-        swaths, layout.grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE, left_out=left_out
+        _swaths(prior, layout.grid, weights, path),
+        layout.grid,
+        len(weights.class_names),
+        come_true=1.0 if weights.reader is None else COME_TRUE,
+        left_out=left_out,
     )
     available = np.asarray(expected_errors.pixels.any(axis=(1, 2)))
     if layout.shown is not None:
@@ -143,15 +145,14 @@ def choose_extent(
 
 def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) -> tuple[int, float, PartialScan]:
     """Return step, exposure and lines of the scan with the highest gain, or of the cheapest within `LOSS` of it."""
-    record = extent_gains.record
     found: list[tuple[int, float, PartialScan]] = []
     least: list[float] = []
-    enough = float(record.scores[MIOU].max()) - POORER
-    shortest, longest = record.offered_ms(layout.camera)
-    for step in record.steps:
+    enough = float(extent_gains.record.scores[MIOU].max()) - POORER
+    shortest, longest = extent_gains.record.offered_ms(layout.camera)
+    for step in extent_gains.record.steps:
         rows = PatchRows.of(layout.uniform(step).sweeps()[1], layout.grid, layout.camera)
         for exposure_ms in exposures_between(shortest, longest):
-            if record.expected(step, exposure_ms)[MIOU] < enough:
+            if extent_gains.record.expected(step, exposure_ms)[MIOU] < enough:
                 continue
             expected_gain = extent_gains.expected_gain(extent_gains.gains(step, exposure_ms))
             times = RunTimes.of_scan(rows.sweeps, layout.camera, layout.cost, exposure_ms)

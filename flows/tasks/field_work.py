@@ -227,8 +227,9 @@ class FieldWork:
 
         Raises SettingsError: one region does not fit the memory.
         """
-        work = Scoring(self.weights, mosaic, policy, capture)
-        found = self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
+        found = self._joined(
+            self._of_regions(Scoring(self.weights, mosaic, policy, capture), mosaic, NO_PATCHES, report)
+        )
         return _field_gain(found) if policy == GAIN else found
 
     def expected_errors(self, mosaic: StageRef, capture: LineSpec, report: Report) -> PatchExpectedErrors:

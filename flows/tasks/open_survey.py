@@ -143,8 +143,14 @@ class OpenSurvey:
             return
         if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
             return
-        if inside_flow():
-            self._held.enter_context(rig_turn(self.observer))
+        while inside_flow():  # signals are handled between tries
+            try:
+                self._held.enter_context(
+                    prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
+                )
+                break
+            except TimeoutError:
+                self.observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
         self._held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
         self._holds_rig = True
 
@@ -175,8 +181,8 @@ class OpenSurvey:
             watch(stage, "failed", reached)
             raise
         state: Literal["ran", "cached"] = "ran" if built else "cached"
-        took_s = time.perf_counter() - begun_s[0], time.process_time() - begun_s[1]
-        self._record(stage, ref, inputs, state, *((*took_s, peak_bytes()) if built else ()))
+        spent = (time.perf_counter() - begun_s[0], time.process_time() - begun_s[1], peak_bytes()) if built else ()
+        self._record(stage, ref, inputs, state, *spent)
         if built:
             self._written += bytes_below(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
@@ -211,21 +217,6 @@ class OpenSurvey:
         taken = self._written + self.run.archive.take_spooled()
         self._written = 0
         return taken
-
-
-@contextmanager
-def rig_turn(observer: Observer) -> Iterator[None]:
-    """Wait for Prefect's limit ``rig`` and hold it; signals are handled between tries."""
-    with ExitStack() as held:
-        while True:
-            try:
-                held.enter_context(
-                    prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
-                )
-                break
-            except TimeoutError:
-                observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
-        yield
 
 
 def peak_bytes() -> int:

@@ -51,11 +51,6 @@ class OpenedRecording:
     notes: tuple[str, ...]
     geobox: GeoBox | None  # of the run that captured the lines, if it is of the same field
 
-    @property
-    def passes(self) -> RecordedPasses:
-        """Return the passes that its lines contain."""
-        return RecordedPasses(self.field.source)
-
     def scene(self) -> tuple[RasterScene, tuple[str, ...]]:
         """Return the field as a scene with size, bands and the labels of the settings, and notes.
 
@@ -120,8 +115,9 @@ def open_recorded(settings: Settings) -> OpenedRecording:
                 "camera.focal_length_mm"
             )
         settings = replace(settings, scan_step=step)
-    field = RecordedField(source, recording.key())
-    return OpenedRecording(settings, recording, field, (*recording.notes, *notes), geobox)
+    return OpenedRecording(
+        settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes), geobox
+    )
 
 
 def _field_shape(

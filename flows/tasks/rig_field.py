@@ -71,16 +71,17 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
     if settings.rig.mounting != STRAIGHT:
         for sweep in planned:
             settings.rig.mounting.to_device(sweep_positions(sweep, settings.camera))
-    source = RigSource(
-        settings.camera,
-        scene.wavelength_nm,
-        scene.shape,
-        lambda: open_devices(settings),
-        KeptInMemory(),
-        rig=settings.rig,
-        vector_pairs=settings.cost.vector_pairs,
+    return RigField(
+        RigSource(
+            settings.camera,
+            scene.wavelength_nm,
+            scene.shape,
+            lambda: open_devices(settings),
+            KeptInMemory(),
+            rig=settings.rig,
+            vector_pairs=settings.cost.vector_pairs,
+        )
     )
-    return RigField(source)
 
 
 @contextmanager

@@ -51,7 +51,7 @@ from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NothingToMend, SceneError, SettingsError
+from pipeline.errors import NothingToMend, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -376,8 +376,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
-    path = weights_path(settings)
-    model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
+    model = SurveyModel.open(weights_path(settings), settings.device, settings.unknown, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
@@ -385,28 +384,29 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
-    outside = beyond_training(settings, scene, described, model.trained_on, path)
+    outside = beyond_training(settings, scene, described, model.trained_on, model.path)
     ood_detector = model.asked_ood(settings.unknown)
     name = settings.name or Path(scene.name).stem
     found = None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
-        asked = (settings, name, grid, described.class_names, scene)
-        found = (None, ()) if archive is None else find_prior(archive, *asked)
-    passes = None if recorded is None else recorded.passes
+        found = (
+            (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names, scene)
+        )
+    passes = None if recorded is None else RecordedPasses(recorded.field.source)
     planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        planned = _plan_capture(settings, scene, zones, path, described, prior, passes, planning=planning)
+        planned = _plan_capture(settings, scene, zones, model.path, described, prior, passes, planning=planning)
     settings = planned.settings
-    read = min(len(scene.wavelength_nm), SMOOTH)  # components that a plan assumes; most mosaics have 11 to 33
-    costs = ReadingCosts(described.config, grid, read)
+    # a plan assumes `SMOOTH` components; most mosaics have 11 to 33
+    costs = ReadingCosts(described.config, grid, min(len(scene.wavelength_nm), SMOOTH))
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
     source, simulated, raster = _open_source(settings, scene, grid, planned.plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
     if raster is not None and not planning:
-        outside += other_unit(raster, scene.wavelength_nm, model.load(), path)
+        outside += other_unit(raster, scene.wavelength_nm, model.load(), model.path)
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)
@@ -480,7 +480,8 @@ class _PlannedCapture:
     """Planned lines of a survey, the choices behind them, and settings that request exactly these lines."""
 
     settings: Settings
-    plan: CapturePlan = field(default_factory=CapturePlan.of_map)
+    # a raster has no sweeps
+    plan: CapturePlan = field(default_factory=lambda: CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True))
     scans: ScanChoice = field(default_factory=ScanChoice)
     extent: ExtentChoice | None = None
     notes: tuple[str, ...] = ()
@@ -508,7 +509,8 @@ def _plan_capture(
     if is_part and prior is None:
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
         extent_notes = ("there is no prior map: the whole field is captured",)
-    layout = PassLayout.of(settings, zones.grid, zones.shown, passes)
+    shown = None if zones.kept is None else zones.kept.shown_patches(zones.grid)
+    layout = PassLayout.of(settings, zones.grid, shown, passes)
     if is_part and prior is not None:
         limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         masks = [one for one in (zones.left_out, scene.missing) if one is not None]
@@ -546,7 +548,12 @@ def _scene_for(
     if not planning:  # before the stages, whose time is measured
         scene.raster.drawn()
         scene.light()
-    model.check_bands(scene.wavelength_nm)
+    basis = model.described.basis
+    if not basis.matrix(scene.wavelength_nm)[1].any():
+        raise WeightsError(
+            f"the weights {model.path.name} are for {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; the scene's bands lie at"
+            f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
+        )
     label_notes = check_labels(scene, model.described)
     size = None if settings.mask is None else load_labels_array(settings.mask).shape[:2]
     if size not in (None, scene.shape):

@@ -60,16 +60,6 @@ class SurveyModel:
                 load_ood(path)
         return SurveyModel(path, described, load)
 
-    def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
-        """Check that the bands overlap the spectral range of the weights. Raises WeightsError: they do not."""
-        basis = self.described.basis
-        _, reached = basis.matrix(wavelength_nm)
-        if not reached.any():
-            raise WeightsError(
-                f"the weights {self.path.name} are for {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; the scene's bands lie"
-                f" at {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm: use weights trained on such data"
-            )
-
     @property
     def trained_on(self) -> TrainedOn | None:
         """Return the record of the training data; None where the weights have none."""
@@ -138,8 +128,7 @@ def beyond_training(
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
             under = "" if scene.light_fraction == 1 else " under a clear sky, by their light"
             found.append(f"exposures of {shortest:g} ms{under} (training: {least:g} ms and more, by --min-exposure-ms)")
-        pixel_m = None
-        known_m = trained.ground_pixel_m
+        pixel_m, known_m = None, trained.ground_pixel_m
         if settings.scene in BUILT_IN_SCENES:
             pixel_m = FARM_PIXEL_M  # independent of the pose
         elif settings.pose is not None:

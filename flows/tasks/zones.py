@@ -34,11 +34,6 @@ class SurveyZones:
     notes: tuple[str, ...] = ()
 
     @cached_property
-    def shown(self) -> NDArray[np.bool_] | None:
-        """Return the patches (patch,) to capture; None for all."""
-        return None if self.kept is None else self.kept.shown_patches(self.grid)
-
-    @cached_property
     def fractions(self) -> NDArray[np.float64] | None:
         """Return the fraction of each patch inside zones (patch,); None: all of it."""
         return None if self.kept is None else self.kept.patch_fractions(self.grid)

@@ -70,8 +70,13 @@ def evaluate(
         names = gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
-        result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        result |= {"none": NOT_JUDGED, "all": NOT_JUDGED, "gap_closed": None, "controls": {}}
+        result: dict[str, Any] = map_figures(names, counts) | {
+            "confusion": counts.tolist(),
+            "none": NOT_JUDGED,
+            "all": NOT_JUDGED,
+            "gap_closed": None,
+            "controls": {},
+        }
         if controls:
             readings, scores = gains.work.readings(mosaic, gains.capture, report)
             readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all

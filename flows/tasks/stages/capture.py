@@ -107,10 +107,11 @@ class SweepRecorder:
         references = source.references(sweep)
         header = SweepHeader(sweep, references, self.wavelength_nm, self.fwhm_nm, source.name, simulation=effects)
         samples, bands = references.dark.shape
-        about = {"sweep": asdict(sweep), **self.source_key}
         statistics = LineStatistics(found, sweep, references, self.camera)
         with (
-            Spool.open(folder, samples, bands, header=about, name=sweep.name) as spool,
+            Spool.open(
+                folder, samples, bands, header={"sweep": asdict(sweep), **self.source_key}, name=sweep.name
+            ) as spool,
             RawCubeWriter(path / f"{sweep.name}.zarr", header, statistics.add) as cube,
         ):
 

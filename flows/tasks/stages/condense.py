@@ -129,10 +129,15 @@ def condense(
         if better is not None:
             condenser = better
             done = written(condenser)
-        record = {"components": len(condenser.components), "bands": condenser.components.bands, "step": condenser.step}
         every = sum(int(cube.valid_line.sum()) * cube.shape[1] for cube in cubes)
-        record |= {"spectra": sum(one.known for one in done), "rare": sum(len(one.rare) for one in done)}
-        record |= {"saturated": sum(one.saturated for one in done) / max(every, 1)}
+        record = {
+            "components": len(condenser.components),
+            "bands": condenser.components.bands,
+            "step": condenser.step,
+            "spectra": sum(one.known for one in done),
+            "rare": sum(len(one.rare) for one in done),
+            "saturated": sum(one.saturated for one in done) / max(every, 1),
+        }
         write_table(path / SIGNAL_RECORD, record)
         rig_record = passes[0].path / RIG_RECORD
         if rig_record.is_file():  # the raw lines may be deleted
@@ -175,7 +180,6 @@ def _write_sweeps(
     origin = np.zeros(found.bands) if found.origin is None else found.origin
     done = []
     for number, (cube, condenser) in enumerate(sweeps):
-        mean = np.nan_to_num(condenser.components.mean)
         first = sweeps[0][0]
         out = path / f"{cube.sweep.name}.zarr"
         shutil.rmtree(out, ignore_errors=True)
@@ -185,7 +189,9 @@ def _write_sweeps(
             SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation),
             condenser.components,
             step=condenser.step,
-            largest=condenser.components.largest(found.largest + np.abs(origin - mean)),
+            largest=condenser.components.largest(
+                found.largest + np.abs(origin - np.nan_to_num(condenser.components.mean))
+            ),
             frames_of=first.sweep.name if number and cube.references.same_as(first.references) else None,
         )
 

@@ -90,15 +90,11 @@ def segment(
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **gains.frame.key, **gains.zones.key}
     params |= {"capture": list(gains.capture), "part": part, "unknown": None if unknown is None else asdict(unknown)}
     params["least_gain"] = least_gain
-    if prior is None:
-        return Wanted(build, params, [mosaic, attention])
-    known: dict[str, Any] = {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
-    known["reader"] = None if reader is None else reader.key
-    return Wanted(
-        build,
-        {**params, **known, "shifts": [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]},
-        [mosaic, attention, *prior.stores],
-    )
+    if prior is not None:
+        params |= {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
+        params["shifts"] = [list(one.shift_px) for one in prior.scan_passes]
+        params["reader"] = None if reader is None else reader.key
+    return Wanted(build, params, [mosaic, attention, *([] if prior is None else prior.stores)])
 
 
 def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, goes_on: bool) -> tuple[str, ...]:

@@ -141,12 +141,13 @@ def write_mosaic(
         opened_tiles(maker)  # before threads use it
     if not pool.elsewhere and budget.workers < min(pool.count, len(tiles)):
         pool = WorkerPool(pool.scheduler, budget.workers)
-    places = [(tile.rows, tile.columns) for tile in tiles]
 
     def take(place: Place, made: tuple[Values, Counts]) -> None:
         writer.write_tile(place[0].start, place[1].start, *made)
 
-    run_blocks(maker, places, pool, take=take, report=report, inputs=recipe.inputs)
+    run_blocks(
+        maker, [(tile.rows, tile.columns) for tile in tiles], pool, take=take, report=report, inputs=recipe.inputs
+    )
     free_tiles()
     return budget
 
