@@ -176,7 +176,7 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
         dst_nodata=0,
         resampling=rasterio_warp.Resampling.max,
     )
-    # GDAL misses pixels of rotated maps
+    # each cell gets the dose of every pixel in it: GDAL misses pixels of rotated maps
     for pixel, cell in _overlaps(np.nonzero(level > 1), raster.geobox, cells):
         np.maximum.at(found, cell, level[pixel])
     for cell, pixel in _overlaps(tuple(np.indices(found.shape).reshape(2, -1)), cells, raster.geobox):

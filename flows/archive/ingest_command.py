@@ -106,7 +106,7 @@ def run_ingest(
     return record
 
 
-def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[SourceFile]:
+def hash_files(source: CubeSource, report: Report) -> list[SourceFile]:
     """Return the name, size and SHA-256 of every file of a cube; names are relative to a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):

@@ -229,7 +229,8 @@ LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
 # Bytes kept, fitted to seven surveys (docs/background/signal.md): receipt and report; pictures, by the side of the
 # field; the map, by its pixels; and the scores of a spectrum, by the bands of a file.
 PAGE, PICTURE_SIDE, MAP_PIXEL = 300_000, 1600.0, 5.0
-FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES, BANDS_POWER = 17.0, 4.5, 2.4, 0.57
+FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES = 17.0, 4.5, 2.4
+BANDS_POWER = 0.57
 KEPT_FROM = "pixels, spectra and bands, by surveys of seven fields, which kept 0.5 to 2 times as much"
 
 

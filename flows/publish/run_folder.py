@@ -153,8 +153,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
-    most_s = run.plan.coarse_s + plan.seconds + 1e-6
-    in_time = [one for one in run.scans.offered if one.seconds <= most_s]
+    in_time = [one for one in run.scans.offered if one.seconds <= run.plan.coarse_s + plan.seconds + 1e-6]
     scans = {
         "taken": run.scans.chosen,
         "best_in_time": max(in_time, key=lambda one: one.expected[MIOU], default=None),

@@ -264,8 +264,7 @@ def _check_table(
             near = [name for name in everywhere if name.split(".")[-1] == key]
             near = near or [prefix + name for name in difflib.get_close_matches(key, declared, n=1, cutoff=0.5)]
             every = f"; known keys: {', '.join(prefix + name for name in declared)}"
-            hint = f"; did you mean '{near[0]}'?" if near else every
-            raise SettingsError(f"unknown setting {place}{hint}")
+            raise SettingsError(f"unknown setting {place}" + (f"; did you mean '{near[0]}'?" if near else every))
         if not prefix and key in TABLES:
             checked[key] = _parse_table(key, value, place, origin)
         else:

@@ -138,6 +138,7 @@ def _usable(
         if probabilities is None or mosaic is None:
             return "its stores were cleared; reprocess computes them again"
         store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
+        names = store.legend.names
         before = load_geobox(probabilities.path / "class_map.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
@@ -151,9 +152,9 @@ def _usable(
             return f"it shows another place: its corner lies {math.hypot(*shift):.0f} px from that of this scene"
     if any(run.settings["camera"][part] != getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")):
         return "its camera has another pitch or focal length"
-    classes = tuple(store.legend.names.index(one) if one in store.legend.names else -1 for one in class_names)
+    classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
-        return f"it has none of the classes of these weights, but {', '.join(store.legend.names)}"
+        return f"it has none of the classes of these weights, but {', '.join(names)}"
     days = _days_since(run, settings.visit, settings.moment)
     if days < 0:
         return f"it was captured {-days:.3g} days after this visit"

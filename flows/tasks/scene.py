@@ -130,7 +130,7 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
         labels_needed=False,
     )
     file = _judged_by_known(file, known)
-    return _placed_once(scene_of_file(file, settings.camera), file, settings, "given their band's median")
+    return _with_notes(scene_of_file(file, settings.camera), file, settings, "given their band's median")
 
 
 def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -163,7 +163,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         pixel_m=file.pixel_m,
         content=file.content,
     )
-    return file, *_placed_once(scene, file, settings, "whose other bands are used")
+    return file, *_with_notes(scene, file, settings, "whose other bands are used")
 
 
 def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
@@ -179,12 +179,12 @@ def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
     return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
 
 
-def _placed_once(
+def _with_notes(
     scene: RasterScene, file: SceneFile, settings: Settings, became: str
 ) -> tuple[RasterScene, tuple[str, ...]]:
-    """Return the scene without its georeference where a pose replaces it, and the notes on a file.
+    """Return the scene of a file, without its georeference where a pose replaces it, and notes on both.
 
-    They include pixels without a value in some bands, which ``became`` this, or in most.
+    ``became`` says what became of pixels without a value in some bands.
     """
     notes = file.provenance
     if scene.geobox is not None and settings.pose is not None:

@@ -98,7 +98,7 @@ def shipped_weights() -> Path:
 
 
 OTHER_UNIT = 20.0  # largest ratio of medians
-SAMPLED_ROWS = 64  # of which it is measured
+SAMPLED_ROWS = 64  # rows of which it is measured
 DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # tolerances of the ranges of training
 
 
