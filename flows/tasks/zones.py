@@ -72,6 +72,7 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
     shape = grid.height, grid.width
 
     def read(source: str, *, named_by: str | None = None, needed: bool = True) -> dict[str, BaseGeometry]:
+        """Return the polygons of a file by name, in pixels of the field."""
         found = read_zones(source, named_by=named_by)
         notes.extend(found.notes)
         found = replace(found, crs=crs_on(place, found.crs, source, ZoneError))
