@@ -32,7 +32,9 @@ class RestoredArray(BackendArray):
     """Spectra (row, column, band) float32; indexing restores only the selected ones."""
 
     def __init__(self, shape: tuple[int, ...], restore: Restore) -> None:
-        self.shape, self.dtype, self._restore = shape, np.dtype(np.float32), restore
+        self.shape = shape
+        self.dtype = np.dtype(np.float32)
+        self._restore = restore
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._outer)

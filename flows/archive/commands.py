@@ -150,9 +150,10 @@ def run_verify(archive: str | Path, console: Console, *, remake: bool = False, a
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 
-def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
+def contents(archive: Archive) -> dict[str, Any]:
     """Return the runs of an archive, newest last, and its stores by stage, oldest first."""
-    catalogue, now = Catalogue.read(archive.root), now or datetime.now(UTC)
+    catalogue = Catalogue.read(archive.root)
+    now = datetime.now(UTC)
     of_runs = (uri for run in catalogue.runs for uri in (run.uri, *run.names))  # also of stores that are missing
     sizes = archive.sizes(sorted({*catalogue.stores, *of_runs}))
     stages: dict[str, list[dict[str, Any]]] = {}
@@ -186,14 +187,13 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
 
 
 def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
-    receipt = run.receipt
     return {
         "id": run.folder.name,
         "created": run.created,
-        "survey": receipt.get("survey", run.facts.get("survey")),
+        "survey": run.receipt.get("survey", run.facts.get("survey")),
         **{name: run.settings.get(name) for name in ("scene", "seed", "budget")},
-        **score_of(receipt),
-        **{name: receipt.get(name) for name in ("accuracy_is", "training_scene")},
+        **score_of(run.receipt),
+        **{name: run.receipt.get(name) for name in ("accuracy_is", "training_scene")},
         "bytes": kept,
         "state": _run_state(catalogue, run),
     }
@@ -223,8 +223,9 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     found = find_product(catalogue, product)
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
-        shown, row = set[str](), _run_row(catalogue, found, archive.kept_bytes(found))
+        row = _run_row(catalogue, found, archive.kept_bytes(found))
         row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
+        shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
     this, before = catalogue.stores[found], version_before(catalogue, found)
@@ -298,9 +299,11 @@ def command(settings: Mapping[str, Any], out: str) -> str:
         repeated = settings.get("coarse_exposure_ms") is not None
         left_out |= {"coarse_exposure_ms", "scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}
     asked, defaults = (json.loads(to_json(one)) for one in ({**settings, "out": out}, Settings().to_dict()))
-    parts, tables = ["spectralzoom", "survey"], list[str]()
+    parts = ["spectralzoom", "survey"]
+    tables: list[str] = []
     for name, usual in defaults.items():
-        value, flag = asked.get(name, usual), name.replace("_", "-")
+        value = asked.get(name, usual)
+        flag = name.replace("_", "-")
         if value is None or value == usual or name in left_out:
             continue
         if isinstance(value, dict):
@@ -334,12 +337,13 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
     state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
     learned = "" if run["training_scene"] is None or miou is None else "*"
-    figures = [
+    return [
+        *map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)),
         "not yet" if is_pending(run) else format_points(miou) + learned,
         format_bytes(run["own_bytes"]),
         _age(run["age_s"]),
+        state,
     ]
-    return [*map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)), *figures, state]
 
 
 def _shown_stores(stage: str, stores: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
@@ -379,16 +383,14 @@ def show_explanation(content: dict[str, Any], console: Console) -> None:
             _say(console, run["command"])
     for node in content["lineage"]:
         console.print(_branch(node, None))
-    if run is None:
-        _say(console, f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}")
-        _show_changes(content, console)
-
-
-def _show_changes(content: dict[str, Any], console: Console) -> None:
+    if run is not None:
+        return
+    _say(console, f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}")
     if content["before"] is None:
         _say(console, "this archive has no other version of it before this one")
         return
-    shown, more = content["changes"][:MOST_ROWS], len(content["changes"]) - MOST_ROWS
+    shown = content["changes"][:MOST_ROWS]
+    more = len(content["changes"]) - MOST_ROWS
     parts = ([one["where"], one["kind"], one["name"], *(_short(one[when]) for when in ("old", "new"))] for one in shown)
     rows = [list(map(escape, row)) for row in parts]
     rows += [["", "", f"[dim]and {more} more; --json has all[/]"]] if more > 0 else []

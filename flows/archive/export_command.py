@@ -100,7 +100,8 @@ def run_export(
     cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
     opened = open_exported(open_archive(archive, create=False, write=False), run)
-    out, surveys = check_outside(out, opened.archive.root), opened.archive.root.name
+    out = check_outside(out, opened.archive.root)
+    surveys = opened.archive.root.name
     collection_id = clean_id(surveys, "surveys")
     check_zones(opened, choice)
     layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]
@@ -157,9 +158,9 @@ class Export:
 
     def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
         """Add a file or store to the catalogue, by its address in a bucket, else by that relative to the item."""
-        archive, href = self.run.archive, quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
-        if isinstance(archive, ObjectArchive) and path.is_relative_to(archive.root):
-            href = archive.url(path)
+        href = quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
+        if isinstance(self.run.archive, ObjectArchive) and path.is_relative_to(self.run.archive.root):
+            href = self.run.archive.url(path)
         self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
         if path.resolve().is_relative_to(self.out):
             self.files[key] = path.resolve().relative_to(self.out).as_posix()
@@ -167,7 +168,8 @@ class Export:
 
 def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
     for layer in layers:
-        path, image = export.folder / f"{layer.name}.tif", layer.image
+        path = export.folder / f"{layer.name}.tif"
+        image = layer.image
         with console.status(f"writing {path.name}"):
             write_cog(path, image, layer.rows())
         about: Asset = {"data_type": image.dtype, "nodata": "nan" if math.isnan(image.nodata) else image.nodata}
@@ -201,29 +203,28 @@ def _export_sweeps(export: Export, console: Console) -> None:
 
 def _add_stores(export: Export) -> None:
     """Add the archive's own stores and the run's files to the catalogue."""
-    run = export.run
     for product, title in {
         "mosaic": "Mosaic of all passes",
         "class_map": "Class map and confidence on the camera's grid",
         "attention": "Score and rank of the patches",
         "ground_map": "Class map, picture and prior map, on the map",
     }.items():
-        if run.store(product) is not None and (product != "ground_map" or run.geobox is not None):
-            box = None if product == "attention" else load_geobox(run.path(product))
-            path = run.archive.root / run.receipt["products"][product]
+        if export.run.store(product) is not None and (product != "ground_map" or export.run.geobox is not None):
+            box = None if product == "attention" else load_geobox(export.run.path(product))
+            path = export.run.archive.root / export.run.receipt["products"][product]
             export.add(f"{product}_zarr", path, title, ZARR, ["data"], **export.projection(box))
-    for sweep in run.sweeps():
+    for sweep in export.run.sweeps():
         title, roles = ("Raw sweep", ["data", "raw"]) if (sweep / "dn").is_dir() else ("Signal of sweep", ["data"])
         export.add(f"{sweep.stem}_zarr", sweep, f"{title} {sweep.stem}", ZARR, roles, **export.projection())
     for name, (title, kind, roles) in RUN_FILES.items():
-        if name in read_manifest(run.folder)["files"]:
-            export.add(Path(name).stem, run.folder / name, title, kind, roles)
+        if name in read_manifest(export.run.folder)["files"]:
+            export.add(Path(name).stem, export.run.folder / name, title, kind, roles)
 
 
 def describe_item(export: Export) -> Item:
     """Return the run's item with all assets that were added."""
-    run, receipt, geobox = export.run, export.run.receipt, export.run.geobox
-    where = NOT_PLACED if geobox is None else "Images lie on a map."
+    receipt = export.run.receipt
+    where = NOT_PLACED if export.run.geobox is None else "Images lie on a map."
     properties: dict[str, Any] = {
         "title": f"Survey of {receipt['survey']}",
         "description": f"Survey of {receipt['survey']} ({receipt['source']} source). {where}",
@@ -233,7 +234,7 @@ def describe_item(export: Export) -> Item:
         "processing:software": dict(receipt["versions"]),
     }
     outline = None
-    if geobox is not None:
-        properties |= {"proj:code": projection(geobox)["proj:code"], "gsd": pixel_side_m(geobox)}
-        outline = footprint(geobox)
-    return Item(run.id, *run.observed, properties, export.assets, outline)
+    if export.run.geobox is not None:
+        properties |= {"proj:code": projection(export.run.geobox)["proj:code"], "gsd": pixel_side_m(export.run.geobox)}
+        outline = footprint(export.run.geobox)
+    return Item(export.run.id, *export.run.observed, properties, export.assets, outline)

@@ -204,7 +204,8 @@ class Layer:
 def map_layers(run: ExportedRun) -> list[Layer]:
     """Return the class map, its confidence, the expected gain of the patches, and a picture."""
     product = run.map_product
-    legend, roles = legend_of(open_group(run.path(product))), ("data", "confidence")
+    legend = legend_of(open_group(run.path(product)))
+    roles = ("data", "confidence")
     return [
         image_layer(run, product, "classes", "class_map", "Class map", nodata=UNLABELLED, legend=legend, band="class"),
         image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),
@@ -256,13 +257,15 @@ def image_layer(
 
 def patch_layer(run: ExportedRun, product: str, array: str, name: str, title: str) -> Layer:
     """Return an image with one pixel a patch, on the grid of the class map."""
-    stored, class_map = open_image(run.path(product), array), run.store("class_map")
+    stored = open_image(run.path(product), array)
+    class_map = run.store("class_map")
     assert class_map is not None
     patch = int(run.archive.manifest(class_map)["params"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
-    shape, fine = (stored.shape[0], stored.shape[1]), load_geobox(run.path("class_map"))
+    shape = (stored.shape[0], stored.shape[1])
+    fine = load_geobox(run.path("class_map"))
     geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
     tags = {**layer_tags(run, product, geobox), **policy, "patch_px": str(patch)}
@@ -273,13 +276,14 @@ def patch_layer(run: ExportedRun, product: str, array: str, name: str, title: st
 
 def _picture(run: ExportedRun) -> Layer:
     """Return the picture on the ground, else the coarse mosaic in a photograph's tones: 1 to 255, 0 without a value."""
-    title, roles = "Picture of the coarse pass", ("visual", "overview")
+    title = "Picture of the coarse pass"
+    roles = ("visual", "overview")
     if run.map_product == "ground_map":
         drawn = image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, nodata=0)
         return replace(drawn, image=replace(drawn.image, bands=RGB))
-    stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
+    geobox = geobox_of(run, open_image(run.path("mosaic"), "coverage"))
+    ref = run.store("mosaic")
     assert ref is not None
-    geobox = geobox_of(run, stored)
 
     def rows() -> Rows:
         yield 0, np.nan_to_num(np.rint(colours_of(ref))).astype(np.uint8)

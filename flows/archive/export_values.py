@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
@@ -19,7 +18,7 @@ from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.indices import Floats, SpectralIndex, index_values, pick_bands, white_level
+from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
 from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import open_image
@@ -51,7 +50,8 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         sums += np.bincount(classes[known], sure[known], 256)
         sure_pixels += np.bincount(classes[known], minlength=256)
     confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
-    pixels, areas = counts[: len(names)], hectares_of_classes(run.receipt)
+    pixels = counts[: len(names)]
+    areas = hectares_of_classes(run.receipt)
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     unknown = np.full(len(names), np.nan)
@@ -90,7 +90,8 @@ class MosaicView:
         """Return the map's grid with its rays, by the pose in the map's store; None without one."""
         if self.run.store("ground_map") is None:
             return None
-        path, scene = self.run.path("ground_map"), grid_of(open_image(self.run.path("class_map"), "classes").about)
+        path = self.run.path("ground_map")
+        scene = grid_of(open_image(self.run.path("class_map"), "classes").about)
         geobox = load_geobox(path)
         assert scene is not None
         assert geobox is not None
@@ -111,20 +112,15 @@ class MosaicView:
             last = min(first + at_once, height)
             out = np.full((last - first, width, len(bands)), np.nan, np.float32)
             for _, columns in map_blocks((last - first, width), (last - first, COLUMNS_AT_ONCE)):
-                out[:, columns] = _window_at(self.mosaic, self.ground.scene_pixels(slice(first, last), columns), bands)
+                pixels = self.ground.scene_pixels(slice(first, last), columns)
+                known = pixels[np.isfinite(pixels).all(axis=-1)]
+                if not len(known):
+                    continue
+                low = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, self.mosaic.shape)
+                high = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, self.mosaic.shape)
+                window = self.mosaic.values(slice(low[0], high[0]), slice(low[1], high[1]), bands)  # around the pixels
+                out[:, columns] = image_at(np.ascontiguousarray(window), pixels - low)
             yield first, out
-
-
-def _window_at(mosaic: Mosaic, pixels: NDArray[np.float64], bands: Sequence[int]) -> Floats:
-    """Return the values at scene places (row, column, 2), reading only the window around them."""
-    known = pixels[np.isfinite(pixels).all(axis=-1)]
-    if not len(known):
-        return np.full((*pixels.shape[:2], len(bands)), np.nan, np.float32)
-    size = mosaic.shape
-    first = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, size)
-    last = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, size)
-    window = mosaic.values(slice(first[0], last[0]), slice(first[1], last[1]), bands)
-    return image_at(np.ascontiguousarray(window), pixels - first)
 
 
 def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:

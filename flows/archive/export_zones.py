@@ -113,7 +113,6 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     """Write cells along the north of the map in metres as polygons, and cells in degrees as task data."""
     assert raster.geobox is not None
     assert raster.geobox.crs is not None
-    unit = choice.unit
     west, south, east, north = _bounds(raster.geobox, WGS84)
     in_metres = is_in_metres(raster.geobox)
     plane = raster.geobox.crs if in_metres else CRS.utm((west + east) / 2, (south + north) / 2)
@@ -122,23 +121,24 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     cells = GeoBox.from_bbox(_bounds(raster.geobox, plane), crs=plane, resolution=cell_m)
     dose = dose_cells(raster, choice.doses, cells)
     row, column = np.nonzero(np.isfinite(dose))
-    (left, top), step = cells.affine * (0, 0), cells.resolution
-    x, y = left + column * step.x, top + row * step.y
-    outlines = shapely.box(x, y + step.y, x + step.x, y)
-    columns = {"dose": dose[row, column], "unit": [unit.name] * len(row)}
+    left, top = cells.affine * (0, 0)
+    x, y = left + column * cells.resolution.x, top + row * cells.resolution.y
+    outlines = shapely.box(x, y + cells.resolution.y, x + cells.resolution.x, y)
+    columns = {"dose": dose[row, column], "unit": [choice.unit.name] * len(row)}
     path = folder / "prescription.gpkg"
-    text = ", ".join(f"{name} {one:g} {unit.name}" for name, one in choice.doses.items())
+    text = ", ".join(f"{name} {one:g} {choice.unit.name}" for name, one in choice.doses.items())
     write_polygons(path, outlines, columns, str(plane), layer="prescription", when=run.receipt["finished"])
     add("prescription", path, f"Prescription ({text}) in cells of {cell_m:g} m", GEOPACKAGE, ["data"])
-    middle, length = (south + north) / 2, pyproj.Geod(ellps="WGS84").line_length
+    middle = (south + north) / 2
+    length = pyproj.Geod(ellps="WGS84").line_length
     metres = length([west, west], [middle - 0.5, middle + 0.5]), length([west - 0.5, west + 0.5], [middle, middle])
     down, across = (round(cell_m / one, DEGREE_DIGITS) for one in metres)
     cells = GeoBox.from_bbox((west, south, east, north), crs=WGS84, resolution=resxy_(across, -down))
     box = cells.boundingbox
-    task = TaskGrid(box.bottom, box.left, down, across, dose_cells(raster, choice.doses, cells)[::-1], unit)
-    survey, version = run.receipt["survey"], str(run.receipt["versions"].get("spectralzoom", "unknown"))
+    task = TaskGrid(box.bottom, box.left, down, across, dose_cells(raster, choice.doses, cells)[::-1], choice.unit)
+    version = str(run.receipt["versions"].get("spectralzoom", "unknown"))
     m2 = M2_PER_HECTARE * sum((hectares_of_classes(run.receipt) or {}).values())
-    files = write_task_data(folder, task, TaskText(survey, survey, text, version, m2))
+    files = write_task_data(folder, task, TaskText(run.receipt["survey"], run.receipt["survey"], text, version, m2))
     kinds = (("task_data", "application/xml"), ("task_grid", "application/octet-stream"))
     for (key, kind), file in zip(kinds, files, strict=True):
         add(key, file, f"Prescription ({text}) as ISOXML task data", kind, ["data"], **IN_DEGREES)
@@ -163,7 +163,8 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
     of_class[UNLABELLED] = 0
     for name, dose in doses.items():
         of_class[raster.legend.names.index(name)] = np.searchsorted(levels[1:], dose) + 1
-    found, level = np.zeros(cells.shape, np.uint8), of_class[raster.classes]
+    found = np.zeros(cells.shape, np.uint8)
+    level = of_class[raster.classes]
     rasterio_warp.reproject(
         level,
         found,
@@ -175,16 +176,12 @@ def dose_cells(raster: ClassRaster, doses: Mapping[str, float], cells: GeoBox) -
         dst_nodata=0,
         resampling=rasterio_warp.Resampling.max,
     )
-    _raise_doses(found, level, raster.geobox, cells)
+    # each cell gets the dose of every pixel in it: GDAL misses pixels of rotated maps
+    for pixel, cell in _overlaps(np.nonzero(level > 1), raster.geobox, cells):
+        np.maximum.at(found, cell, level[pixel])
+    for cell, pixel in _overlaps(tuple(np.indices(found.shape).reshape(2, -1)), cells, raster.geobox):
+        np.maximum.at(found, cell, level[pixel])
     return np.asarray(levels[found])
-
-
-def _raise_doses(found: NDArray[np.uint8], level: NDArray[np.uint8], geobox: GeoBox, cells: GeoBox) -> None:
-    """Raise the level of each cell to that of every pixel in it, in place: GDAL misses pixels of rotated maps."""
-    for pixel, cell in _overlaps(np.nonzero(level > 1), geobox, cells):
-        np.maximum.at(found, cell, level[pixel])
-    for cell, pixel in _overlaps(tuple(np.indices(found.shape).reshape(2, -1)), cells, geobox):
-        np.maximum.at(found, cell, level[pixel])
 
 
 def _overlaps(places: Places, grid: GeoBox, other: GeoBox) -> Iterator[tuple[Places, Places]]:

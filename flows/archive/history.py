@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     import flows.publish.panels as panels
     import flows.publish.report as pages
 else:
-    mpl_figure, panels = deferred("matplotlib.figure"), deferred("flows.publish.panels")
+    mpl_figure = deferred("matplotlib.figure")
+    panels = deferred("flows.publish.panels")
     pages = deferred("flows.publish.report")
 
 LEADING_CLASSES = 3  # of a run in the table
@@ -156,8 +157,7 @@ def _draw_areas(rows: Sequence[Row], legend: ClassNames | None) -> str | None:
         points = [(datetime.fromisoformat(row["visited"]), row["areas"].get(name, 0.0)) for row in dated]
         label = visible(name).replace("_", " ").replace("$", r"\$")
         axes.plot(*zip(*points, strict=True), marker="o", markersize=4, color=colours.get(name), label=label)
-    axes.set_ylim(bottom=0)
-    axes.set_ylabel(AXES[unit])
+    axes.set(ylim=(0, None), ylabel=AXES[unit])
     axes.grid(color=panels.GRID)
     axes.tick_params(axis="x", labelrotation=20)
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)

@@ -84,10 +84,12 @@ def run_ingest(
         check_name(name)
     with console.status("opening the source"):
         found = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
-        cube, opened = with_stated_values(found, source), open_archive(archive)
+        cube = with_stated_values(found, source)
+        opened = open_archive(archive)
         opened.reclaim()  # of a killed ingest
     with opened.in_use(), StageProgress(console, TITLES) as progress:
-        before, files = _stamps(cube), hash_files(cube, lambda done: progress.show("read", done))
+        before = _stamps(cube)
+        files = hash_files(cube, lambda done: progress.show("read", done))
         progress.show("read", 1.0, ended=True)
 
         def build(path: Path) -> None:
@@ -104,7 +106,7 @@ def run_ingest(
     return record
 
 
-def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[SourceFile]:
+def hash_files(source: CubeSource, report: Report) -> list[SourceFile]:
     """Return the name, size and SHA-256 of every file of a cube; names are relative to a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):
@@ -117,9 +119,10 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
 
 def _next(record: Mapping[str, Any], source: str, wavelengths: str | None) -> str:
     """Return the command that surveys the cube: a camera's numbers as a recording, images and maps as a scene."""
-    words, path = ["spectralzoom", "survey"], Path(source)
+    words = ["spectralzoom", "survey"]
     image = record["georeferenced"] or reader_of(source) in ("image", "array")
     if not image and record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
+        path = Path(source)
         table = find_pointing(path.parent, path.name.removesuffix(path.suffix))
         words += ["--source", "recorded", "--sweeps", record["path"]]
         words += [] if table is None else ["--pointing", str(table)]
@@ -184,9 +187,8 @@ def _print(record: dict[str, Any], source: CubeSource, console: Console) -> None
     console.print(f"{escape(record['name'])}: {lines} x {samples} px, {bands} bands, {light}", soft_wrap=True)
     for note in (*source.notes, *([source.bands.origin] if source.bands.origin else [])):
         console.print(f"[dim]note: {escape(note)}[/]", soft_wrap=True)
-    lost = record["lost_lines"]
-    if lost:
-        console.print(f"[yellow]{lost} of {lines} lines are in no file and flagged[/]")
+    if record["lost_lines"]:
+        console.print(f"[yellow]{record['lost_lines']} of {lines} lines are in no file and flagged[/]")
     done = "already there" if record["cached"] else "stored"
     sizes = f"{record['bytes_read'] / 1e6:.1f} MB read, {record['bytes_stored'] / 1e6:.1f} MB stored"
     console.print(f"{done}: {escape(record['path'])} ({sizes})", soft_wrap=True)

@@ -26,7 +26,6 @@ from flows.tasks.capture_plan import as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scores import MOST_ERROR, format_prediction
-from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan
 from flows.terminal.figures import DASH, counted, format_bytes, format_count, format_seconds, known_number
@@ -99,12 +98,19 @@ class Planner(OpenSurvey):
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
         """Add the forecast of a stage, and return the address that its store would have."""
+        product = STAGES[stage].product.name
+        ref: StageRef = _Awaited(product, "", Path(), made_by=stage)
         try:
-            row, ref = self._forecast(STAGES[stage], STAGES[stage].wants(self.run, *inputs))
+            wanted = STAGES[stage].wants(self.run, *inputs)
+            key = STAGES[stage].key(wanted)
+            found = STAGES[stage].find(self.run.archive, wanted)
         except (PipelineError, OSError) as error:  # the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
-            ref = _Awaited(STAGES[stage].product.name, "", Path(), made_by=stage)
+        else:
+            folder = store_at(self.run.archive.root, product, key).folder
+            row = StageForecast(stage, "to run" if found is None else "cached", key)
+            ref = _Awaited(product, key, folder, made_by=stage) if found is None else found
         if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref
@@ -120,13 +126,6 @@ class Planner(OpenSurvey):
         """Add a store that is not made again, because later ones were made of it."""
         self.rows.append(StageForecast(stage, "cached", ref.key))
         self.products[stage] = ref
-
-    def _forecast(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
-        key, found = stage.key(wanted), stage.find(self.run.archive, wanted)
-        if found is not None:
-            return StageForecast(stage.name, "cached", key), found
-        ref = store_at(self.run.archive.root, stage.product.name, key)
-        return StageForecast(stage.name, "to run", key), _Awaited(ref.stage, key, ref.folder, made_by=stage.name)
 
 
 MOST_SCANS = 8  # in the table
@@ -180,12 +179,11 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         for row in content["stages"]
     ]
     console.print(table(("stage", "state", "why"), rows, left=3, whole=("stage", "state")))
-    figures = content["field"]
-    size = f"{' x '.join(map(format_count, figures['size_px']))} px"
-    told = [size, *(text for _, text in finding_rows({"field": figures}))]
-    if figures["ground_pixel_m"] is None:
+    size = f"{' x '.join(map(format_count, content['field']['size_px']))} px"
+    told = [size, *(text for _, text in finding_rows({"field": content["field"]}))]
+    if content["field"]["ground_pixel_m"] is None:
         told.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
-    if figures["camera_s"] is None:
+    if content["field"]["camera_s"] is None:
         told.append("no camera: the pixels of the raster are taken as they are")
     console.print(escape(f"field: {'; '.join(told)}"), soft_wrap=True)
     if content["to_make"]:
@@ -231,7 +229,8 @@ LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
 # Bytes kept, fitted to seven surveys (docs/background/signal.md): receipt and report; pictures, by the side of the
 # field; the map, by its pixels; and the scores of a spectrum, by the bands of a file.
 PAGE, PICTURE_SIDE, MAP_PIXEL = 300_000, 1600.0, 5.0
-FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES, BANDS_POWER = 17.0, 4.5, 2.4, 0.57
+FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES = 17.0, 4.5, 2.4
+BANDS_POWER = 0.57
 KEPT_FROM = "pixels, spectra and bands, by surveys of seven fields, which kept 0.5 to 2 times as much"
 
 
@@ -257,7 +256,17 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate
     source = f"the patches that other scenes needed; {every} with every patch" if expected else "network and field"
     work = Estimate(run.work_done(patch_index).total, source, fine is None and run.chooses and not expected)
     captured = (camera["bytes_captured"].value or 0.0) if camera else 0.0
-    return {**camera, "bytes_kept": _kept(run, captured), "multiply_adds": work, "miou": _score(run)}
+    kept_bytes = estimated_bytes(
+        math.prod(run.scene.shape),
+        len(run.scene.wavelength_nm),
+        captured,
+        is_farm=run.settings.scene in BUILT_IN_SCENES,
+        most=run.settings.kept_bytes,
+    )
+    kept = Estimate(kept_bytes, KEPT_FROM)
+    if run.settings.keep != KEEP_SIGNAL:
+        kept = Estimate(kept_bytes + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)
+    return {**camera, "bytes_kept": kept, "multiply_adds": work, "miou": _score(run)}
 
 
 def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
@@ -265,17 +274,20 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
 
     A fine pass that is not planned yet counts with all of its budget, and with as many lines as can fit into it.
     """
-    plan, camera, bands, second = run.plan, run.camera, len(run.scene.wavelength_nm), run.second_pass
-    captured = raw_bytes([*plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
+    camera = run.camera
+    bands = len(run.scene.wavelength_nm)
+    second = run.second_pass
+    captured = raw_bytes([*run.plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
     open_end = fine is None and second is not None
     if fine is None and second is not None:
-        record, left = run.scan_record, raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
+        record = run.scan_record
+        left = raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
         shortest = (
             camera if record is None or run.recorded else replace(camera, exposure_ms=record.offered_ms(camera)[0])
         )
-        lines = int(plan.fine_s / (shortest.frame_ms * 1e-3))
+        lines = int(run.plan.fine_s / (shortest.frame_ms * 1e-3))
         captured += min(lines * camera.samples * bands * BYTES_PER_SAMPLE, left)
-    seconds = plan.coarse_s + (plan.fine_s if fine is None else fine.seconds)
+    seconds = run.plan.coarse_s + (run.plan.fine_s if fine is None else fine.seconds)
     return {
         "capture_s": Estimate(seconds, "the cost model of mirror and camera", open_end),
         "bytes_captured": Estimate(captured, "lines, samples and bands of the passes", open_end),
@@ -286,31 +298,17 @@ def _score(run: SurveyRun) -> Estimate:
     """Return the score by the weights' table of scans, else by the scenes that were kept for validation."""
     if run.part:
         return Estimate(None, "a part of the field is captured, the prior map shows the rest")
-    record = run.described.record
     if (scan := run.scans.chosen) is not None:
-        source = f"the weights' record of such scans, {counted(int(record['scans']['scenes']), 'scene')}"
+        source = f"the weights' record of such scans, {counted(int(run.described.record['scans']['scenes']), 'scene')}"
         if scan.spread is not None and scan.spread > MOST_ERROR:
             return Estimate(None, f"{source}; the scenes differ too much")
         return Estimate(scan.expected["mIoU"], source, at_most=run.budget is not None, spread=scan.spread)
-    validation = record.get("validation") or {}
+    validation = run.described.record.get("validation") or {}
     whole = known_number((validation.get("all") or {}).get("miou"))
     if whole is None:
         return Estimate(None, "no scene was kept for validation when the weights were trained")
     source = f"these weights on {counted(int(validation['scenes']), 'scene')} kept for validation, read whole"
     return Estimate(whole, source, at_most=run.chooses or not run.plan.plain)
-
-
-def _kept(run: SurveyRun, captured: float) -> Estimate:
-    kept = estimated_bytes(
-        math.prod(run.scene.shape),
-        len(run.scene.wavelength_nm),
-        captured,
-        is_farm=run.settings.scene in BUILT_IN_SCENES,
-        most=run.settings.kept_bytes,
-    )
-    if run.settings.keep == KEEP_SIGNAL:
-        return Estimate(kept, KEPT_FROM)
-    return Estimate(kept + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)
 
 
 def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool, most: float | None = None) -> float:

@@ -186,7 +186,8 @@ def run_judge(
     WeightsError: scene, labels or weights are not those of the run, or there are no labels.
     """
     opened = open_archive(archive, create=False)
-    catalogue, found = Catalogue.read(opened.root), read_run(opened.run_folder(name))
+    catalogue = Catalogue.read(opened.root)
+    found = read_run(opened.run_folder(name))
     receipt = load_receipt(found.folder)
     settings = replace(asked_again(found, opened.name, None), accuracy=True)
     if controls is not None:

@@ -119,7 +119,8 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
 
 def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
     """Return the stores that a survey would make again: missing, damaged, of another version or of other weights."""
-    now, by_weights = versions(), {one.product.name for one in STAGES.values() if one.product.by_weights}
+    now = versions()
+    by_weights = {one.product.name for one in STAGES.values() if one.product.by_weights}
 
     def is_stale(store: Store | None) -> bool:
         if store is None or store.problem is not None or store.version != str(now.get(store.ref.stage)):

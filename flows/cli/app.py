@@ -60,7 +60,8 @@ def build_app(*, listed: bool) -> App:
     rig = App(name="rig", help="Check the hardware, or emulate it.")
     app.command(rig)
     for verb, module in VERBS.items():
-        group, name = (rig if verb.startswith("rig ") else app), verb.split()[-1]
+        group = rig if verb.startswith("rig ") else app
+        name = verb.split()[-1]
         summary = {"help": _summary(module, name)} if listed else {}  # replaces all of the verb's own help
         group.command(f"{module}:{name}", name=name, **summary)
     app.register_install_completion_command(name="completion", add_to_startup=False)

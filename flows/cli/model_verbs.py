@@ -279,10 +279,17 @@ def evaluate(
     run
         Run of the archive: its name, or `latest`. `evaluate archive/runs/NAME` is equivalent.
     """
-    address = _run_address(dataset, run, weights=bool(flags.weights))
-    if address is not None:
+    if run is None and not flags.weights:
+        found = re.fullmatch(r"(.+)/runs/([^/]+)/?", dataset)
+        if found is None:
+            raise SettingsError(
+                f"evaluate {dataset}: give --weights FILE to judge weights on this data set, or a run of this archive, "
+                f"such as evaluate {dataset} latest, to judge its map"
+            )
+        dataset, run = found[1], found[2]
+    if run is not None:
         check_default(flags, ("labels", "controls"), "for weights that are judged on a data set, not for a run")
-        receipt = run_judge(*address, stderr, controls=flags.controls, labels=flags.labels)
+        receipt = run_judge(dataset, run, stderr, controls=flags.controls, labels=flags.labels)
         if as_json:
             print_json(receipt)
         return 0
@@ -290,18 +297,3 @@ def evaluate(
         raise SettingsError("--controls is for a run of an archive, not for weights; leave it out")
     run_evaluate(flags.request(dataset), stderr, as_json=as_json)
     return 0
-
-
-def _run_address(dataset: str, run: str | None, *, weights: bool) -> tuple[str, str] | None:
-    """Return archive and run, or None for an evaluation of weights. Raises SettingsError: neither is given."""
-    if run is not None:
-        return dataset, run
-    if weights:
-        return None
-    found = re.fullmatch(r"(.+)/runs/([^/]+)/?", dataset)
-    if found is None:
-        raise SettingsError(
-            f"evaluate {dataset}: give --weights FILE to judge weights on this data set, or a run of this archive, such"
-            f" as evaluate {dataset} latest, to judge its map"
-        )
-    return found[1], found[2]

@@ -80,7 +80,8 @@ def serve(
     port
         Port of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
     """
-    schedule, served = schedule_of(cron, every, timezone), load_fields(fields, out)
+    schedule = schedule_of(cron, every, timezone)
+    served = load_fields(fields, out)
     archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
     try:
         with terminable(), ExitStack() as held:
@@ -266,18 +267,23 @@ def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
     }
     now: Any = datetime.now(UTC)
     due = filters.FlowRunFilterExpectedStartTime(before_=now)
-    crashed: Any = Crashed(message="the process that ran it is gone")
-    missed: Any = Cancelled(message="no serve was running when it was due")
-    gone: Any = Cancelled(message="cancelled; the process that ran it is gone")
+    states: Any = (
+        ([StateType.SCHEDULED], Cancelled(message="no serve was running when it was due"), due),
+        ([StateType.PENDING, StateType.RUNNING], Crashed(message="the process that ran it is gone"), None),
+        ([StateType.CANCELLING], Cancelled(message="cancelled; the process that ran it is gone"), None),
+    )
     with get_client(sync_client=True) as client:
         for one in deployments if shared else ():
-            _check_other(client, one)
+            name = f"{one.flow_name}/{one.name}"
+            with suppress(ObjectNotFound):
+                known = client.read_deployment_by_name(name).parameters.get("settings", {}).get("out")
+                if known is not None and known != one.parameters.get("settings", {}).get("out"):
+                    raise SettingsError(
+                        f"the Prefect server has a field {one.name} of the archive {known}: give this field another "
+                        f"name, or delete the deployment {name} there"
+                    )
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        for kinds, ended, when in (
-            ([StateType.SCHEDULED], missed, due),
-            ([StateType.PENDING, StateType.RUNNING], crashed, None),
-            ([StateType.CANCELLING], gone, None),
-        ):
+        for kinds, ended, when in states:
             left = filters.FlowRunFilter(
                 state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=kinds)),
                 expected_start_time=when,
@@ -285,17 +291,6 @@ def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
             while found := client.read_flow_runs(**own, flow_run_filter=left):  # a page at a time
                 for run in found:
                     client.set_flow_run_state(run.id, ended, force=True)
-
-
-def _check_other(client: Any, one: Any) -> None:
-    """Raise SettingsError where the server has a deployment of this name whose surveys go into another archive."""
-    with suppress(ObjectNotFound):
-        known = client.read_deployment_by_name(f"{one.flow_name}/{one.name}").parameters.get("settings", {}).get("out")
-        if known is not None and known != one.parameters.get("settings", {}).get("out"):
-            raise SettingsError(
-                f"the Prefect server has a field {one.name} of the archive {known}: give this field another name, or "
-                f"delete the deployment {one.flow_name}/{one.name} there"
-            )
 
 
 def _wait_for_server() -> None:

@@ -82,7 +82,8 @@ def simulate(
             return ref, built
 
         effects, _ = made("effects", choose_effects, choose_effects.wants(watching("effects")))
-        began, wanted = time.process_time(), run.recorder.wanted(sweeps, [effects], watching("capture").report)
+        began = time.process_time()
+        wanted = run.recorder.wanted(sweeps, [effects], watching("capture").report)
         raw, built = made("capture", capture_coarse, wanted)
         record = _record(run, sweeps, effects, raw, time.process_time() - began if built else None)
     _print(record, stderr)

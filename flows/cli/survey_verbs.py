@@ -83,8 +83,9 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     settings
         Settings files (TOML), surveyed one after the other; flags override each. Default: none.
     """
-    every, code = [load_settings(file, by_setting(flags)) for file in settings or (None,)], 0
+    every = [load_settings(file, by_setting(flags)) for file in settings or (None,)]
     printed: list[dict[str, Any]] = []
+    code = 0
     try:
         for number, requested in enumerate(every):
             if len(every) > 1:

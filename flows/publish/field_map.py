@@ -116,12 +116,12 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     if not run.plan.plain:
         patch_index = np.zeros(run.grid.patch_shape, np.uint8)
         patch_index.ravel()[plan.patch_index] = 1
-        p, table = run.grid.patch, np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
+        p = run.grid.patch
         pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
+        table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
         layers.append(MapLayer("Captured again", layer_address(pixels[thin], table), opacity=0.6))
     counts = class_counts(shown.class_map, len(shown.class_names))
-    beyond = 1 - counts.sum() / max(shown.class_map.size, 1)
-    covered = np.append(counts / max(counts.sum(), 1), beyond)
+    covered = np.append(counts / max(counts.sum(), 1), 1 - counts.sum() / max(shown.class_map.size, 1))
     rows = [
         {
             "name": name.replace("_", " "),

@@ -47,7 +47,8 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
     kept = scale
     if run.zones.kept is not None and scale.area_m2 is not None:
         kept = replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))  # the area within the zones
-    footprint, captured = scale.footprint, run.raster is None
+    footprint = scale.footprint
+    captured = run.raster is None
     camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
     lines = {
         "coarse": sum(sweep.lines for sweep in run.plan.coarse),
@@ -76,13 +77,12 @@ def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict
 
     With a pose, hectares are those of the map on the ground.
     """
-    names = drawn.names
-    pixels = class_counts(drawn.classes, len(names)).tolist()
-    m2 = None if posed is not None else areas_by_number(run.zones.place, drawn.classes, len(names))
-    hectares = {} if m2 is None else dict(zip(names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
+    pixels = class_counts(drawn.classes, len(drawn.names)).tolist()
+    m2 = None if posed is not None else areas_by_number(run.zones.place, drawn.classes, len(drawn.names))
+    hectares = {} if m2 is None else dict(zip(drawn.names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
     if posed is not None:
         hectares = {name: area["ha"] for name, area in posed.areas.items()}
-    return {"areas": {"px": dict(zip(names, pixels, strict=True)), **({"ha": hectares} if hectares else {})}}
+    return {"areas": {"px": dict(zip(drawn.names, pixels, strict=True)), **({"ha": hectares} if hectares else {})}}
 
 
 def find_ground(
@@ -101,13 +101,12 @@ def find_ground(
         "resolution_m": pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x)),
         "shape": [int(size) for size in geobox.shape],
     }
-    place = run.zones.place
     age_days = np.where(found.classes != UNLABELLED, probabilities.age(), np.nan)
-    figures |= {"older_ha": older_hectares(place, age_days)}
+    figures |= {"older_ha": older_hectares(run.zones.place, age_days)}
     if (old_class := probabilities.old_class()) is not None:
         changes = [] if prior is None else prior["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
-        figures |= {"changes_ha": changed_hectares(place, old_class, found, beyond)}
+        figures |= {"changes_ha": changed_hectares(run.zones.place, old_class, found, beyond)}
     return {"ground": figures}
 
 
@@ -128,7 +127,8 @@ def changed_hectares(
     ``old_class`` is 255 where prior map and map agree. ``beyond`` is the fraction of differing pixels in excess of the
     differences between two maps of the same ground, by class before and now. Pairs without it did not change.
     """
-    names, count = found.names, len(found.names)
+    names = found.names
+    count = len(names)
     differing = (old_class != UNLABELLED) & (found.classes != UNLABELLED)
     pairs = np.where(differing, old_class.astype(np.int64) * count + found.classes, -1)
     areas = areas_by_number(place, pairs, count**2)
@@ -141,19 +141,19 @@ def changed_hectares(
 
 def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
     """Return ``zones``, the size of the mapped part, and ``plots``, a row each; empty without either."""
-    zones, found = run.zones, dict[str, Any]()
-    if zones.kept is not None:
-        kept = zones.kept.kept
+    found: dict[str, Any] = {}
+    if run.zones.kept is not None:
+        kept = run.zones.kept.kept
         found["zones"] = {
             "kept_px": int(np.count_nonzero(kept)),
             "field_px": kept.size,
-            "no_go_px": 0 if zones.kept.no_go is None else int(np.count_nonzero(zones.kept.no_go)),
+            "no_go_px": 0 if run.zones.kept.no_go is None else int(np.count_nonzero(run.zones.kept.no_go)),
             "kept_m2": _ground_m2(run, kept),
         }
-    if zones.plots is not None:
+    if run.zones.plots is not None:
         found["plots"] = [
-            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
-            for name, shape in zones.plots.items()
+            asdict(figures_of_plot(name, shape, run.zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in run.zones.plots.items()
         ]
     return found
 
@@ -167,7 +167,8 @@ def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
     names = list(plots[0]["fractions"]) if plots else []
-    head, text = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"], io.StringIO()
+    head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
+    text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow([*head, *(f"fraction_{name}" for name in names)])
     for plot in plots:
@@ -179,7 +180,8 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
 def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
     """Return ``unknown``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
     found: dict[str, Any] = {}
-    unclassed, fraction = drawn.classes == UNLABELLED, 0.0
+    unclassed = drawn.classes == UNLABELLED
+    fraction = 0.0
     if (rate := run.settings.unknown_rate) is not None and run.ood_detector is not None:
         count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
         classified = int(np.count_nonzero(~unclassed))
@@ -204,20 +206,21 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     They were compared for maps of uniform scans segmented in full without a prior map. Pixels without a class do not
     count. A score with too large an error is not predicted.
     """
-    settings, step = run.settings, run.settings.scan_step
+    step = run.settings.scan_step
     if (
         run.map_scores is None
         or step is None
         or not run.plan.plain
-        or settings.extent != EXTENT_WHOLE
+        or run.settings.extent != EXTENT_WHOLE
         or run.settings.macs is not None
         or ((prior := prior_map_figures(ref.path)) is not None and prior["put_aside"] is None)
     ):
         return None
-    names, store = run.described.class_names, ProbabilityStore(ref.path / "class_probabilities.zarr")
+    names = run.described.class_names
+    store = ProbabilityStore(ref.path / "class_probabilities.zarr")
     high = SHARD_ROWS * int(np.clip(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1, 4))
     strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
-    exposure_ms = (settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
+    exposure_ms = (run.settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
     score = run.map_scores.expected(expected_counts(strips, len(names)), step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None

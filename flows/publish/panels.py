@@ -58,18 +58,21 @@ def boxes_for_letters() -> Iterator[None]:
 
 def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
     """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
-    canvas, file = FigureCanvasAgg(figure), io.BytesIO()
+    canvas = FigureCanvasAgg(figure)
     with boxes_for_letters():
         canvas.draw()  # type: ignore[no-untyped-call]
     drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     kept = np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
     others = COLOURS - len(kept)
     rough = Image.fromarray(drawn).convert("RGB").quantize(others, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    numbers, packed, palette = np.array(rough), drawn.view(np.uint32)[..., 0], rough.getpalette() or []
+    numbers = np.array(rough)
+    packed = drawn.view(np.uint32)[..., 0]
     for number, colour in enumerate(kept, others):
         numbers[packed == np.array([*colour, 255], np.uint8).view(np.uint32)] = number
     picture = Image.fromarray(numbers)
+    palette = rough.getpalette() or []
     picture.putpalette([*palette, *[0] * (3 * others - len(palette)), *kept.ravel().tolist()])
+    file = io.BytesIO()
     picture.save(file, "PNG")
     return file.getvalue()
 
@@ -109,7 +112,8 @@ def class_rgb(classes: NDArray[np.integer], colours: NDArray[np.integer]) -> NDA
 
 def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) -> list[list[tuple[float, float]]]:
     """Return the border of some patches as segments ((x, y), (x, y)) in scene px, clipped to the (y, x) ``shape``."""
-    padded, limit = np.pad(chosen, 1), np.array([shape[1], shape[0]], np.float64)
+    padded = np.pad(chosen, 1)
+    limit = np.array([shape[1], shape[0]], np.float64)
     segments = []
     for axis in (0, 1):
         row, column = np.nonzero(np.diff(padded, axis=axis))
@@ -167,12 +171,11 @@ def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
     spectra = class_spectra(mosaic, found.classes, len(found.names))
     if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
         return None
-    palette = class_palette(found.colours)
     with mpl.rc_context({**STYLE, "font.size": 9}):
         figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained", facecolor=PAPER)
         axes = figure.subplots()
         axes.set_facecolor(PAPER)
-        for name, spectrum, colour in zip(found.names, spectra, palette, strict=False):
+        for name, spectrum, colour in zip(found.names, spectra, class_palette(found.colours), strict=False):
             if (known := np.isfinite(spectrum)).any():
                 nm, curve = curve_with_gaps(mosaic.wavelength_nm[known], spectrum[known])
                 axes.plot(nm, curve, color=colour, linewidth=1.2, label=name.replace("_", " "), **DOTS)
@@ -186,9 +189,11 @@ def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> N
 
     ``classes`` (y, x) are of the same pixels.
     """
-    sums, pixels, top = np.zeros((count, len(mosaic.components))), np.zeros(count), 0
+    sums, pixels = np.zeros((count, len(mosaic.components))), np.zeros(count)
+    top = 0
     for scores in mosaic.row_blocks():
-        under, seen = classes[top : top + len(scores)], np.isfinite(scores).all(axis=2)
+        under = classes[top : top + len(scores)]
+        seen = np.isfinite(scores).all(axis=2)
         for number in range(count):
             here = scores[seen & (under == number)]
             sums[number] += here.sum(axis=0, dtype=np.float64)

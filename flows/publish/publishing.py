@@ -78,7 +78,8 @@ def clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
 
 
 def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
-    archive, passes = survey.run.archive, [survey.products[name] for name in PASSES if name in survey.products]
+    archive = survey.run.archive
+    passes = survey.products.there(*PASSES)
     if not survey.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
     archive.refresh()
@@ -98,7 +99,8 @@ def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
 
 def _clear_first_mosaic(survey: OpenSurvey) -> None:
     """Clear the mosaic of the first pass, whose lines are in that of both passes."""
-    archive, first = survey.run.archive, survey.products.get("rectify")
+    archive = survey.run.archive
+    first = survey.products.get("rectify")
     if first is None or "rectify_fine" not in survey.products or survey.registers:  # fine sweeps are registered on it
         return
     archive.refresh()
@@ -148,7 +150,8 @@ def _show_artifact(survey: OpenSurvey, published: Published) -> None:
     if not inside_flow():
         return
     letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in survey.run.name.lower())
-    key, where = "".join(letters).strip("-"), f"{survey.run.archive.name}/runs/{published.folder.name}"
+    key = "".join(letters).strip("-")
+    where = f"{survey.run.archive.name}/runs/{published.folder.name}"
     with suppress(Exception):  # without a server the archive has everything
         text = render_markdown(
             "survey.md",

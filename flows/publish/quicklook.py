@@ -192,7 +192,8 @@ def _draw_confidence(axes: Axes, data: QuicklookData, title: str, why: str = "")
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
-    palette, counts = class_palette(data.class_colours), class_counts(data.class_map, len(data.class_names))
+    palette = class_palette(data.class_colours)
+    counts = class_counts(data.class_map, len(data.class_names))
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
     words = zip(data.class_names, map(format_percent, counts / max(int(counts.sum()), 1)), strict=True)
     names = [f"{name.replace('_', ' ')[:MOST_LETTERS]}  {fraction}" for name, fraction in words]
@@ -232,9 +233,8 @@ def _caption(axes: Axes, title: str, words: str) -> None:
 
 def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:
     """Draw a colour bar with the values of its ends in the lower right corner."""
-    axes = image.axes
-    box = axes.inset_axes((0.62, 0.09, 0.3, 0.03))
-    bar = axes.figure.colorbar(image, cax=box, orientation="horizontal")
+    box = image.axes.inset_axes((0.62, 0.09, 0.3, 0.03))
+    bar = image.axes.figure.colorbar(image, cax=box, orientation="horizontal")
     low, high = image.get_clim()
     bar.set_ticks([low or 0.0, high or 1.0], labels=list(ends))
     for label in box.get_xticklabels():

@@ -64,11 +64,10 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
         for name, (label, show) in COST_LABELS.items()
         if (one := receipt["savings"].get(name)) is not None
     ]
-    account = receipt["data_bytes"]
-    full = account["reference"]
+    full = receipt["data_bytes"]["reference"]
     show_bytes = format_bytes if full < LEAST_REFERENCE else lambda size: f"{three_digits(size / 1e6)} MB"
     for name, label in BYTE_LABELS.items():
-        done = account[name]
+        done = receipt["data_bytes"][name]
         if done or name != "moved_bucket":
             ratio = done / full if full else None
             rows.append({"label": label, "done": show_bytes(done), "full": show_bytes(full), "ratio": ratio})
@@ -117,7 +116,8 @@ def format_score(receipt: Mapping[str, Any]) -> str:
 
 def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the accuracy; after a revisit without the maps to compare, which lack the prior map."""
-    accuracy, prior = receipt.get("accuracy"), receipt.get("prior_map")
+    accuracy = receipt.get("accuracy")
+    prior = receipt.get("prior_map")
     if accuracy is None or prior is None or prior["put_aside"] is not None:
         return accuracy
     return {**accuracy, "none": NOT_JUDGED, "all": NOT_JUDGED, "controls": {}, "gap_closed": None}
@@ -200,7 +200,8 @@ def format_change(value: float | None) -> str:
 
 def format_total(total: Mapping[str, Any]) -> Sequence[str]:
     """Return sentences on the effects computed, the error bound against the tolerance, and the seconds saved."""
-    unit, count = UNIT_NAMES[total["unit"]], total["on"] + total["off"]
+    unit = UNIT_NAMES[total["unit"]]
+    count = total["on"] + total["off"]
     tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
     words = [f"Effects computed: {total['on']} of {count} (asked: {total['asked']}, tolerance {tolerance} {unit})."]
     if total["bound"] is None:
@@ -295,7 +296,8 @@ def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
     Hectares are left out where the size of a pixel on the ground is not known.
     """
     pixels: Mapping[str, int] = (receipt.get("areas") or {}).get("px", {})
-    hectares, every = hectares_of_classes(receipt), sum(pixels.values())
+    hectares = hectares_of_classes(receipt)
+    every = sum(pixels.values())
     return [
         {"class": spaced(name), "pixels": format_count(count), "fraction": format_percent(count / every)}
         | ({} if hectares is None else {"area": format_area(hectares.get(name, 0.0))})

@@ -143,7 +143,8 @@ def render_report(
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
-    total, accuracy = receipt.get("effects_total"), shown_accuracy(receipt)
+    total = receipt.get("effects_total")
+    accuracy = shown_accuracy(receipt)
     return render_page(
         "report.html",
         () if field is None else MAP_SCRIPTS,

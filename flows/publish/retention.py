@@ -88,7 +88,8 @@ def outlived_lines(catalogue: Catalogue, now: datetime) -> Iterator[OutlivedLine
             if raw.ref.uri in catalogue.inputs_of(signal.ref.uri) and all(is_outlived(one, now) for one in runs):
                 found.add(raw.ref.uri)
                 keeps = sorted({str(one.settings["keep"]) for one in runs})
-                stage, present = signal.ref.stage, PRESENT.get(signal.ref.stage)
+                stage = signal.ref.stage
+                present = PRESENT.get(stage)
                 old = f"they were condensed by version {signal.version} of {stage}, now {present}: run reprocess"
                 stay = None if present == signal.version else old
                 yield OutlivedLines(raw, signal, f"keep = {', '.join(keeps)}, and they were condensed", stay)
@@ -107,8 +108,7 @@ def is_outlived(run: Run, now: datetime) -> bool:
         days = raw_days(parse_keep(run.settings["keep"]))
     except (KeyError, ValueError):
         return False
-    old = made is not None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
-    return run.problem is None and old
+    return run.problem is None and made is not None and (days <= 0 or (now - made).total_seconds() >= days * DAY_S)
 
 
 def _removal(one: OutlivedLines) -> Removal:

@@ -70,14 +70,15 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
 
     ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the evaluation. All else of the receipt stays.
     """
-    judge, before, asked = STAGES["evaluate"], load_receipt(draft.published), asked_settings(survey.run)
+    before = load_receipt(draft.published)
+    asked = asked_settings(survey.run)
     other_labels = asked["labels"] != before["settings"].get("labels")
     names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
     receipt = with_accuracy(
         before,
         load_accuracy(accuracy),
-        survey.records[judge.name],
-        judge.addresses(accuracy)["accuracy"],
+        survey.records[STAGES["evaluate"].name],
+        STAGES["evaluate"].addresses(accuracy)["accuracy"],
         settings={name: asked[name] for name in names},
         judged=now(),
     )
@@ -105,21 +106,19 @@ _DRAWN: WeakKeyDictionary[OpenSurvey, _Drawn] = WeakKeyDictionary()  # of survey
 
 
 def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
-    run, products = survey.run, survey.products
-    shown = quicklook_data(run, products, plan)
-    maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
+    shown = quicklook_data(survey.run, survey.products, plan)
+    maps = (load_ground_map(ref.path / STORE) for ref in survey.products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    drawn = load_class_map(products["segment"].path / "class_map.zarr")
-    if (spectra := draw_spectra(open_mosaic(products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
+    drawn = load_class_map(survey.products["segment"].path / "class_map.zarr")
+    if (spectra := draw_spectra(open_mosaic(survey.products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
         pictures.append(Picture(spectra, SPECTRA_CAPTION))
-    field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
+    field = field_map(survey.run, plan, shown, prior_map(survey.run.prior, survey.products["segment"], receipt))
     return _Drawn(draw_quicklook(shown), tuple(pictures), field)
 
 
 def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
     """Publish a draft as a run folder with receipt.json, quicklook.png and report.html."""
-    run, products = survey.run, survey.products
-    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
+    again = None if survey.run.plan.plain else len(plan.patch_index) / len(survey.run.grid.every_patch())
     drawn = _DRAWN.pop(survey, None) or _draw(survey, plan, receipt)
     if not draft.extends:
         _DRAWN[survey] = drawn
@@ -127,12 +126,12 @@ def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: 
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     receipt = publish_counted(
-        run.archive,
+        survey.run.archive,
         draft,
         receipt,
         lambda told: render_report(told, drawn.quicklook, drawn.pictures, captured_again=again, field=drawn.field),
-        rests_on=run.archive.manifest_hashes(products.values()),
-        of_earlier=() if run.prior is None else run.archive.manifest_hashes(run.prior.stores),
+        rests_on=survey.run.archive.manifest_hashes(survey.products.values()),
+        of_earlier=() if survey.run.prior is None else survey.run.archive.manifest_hashes(survey.run.prior.stores),
         written=survey.take_written(),
     )
     return Published(receipt, draft.published, again)
@@ -154,8 +153,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
-    most_s = run.plan.coarse_s + plan.seconds + 1e-6
-    in_time = [one for one in run.scans.offered if one.seconds <= most_s]
+    in_time = [one for one in run.scans.offered if one.seconds <= run.plan.coarse_s + plan.seconds + 1e-6]
     scans = {
         "taken": run.scans.chosen,
         "best_in_time": max(in_time, key=lambda one: one.expected[MIOU], default=None),
@@ -223,9 +221,11 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     bands, caption = choose_bands(run.scene.wavelength_nm)
     decided = products["segment"].path / READING
     attention = load_attention(decided if decided.exists() else products["score"].path / READING)
-    changed, found = attention.changed, load_class_map(products["segment"].path / "class_map.zarr")
+    changed = attention.changed
     order = np.argsort(attention.rank.ravel(), kind="stable")
-    prior, drawn = prior_map_figures(products["segment"].path), products["segment"].path / "class_probabilities.zarr"
+    found = load_class_map(products["segment"].path / "class_map.zarr")
+    prior = prior_map_figures(products["segment"].path)
+    drawn = products["segment"].path / "class_probabilities.zarr"
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
@@ -279,12 +279,11 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if prior is not None:
         found["prior_map"] = prior
     if run.settings.extent != EXTENT_WHOLE:
-        expected = {} if run.extent is None else asdict(run.extent)
         found["extent"] = {
             "lines": run.settings.extent,
             "patches_touched": len(plan.patch_index) / max(len(run.kept_patches), 1),
             "uses_prior_map": prior is not None and prior["put_aside"] is None,
-            **expected,
+            **({} if run.extent is None else asdict(run.extent)),
         }
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
@@ -292,13 +291,11 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         pointing["fine"]["partly_seen"] = _partly_seen(run, products.mosaic, plan)
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
-    class_map = products["segment"]
-    drawn = load_class_map(class_map.path / "class_map.zarr")
+    drawn = load_class_map(products["segment"].path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
-    probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
-    found |= find_areas(run, posed, drawn)
-    found |= find_ground(run, posed, drawn, probabilities, prior) | find_zones(run, drawn)
-    found |= find_map(run, class_map, drawn)
+    probabilities = ProbabilityStore(products["segment"].path / "class_probabilities.zarr")
+    found |= find_areas(run, posed, drawn) | find_ground(run, posed, drawn, probabilities, prior)
+    found |= find_zones(run, drawn) | find_map(run, products["segment"], drawn)
     if run.raster is not None:
         return found
     record = products.mosaic.path / SIGNAL_RECORD
@@ -342,8 +339,9 @@ def open_account(run: SurveyRun, plan: FinePlan) -> Facts:
         captured = raw_bytes([*run.plan.coarse, *plan.sweeps], run.camera, bands)
         reference = raw_bytes(run.plan.full, run.camera, bands)
     else:
-        captured, reference = 0, int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
-    return {**{"captured": captured, "written": 0, "kept": 0, "moved_bucket": 0}, "reference": reference}
+        captured = 0
+        reference = int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
+    return {"captured": captured, "written": 0, "kept": 0, "moved_bucket": 0, "reference": reference}
 
 
 def publish_counted(
@@ -363,11 +361,14 @@ def publish_counted(
     ``written`` are bytes of stores that the receipt does not count yet.
     """
     facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
-    products, drops_raw = receipt["products"], receipt["settings"]["keep"] == KEEP_SIGNAL
+    products = receipt["products"]
+    drops_raw = receipt["settings"]["keep"] == KEEP_SIGNAL
     others = {*of_earlier, *(products[name] for name in LINE_PRODUCTS if drops_raw and name in products)}
     stores = archive.sizes(uri for uri in rests_on if uri not in others)
     moved = archive.take_moved()
-    before, longest, folder = receipt["data_bytes"], {RECEIPT: 0, REPORT: 0}, 0
+    before = receipt["data_bytes"]
+    longest = {RECEIPT: 0, REPORT: 0}
+    folder = 0
     while True:
         told = {
             "written": before["written"] + written + folder,

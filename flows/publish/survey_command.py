@@ -89,7 +89,8 @@ def _prefect_server(out: str) -> Iterator[None]:
         yield
         return
     root = open_archive(out).root
-    home, release = root / ".prefect", take_lock(root / ".locks" / "prefect.lock", wait=False)
+    home = root / ".prefect"
+    release = take_lock(root / ".locks" / "prefect.lock", wait=False)
     if release is None:
         home = root / f".prefect-{os.getpid()}"
         atexit.register(remove_tree, home)

@@ -31,8 +31,7 @@ def about(one: Declared, *, choices: bool = True) -> str:
 
 def toml_value(one: Declared) -> str:
     """Return the default of a setting, or an example value, as TOML."""
-    example = one.about["example"]
-    return as_toml(one.item.default if example is None else example)
+    return as_toml(one.item.default if one.about["example"] is None else one.about["example"])
 
 
 def as_toml(value: object) -> str:

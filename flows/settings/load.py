@@ -108,7 +108,8 @@ class Declared:
 
 def _declared(make: type[Any]) -> dict[str, Declared]:
     own = {datetime: Annotated[datetime, PlainValidator(parse_moment)]}
-    hints, found = get_type_hints(make, include_extras=True), {}
+    hints = get_type_hints(make, include_extras=True)
+    found = {}
     for item in dataclasses.fields(make):
         hint = hints[item.name]
         if get_origin(hint) in (types.UnionType, Union):
@@ -263,8 +264,7 @@ def _check_table(
             near = [name for name in everywhere if name.split(".")[-1] == key]
             near = near or [prefix + name for name in difflib.get_close_matches(key, declared, n=1, cutoff=0.5)]
             every = f"; known keys: {', '.join(prefix + name for name in declared)}"
-            hint = f"; did you mean '{near[0]}'?" if near else every
-            raise SettingsError(f"unknown setting {place}{hint}")
+            raise SettingsError(f"unknown setting {place}" + (f"; did you mean '{near[0]}'?" if near else every))
         if not prefix and key in TABLES:
             checked[key] = _parse_table(key, value, place, origin)
         else:
@@ -332,7 +332,8 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
 
 def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings of a camera for a raster. The IFOV is that of its [pose]."""
-    usual, changed = Settings(), list[str]()
+    usual = Settings()
+    changed: list[str] = []
     for name in OF_A_CAMERA:
         own, other = getattr(settings, name), getattr(usual, name)
         if name in TABLES:
@@ -350,7 +351,8 @@ def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str
 
 def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings that the scene cannot have."""
-    scene, bands, wavelengths = settings.scene, settings.bands, settings.wavelengths
+    scene = settings.scene
+    bands, wavelengths = settings.bands, settings.wavelengths
     if (settings.policy == "mask") != (settings.mask is not None):
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
         yield f"{wants}: got policy = {settings.policy!r}, mask = {settings.mask!r}; give both or neither"
@@ -485,7 +487,8 @@ def time_of_visit(run: Run) -> str | None:
 
     A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
     """
-    named, began = moment_of(run.settings.get("visit")), moment_of(run.receipt.get("started")) or moment_of(run.created)
+    named = moment_of(run.settings.get("visit"))
+    began = moment_of(run.receipt.get("started")) or moment_of(run.created)
     found = named or began
     with suppress(TypeError, ValueError, OverflowError):
         if named is None and began is not None and run.settings.get("scene") in BUILT_IN_SCENES:

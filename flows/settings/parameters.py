@@ -109,7 +109,8 @@ class SurveySettings(BaseModel):
 
         Raises SettingsError: the file is not valid, or has another white reference or mounting.
         """
-        requested, there = self.settings(), load_settings(file).rig
+        requested = self.settings()
+        there = load_settings(file).rig
         for name in OF_THE_LINES:
             if (own := getattr(requested.rig, name)) != (other := getattr(there, name)):
                 raise SettingsError(

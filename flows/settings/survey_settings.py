@@ -375,11 +375,6 @@ class Settings:
         return self.zoom == AUTO and free and whole and self.source in (SIM, RIG)
 
     @property
-    def undecided(self) -> bool:
-        """Return whether the scan performance table of the weights chooses the scan."""
-        return not self.plain and self.budget is None
-
-    @property
     def is_map(self) -> bool:
         """Return whether the scene is a raster whose pixels are used as they are, without a camera."""
         return self.source == RASTER

@@ -176,7 +176,8 @@ def parse_moment(value: object) -> datetime:
 
 def parse_tolerance(value: object) -> Tolerance:
     """Return a tolerance from noise sigmas (0.1) or DN (0.5dn); 0 omits nothing, inf has no limit."""
-    found, amount = re.fullmatch(r"([-+0-9.e]+|inf)\s*(dn|sigmas?)?", str(value).strip().lower()), None
+    found = re.fullmatch(r"([-+0-9.e]+|inf)\s*(dn|sigmas?)?", str(value).strip().lower())
+    amount = None
     if found is not None and not isinstance(value, bool):
         amount = math.inf if found[1] == "inf" else _to_float(found[1])
     if found is None or amount is None or amount < 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -54,11 +53,6 @@ class CapturePlan:
     margin_px: float  # extension of sweeps at both ends
     plain: bool = False  # one uniform scan, or a raster
     by_record: bool = False  # scan performance chooses the lines of the second pass
-
-    @staticmethod
-    def of_map() -> CapturePlan:
-        """Return the plan of a raster, without sweeps."""
-        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True)
 
 
 @dataclass(frozen=True)
@@ -114,7 +108,7 @@ class PassLayout:
         """
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
-        fine_s, by_record = 0.0, budget is None and seconds is not None
+        fine_s = 0.0
         limit_s = seconds if budget is None else budget * full_s
         if limit_s is not None:
             fine_s = limit_s - coarse_s
@@ -130,8 +124,11 @@ class PassLayout:
                     f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.2f} s; "
                     f"{', '.join([*ways, f'or take one uniform scan ({left_out})'])}"
                 )
-        margin, plain = 2 * self.pointing_px, budget is None and seconds is None
-        return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, margin, plain=plain, by_record=by_record)
+        margin_px = 2 * self.pointing_px
+        by_record = budget is None and seconds is not None
+        return CapturePlan(
+            along, coarse, full, coarse_s, full_s, fine_s, margin_px, plain=limit_s is None, by_record=by_record
+        )
 
     def sweeps(self) -> tuple[Axis, list[Sweep], list[Sweep]]:
         """Return the axis of the lines, the sweeps of the first pass or uniform scan, and those of the full scan.
@@ -140,14 +137,15 @@ class PassLayout:
         whole sweeps. Raises SettingsError: overlaps would take whole lines, or the extent names lines that do not
         exist; PoseError: the field exceeds the mirror's range; NotRecordedError: a recording lacks a line.
         """
-        grid, camera, cost, apart = self.grid, self.camera, self.cost, 2 * self.pointing_px
-        shown, recorded = self.shown, self.recorded
+        grid = self.grid
+        camera = self.camera
+        apart = 2 * self.pointing_px
 
         def cut(sweeps: list[Sweep]) -> list[Sweep]:
-            return sweeps if shown is None or apart else sweeps_over(sweeps, grid, camera, shown)
+            return sweeps if self.shown is None or apart else sweeps_over(sweeps, grid, camera, self.shown)
 
-        axes: tuple[Axis, ...] = ("x", "y") if recorded is None else recorded.axes
-        along, full, _ = cheapest_full(grid, camera, cost, overlap_px=self._overlap(1), cut=cut, axes=axes)
+        axes: tuple[Axis, ...] = ("x", "y") if self.recorded is None else self.recorded.axes
+        along, full, _ = cheapest_full(grid, camera, self.cost, overlap_px=self._overlap(1), cut=cut, axes=axes)
         if self.step is not None:
             scan_passes = uniform_sweeps(
                 grid, camera, along, step=self.step, exposure_ms=self.exposure_ms, overlap_px=self._overlap(self.step)
@@ -159,17 +157,18 @@ class PassLayout:
         if self.extent != EXTENT_WHOLE:
             scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))
         scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
-        if recorded is None:
+        if self.recorded is None:
             return along, scan_passes, full
-        taken = recorded.uniform_scan() if self.as_taken else recorded.first_pass(scan_passes)
-        return along, taken, recorded.full_scan(full)
+        taken = self.recorded.uniform_scan() if self.as_taken else self.recorded.first_pass(scan_passes)
+        return along, taken, self.recorded.full_scan(full)
 
     def _overlap(self, step: int) -> float:
         """Return the overlap of neighbouring sweeps that leaves 64 pixels at the greatest pointing error [px]."""
-        off, samples = self.pointing_px, self.camera.samples
+        off = self.pointing_px
         if not off:
             return 0.0
-        rest, line = LEAST_OVERLAP_PX * step, samples // step * step
+        rest = LEAST_OVERLAP_PX * step
+        line = self.camera.samples // step * step
         overlap = 2 * off + rest
         if overlap >= line:
             raise SettingsError(
@@ -203,9 +202,9 @@ def choose_uniform_scan(
     SettingsError: the weights lack the class of a goal, or the table starts at longer exposures than the camera's;
     PoseError: the field exceeds the mirror's range.
     """
-    plain, content = settings.plain, weights.record.get("scans")
+    content = weights.record.get("scans")
     if content is None:
-        if layout.step is None and plain:
+        if layout.step is None and settings.plain:
             by_hand = "--scan-step" + ("" if settings.source == RECORDED else " and --scan-exposure-ms")
             raise WeightsError(
                 f"the weights {path.name} have no record of uniform scans to choose by: give {by_hand} instead of "
@@ -218,36 +217,35 @@ def choose_uniform_scan(
         if name not in record.scores:
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: no class of the weights; give one of {known}")
-    camera, cost = layout.camera, layout.cost
+    camera = layout.camera
     sweeps: dict[int, list[Sweep]] = {}  # by line spacing: those that fit the field, or that recorded lines contain
     for step in (one for one in record.steps if one <= camera.samples):
         others = (SettingsError, PoseError) if step != (layout.step or min(record.steps)) else ()
         with suppress(*others if layout.recorded is None else (NotRecordedError,)):
             found = layout.uniform(step, layout.exposure_ms).sweeps()[1]
-            memory_loads(found, cost.vector_pairs)  # raises where the mirror cannot hold a line
+            memory_loads(found, layout.cost.vector_pairs)  # raises where the mirror cannot hold a line
             sweeps[step] = found
     recorded_ms = None  # by line spacing: recorded lines have exposures of their own
     if layout.recorded is not None:
         recorded_ms = {step: exposing(camera, found[0]).exposure_ms for step, found in sweeps.items()}
-    scans = uniform_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, recorded_ms=recorded_ms)
+    scans = uniform_scans(record, sweeps, camera, layout.cost, bands, seconds=settings.seconds, recorded_ms=recorded_ms)
     chosen = None
     exposure_ms = (recorded_ms or {}).get(layout.step or 0) or layout.exposure_ms or camera.exposure_ms
     if layout.extent != EXTENT_WHOLE:  # the table is for whole fields
         pass
     elif layout.step in sweeps and record.knows(exposure_ms):
-        chosen = priced_scan(record, sweeps[layout.step], camera, cost, bands, exposure_ms)
-    elif plain and layout.step is None:
+        chosen = priced_scan(record, sweeps[layout.step], camera, layout.cost, bands, exposure_ms)
+    elif settings.plain and layout.step is None:
         if not scans:
-            offered, longer = f"camera.exposure_ms = {camera.exposure_ms:g}", "longer exposures, or "
-            if recorded_ms is not None:
-                exposures = ", ".join(f"{one:g}" for one in sorted({*recorded_ms.values()}))
-                offered, longer = f"recorded lines of {exposures} ms", ""
-            raise SettingsError(
-                f"{offered}: the scan performance of the weights starts at "
-                f"{record.exposures_ms[0]:g} ms; give {longer}--scan-step instead of --seconds and --goal"
-            )
+            start = f"the scan performance of the weights starts at {record.exposures_ms[0]:g} ms"
+            advice = "--scan-step instead of --seconds and --goal"
+            if recorded_ms is None:
+                offered = f"camera.exposure_ms = {camera.exposure_ms:g}"
+                raise SettingsError(f"{offered}: {start}; give longer exposures, or {advice}")
+            exposures = ", ".join(f"{one:g}" for one in sorted({*recorded_ms.values()}))
+            raise SettingsError(f"recorded lines of {exposures} ms: {start}; give {advice}")
         chosen = choose_scan(scans, settings.seconds, goals)
-    elif settings.undecided and scans and not settings.zooms:
+    elif scans and not settings.plain and not settings.zooms:
         chosen = reference_scan(scans)
     return ScanChoice(tuple(scans), chosen)
 
@@ -260,7 +258,9 @@ def lay_out_passes(
     Returns layout, plan, settings that request exactly this plan, and notes. Without settings or a table, every line
     is captured. Raises what `PassLayout.plan` raises.
     """
-    chosen, content, first = scans.chosen, weights.record.get("scans"), None
+    chosen = scans.chosen
+    content = weights.record.get("scans")
+    first = None
     if content is not None and (settings.zooms or zoom_may_pay(layout, scans, settings)):
         record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
         if settings.seconds is not None and settings.coarse_exposure_ms is None:
@@ -319,12 +319,13 @@ def choose_first_pass(
     The criterion is the expected mIoU if the second pass covers the whole field. Among nearly equal choices, the
     closest lines are taken, then the longest exposure. Recorded lines have their own exposure.
     """
-    camera, cost, full = layout.camera, layout.cost, layout.sweeps()[2]
-    shortest, longest = record.offered_ms(camera)
+    full = layout.sweeps()[2]
+    shortest, longest = record.offered_ms(layout.camera)
     offered_ms = exposures_between(shortest, longest)
     if layout.recorded is not None:
         taken_ms = layout.recorded.exposures_ms
-        shortest, longest, offered_ms = taken_ms[0], taken_ms[-1], taken_ms[:1]
+        shortest, longest = taken_ms[0], taken_ms[-1]
+        offered_ms = taken_ms[:1]
     found: list[FirstPass] = []
     fastest: FirstPass | None = None
     for first_step in (step for step in steps if step in record.steps):
@@ -332,15 +333,15 @@ def choose_first_pass(
             first = every_nth(full, first_step, first_ms)
             if layout.recorded is not None:
                 first = layout.recorded.first_pass(first)
-                first_ms = exposing(camera, first[0]).exposure_ms
-            left_s = seconds - cost.seconds(first, camera)
+                first_ms = exposing(layout.camera, first[0]).exposure_ms
+            left_s = seconds - layout.cost.seconds(first, layout.camera)
             if left_s < 0:
                 fastest = FirstPass(first_step, first_ms, 0.0)
                 break
             scores = [0.0]
             for step in (step for step in record.steps if step < first_step):
                 rest = lines_between(full, first, step=step)
-                rest_ms = longest_exposure(left_s, rest, camera, cost, shortest, longest)
+                rest_ms = longest_exposure(left_s, rest, layout.camera, layout.cost, shortest, longest)
                 if rest_ms is not None:
                     scores.append(record.expected(step, merged_ms(first_ms, rest_ms, step / first_step))[MIOU])
             found.append(FirstPass(first_step, first_ms, max(scores)))
@@ -353,6 +354,5 @@ def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:
     """Return a scan for receipts, with its expected mIoU."""
     if scan is None:
         return None
-    fields: Mapping[str, Any] = asdict(scan)
     figures = {"expected_miou": scan.expected[MIOU], "expected_spread": scan.spread}
-    return {name: value for name, value in fields.items() if name not in ("expected", "spread")} | figures
+    return {name: value for name, value in asdict(scan).items() if name not in ("expected", "spread")} | figures

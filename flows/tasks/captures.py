@@ -69,7 +69,9 @@ def opened_first(settings: Settings) -> Iterator[None]:
 
 
 def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
-    observer, requested, due = current_observer(), settings.settings(), _due_time()
+    observer = current_observer()
+    requested = settings.settings()
+    due = _due_time()
     first, run = next(iter(_opened.get() or ()), (None, None))
     if run is None or first is not requested:
         try:
@@ -112,31 +114,31 @@ def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef
 
 def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
     """Return the condensed sweeps of a pass; capture only what the archive lacks. Raises as `capture_pass`."""
-    condense, stage, archive = CONDENSED[sweeps], PASSES[sweeps], survey.run.archive
+    condense, stage = CONDENSED[sweeps], PASSES[sweeps]
     before = survey.products.there("capture_coarse") if sweeps == "fine" else []
     found = None
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the capture
-        raw = archive.ref(stage.product.name, stage.key(stage.wants(survey.run, *inputs)))
-        found = condense.find(archive, condense.wants(survey.run, raw, *before))
+        raw = survey.run.archive.ref(stage.product.name, stage.key(stage.wants(survey.run, *inputs)))
+        found = condense.find(survey.run.archive, condense.wants(survey.run, raw, *before))
     if found is None:
-        if before and not archive.is_there(before[0].uri):  # raw lines were deleted
+        if before and not survey.run.archive.is_there(before[0].uri):  # raw lines were deleted
             capture_pass(survey, "coarse", inputs[-1])
         return condense(survey, capture_pass(survey, sweeps, *inputs), *before)
     settings = survey.run.settings
-    if settings.keep == KEEP_RAW and settings.source != RIG and archive.find(raw.stage, raw.key) is None:
+    if settings.keep == KEEP_RAW and settings.source != RIG and survey.run.archive.find(raw.stage, raw.key) is None:
         capture_pass(survey, sweeps, *inputs)  # an earlier run deleted the raw lines that this one keeps
-    elif archive.is_known(raw):
+    elif survey.run.archive.is_known(raw):
         survey.take_as_found(stage.name, raw, *inputs)
     return condense(survey, raw, *before)
 
 
 def first_mosaic(survey: OpenSurvey, *inputs: StageRef | None) -> StageRef:
     """Return the mosaic of the first pass; one that was cleared after the second pass is not made again."""
-    archive, given = survey.run.archive, [ref for ref in inputs if ref is not None]
+    given = [ref for ref in inputs if ref is not None]
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the stage
-        mosaic = archive.ref(rectify.product.name, rectify.key(rectify.wants(survey.run, *given)))
-        cleared = archive.is_known(mosaic) and archive.find(mosaic.stage, mosaic.key) is None
-        request = score.find(archive, score.wants(survey.run, mosaic)) if cleared else None
+        mosaic = survey.run.archive.ref(rectify.product.name, rectify.key(rectify.wants(survey.run, *given)))
+        cleared = survey.run.archive.is_known(mosaic) and survey.run.archive.find(mosaic.stage, mosaic.key) is None
+        request = score.find(survey.run.archive, score.wants(survey.run, mosaic)) if cleared else None
         if request is not None and survey.goes_back(request):
             survey.take_as_found(rectify.name, mosaic, *given)
             return mosaic

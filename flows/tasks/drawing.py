@@ -75,13 +75,16 @@ class Drawing:
 
     def __call__(self, region: Region) -> DrawnRegion:
         """Read what was seen of the region coarsely and finely, and return the part of the map that is kept."""
-        weights, mosaic, chosen = self.weights.load(), open_mosaic(self.mosaic.path / "mosaic.zarr"), self.chosen
+        weights = self.weights.load()
+        mosaic = open_mosaic(self.mosaic.path / "mosaic.zarr")
+        chosen = self.chosen
         seen = coarse_region(weights, self.mosaic, region, self.capture)
         if self.choice is not None:
             folder = self.choice.overviews
             overview = None if folder is None else load_overview(overview_file(folder, region), weights)
             seen = predicted = read_coarse_prediction(weights, seen, overview)
-            gain, here = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels), region.numbers_here(chosen)
+            gain = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels)
+            here = region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
         patch_index, columns = seen_patches(chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, every_class=True)
@@ -97,7 +100,8 @@ class Drawing:
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         observation = self._observation(region, drawn.log_probability, shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
-        comparison, old = None, None
+        comparison = None
+        old = None
         if self.prior_map is None:
             after = first_probabilities(observation)
             if not shown.all():
@@ -109,19 +113,20 @@ class Drawing:
                 after.log_probability[unknown], after.light[unknown] = np.nan, 0
             classes, confidence = after.classes()
             comparison = compare(local, observation, after, region.kept_here)
-            old, after = changed_from(local, after), as_captured(local, after)
+            old = changed_from(local, after)
+            after = as_captured(local, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
             after.log_probability[unknown], after.age_days[unknown] = np.nan, 0  # they are captured
         reading = None
         if self.choice is not None:
-            read, changed = np.zeros(gain.shape, np.bool_), np.zeros(gain.shape, np.float32)
+            read = np.zeros(gain.shape, np.bool_)
             read[patch_index] = True
             before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
             other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
+            changed = np.zeros(gain.shape, np.float32)
             changed[patch_index] = changed_fractions(other, region.grid).ravel()[patch_index]
-            kept = region.crop_patches
-            reading = FullReading(kept(gain), kept(read), kept(changed))
+            reading = FullReading(region.crop_patches(gain), region.crop_patches(read), region.crop_patches(changed))
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return DrawnRegion(
             region.crop(classes),
@@ -160,7 +165,8 @@ class Drawing:
         if not self.part:
             return covered
         reached = patch_pixels(region.grid, covered)
-        (rows, columns), p = region.grid.patch_shape, region.grid.patch
+        rows, columns = region.grid.patch_shape
+        p = region.grid.patch
         enough = ENOUGH_SEEN * region.grid.valid_fraction().reshape(-1, 1, 1)  # of a patch at the border of the field
         reached &= reached.mean(axis=(1, 2), keepdims=True) >= enough
         pixels = reached.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
@@ -247,7 +253,8 @@ def draw_field(
     begun = 0.0
     with TemporaryDirectory(prefix="overviews-", dir=path) as folder:
         if least_gain is not None:
-            begun, overviews = 0.3, Path(folder) if pool.shares_memory else None
+            begun = 0.3
+            overviews = Path(folder) if pool.shares_memory else None
             overview = Scoring(work.weights, work.mosaic, GAIN, work.capture, overviews)
             some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
             found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), inputs=work.inputs)
@@ -261,7 +268,8 @@ def draw_field(
             report=lambda done: report(begun + (1 - begun) * done),
             inputs=work.inputs,
         )
-    compared, reading = [part.comparison for part in parts if part.comparison is not None], None
+    compared = [part.comparison for part in parts if part.comparison is not None]
+    reading = None
     if least_gain is not None:
         shape = field.regions[0].field.patch_shape
         reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))

@@ -99,15 +99,18 @@ def choose_extent(
     ``skip_below_error``, and no patch is too old; WeightsError: the weights have no scan performance table;
     BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
     """
-    content, grid = weights.record.get("scans"), layout.grid
+    content = weights.record.get("scans")
     if content is None:
         raise WeightsError(
             f"the weights {path.name} have no record of uniform scans to choose a part of the field by: capture all of "
             f"it ({WHOLE}), or train weights with --min-exposure-ms 3 and validation scenes"
         )
-    swaths, classes = _swaths(prior, grid, weights, path), len(weights.class_names)
     expected_errors = PatchExpectedErrors.of(
-        swaths, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE, left_out=left_out
+        _swaths(prior, layout.grid, weights, path),
+        layout.grid,
+        len(weights.class_names),
+        come_true=1.0 if weights.reader is None else COME_TRUE,
+        left_out=left_out,
     )
     available = np.asarray(expected_errors.pixels.any(axis=(1, 2)))
     if layout.shown is not None:
@@ -127,7 +130,7 @@ def choose_extent(
     free = replace(layout, recorded=None)
     step, exposure_ms, extent = _best_extent(free, extent_gains, seconds)
     captured = patches_shown(
-        sweeps_of_runs(free.uniform(step, exposure_ms).sweeps()[1], extent.runs), grid, layout.camera
+        sweeps_of_runs(free.uniform(step, exposure_ms).sweeps()[1], extent.runs), layout.grid, layout.camera
     )
     choice = ExtentChoice(
         seconds=extent.seconds,
@@ -142,24 +145,23 @@ def choose_extent(
 
 def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) -> tuple[int, float, PartialScan]:
     """Return step, exposure and lines of the scan with the highest gain, or of the cheapest within `LOSS` of it."""
-    record, camera, cost = extent_gains.record, layout.camera, layout.cost
     found: list[tuple[int, float, PartialScan]] = []
     least: list[float] = []
-    enough = float(record.scores[MIOU].max()) - POORER
-    shortest, longest = record.offered_ms(camera)
-    for step in record.steps:
-        rows = PatchRows.of(layout.uniform(step).sweeps()[1], layout.grid, camera)
+    enough = float(extent_gains.record.scores[MIOU].max()) - POORER
+    shortest, longest = extent_gains.record.offered_ms(layout.camera)
+    for step in extent_gains.record.steps:
+        rows = PatchRows.of(layout.uniform(step).sweeps()[1], layout.grid, layout.camera)
         for exposure_ms in exposures_between(shortest, longest):
-            if record.expected(step, exposure_ms)[MIOU] < enough:
+            if extent_gains.record.expected(step, exposure_ms)[MIOU] < enough:
                 continue
             expected_gain = extent_gains.expected_gain(extent_gains.gains(step, exposure_ms))
-            times = RunTimes.of_scan(rows.sweeps, camera, cost, exposure_ms)
+            times = RunTimes.of_scan(rows.sweeps, layout.camera, layout.cost, exposure_ms)
             extent = choose_runs(rows, expected_gain, times, seconds=seconds)
             found += [] if extent is None else [(step, exposure_ms, extent)]
-            least.append(cheapest_row_seconds(rows, expected_gain, camera, cost, exposure_ms))
+            least.append(cheapest_row_seconds(rows, expected_gain, layout.camera, layout.cost, exposure_ms))
     if not least:
         raise SettingsError(
-            f"camera.exposure_ms = {camera.exposure_ms:g} is too short for a partial scan; give a longer one, or"
+            f"camera.exposure_ms = {layout.camera.exposure_ms:g} is too short for a partial scan; give a longer one, or"
             f" capture all of the field ({WHOLE})"
         )
     if not found:

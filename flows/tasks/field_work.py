@@ -179,7 +179,8 @@ def coarse_region(weights: Weights, mosaic: StageRef, region: Region, capture: L
     """
     free_tiles()
     give_back_freed_memory()  # regions differ in size: their remainders would add up over a large field
-    coarse, window = open_mosaic(mosaic.path / "mosaic.zarr"), (region.read.rows, region.read.columns)
+    coarse = open_mosaic(mosaic.path / "mosaic.zarr")
+    window = (region.read.rows, region.read.columns)
     mixed = coarse.captures(*window)
     how: Capture = capture if mixed is None else CaptureMap(tuple(LineSpec(*one) for one in mixed[0]), mixed[1])
     return read_coarse_pass(
@@ -226,8 +227,9 @@ class FieldWork:
 
         Raises SettingsError: one region does not fit the memory.
         """
-        work = Scoring(self.weights, mosaic, policy, capture)
-        found = self._joined(self._of_regions(work, mosaic, NO_PATCHES, report))
+        found = self._joined(
+            self._of_regions(Scoring(self.weights, mosaic, policy, capture), mosaic, NO_PATCHES, report)
+        )
         return _field_gain(found) if policy == GAIN else found
 
     def expected_errors(self, mosaic: StageRef, capture: LineSpec, report: Report) -> PatchExpectedErrors:

@@ -82,7 +82,17 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
     SettingsError: the port is in use.
     """
     with _listening(port) as listening, _using(home, listening.getsockname()[1], schedules=schedules) as api:
-        server, thread = _start(listening, schedules=schedules)
+        made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
+        server = uvicorn.Server(uvicorn.Config(made, log_level="critical", lifespan="on"))
+        thread = threading.Thread(
+            target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True
+        )
+        thread.start()
+        end = time.monotonic() + STARTED_WITHIN_S
+        while not server.started:
+            if not thread.is_alive() or time.monotonic() > end:
+                raise ServerUnavailable("the Prefect server did not start")
+            time.sleep(0.02)
         try:
             yield api
         finally:
@@ -129,22 +139,6 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
             os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
-
-
-def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server, threading.Thread]:
-    """Start the server in a thread and wait for it. Raises ServerUnavailable."""
-    made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
-    server = uvicorn.Server(uvicorn.Config(made, log_level="critical", lifespan="on"))
-    thread = threading.Thread(
-        target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True
-    )
-    thread.start()
-    end = time.monotonic() + STARTED_WITHIN_S
-    while not server.started:
-        if not thread.is_alive() or time.monotonic() > end:
-            raise ServerUnavailable("the Prefect server did not start")
-        time.sleep(0.02)
-    return server, thread
 
 
 def create_database(path: Path) -> None:

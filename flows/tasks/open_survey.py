@@ -31,7 +31,8 @@ else:
     rig_field = deferred("flows.tasks.rig_field")
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
-LEASE_S, TRY_S = 60, 10  # of that limit: until a lost process frees it, and between two tries
+LEASE_S = 60  # until a lost process frees that limit
+TRY_S = 10  # between two tries to get it
 OF_THE_SURVEY = (
     *(choose_effects, capture_coarse, condense_coarse, register_coarse, locate, rectify, condense_raster, score),
     *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
@@ -88,7 +89,8 @@ class OpenSurvey:
     """Opened survey: runs its stages in this process, and records them. No dataclass, which Prefect would copy."""
 
     def __init__(self, run: SurveyRun, observer: Observer | None = None) -> None:
-        self.run, self.started = run, now()
+        self.run = run
+        self.started = now()
         self.observer = current_observer() if observer is None else observer
         self.capture_deployment: str | None = None  # that captures on the rig's machine
         self.products = Products()
@@ -141,8 +143,14 @@ class OpenSurvey:
             return
         if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
             return
-        if inside_flow():
-            self._held.enter_context(rig_turn(self.observer))
+        while inside_flow():  # signals are handled between tries
+            try:
+                self._held.enter_context(
+                    prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
+                )
+                break
+            except TimeoutError:
+                self.observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
         self._held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
         self._holds_rig = True
 
@@ -154,7 +162,10 @@ class OpenSurvey:
             if shown or state == "failed":
                 self.observer.watch(stage, state, done)
 
-        meter, reached = _Meter(), 0.0
+        with suppress(OSError):  # Linux: reset the peak
+            Path("/proc/self/clear_refs").write_text("5")
+        begun_s = time.perf_counter(), time.process_time()
+        reached = 0.0
 
         def report(done: float) -> None:
             nonlocal reached
@@ -170,7 +181,8 @@ class OpenSurvey:
             watch(stage, "failed", reached)
             raise
         state: Literal["ran", "cached"] = "ran" if built else "cached"
-        self._record(stage, ref, inputs, state, *(meter.read() if built else ()))
+        spent = (time.perf_counter() - begun_s[0], time.process_time() - begun_s[1], peak_bytes()) if built else ()
+        self._record(stage, ref, inputs, state, *spent)
         if built:
             self._written += bytes_below(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
@@ -194,42 +206,17 @@ class OpenSurvey:
         cpu: float | None = None,
         peak: int | None = None,
     ) -> None:
-        size, known = self.run.archive.stored_bytes, self.run.archive.manifest_hash(ref)
+        size = self.run.archive.stored_bytes
+        known = self.run.archive.manifest_hash(ref)
         bytes_in = sum(size(one) for one in inputs)
         self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
         self.products[stage] = ref
 
     def take_written(self) -> int:
         """Return the bytes of stores and spools that were written since the last call."""
-        taken, self._written = self._written + self.run.archive.take_spooled(), 0
+        taken = self._written + self.run.archive.take_spooled()
+        self._written = 0
         return taken
-
-
-@contextmanager
-def rig_turn(observer: Observer) -> Iterator[None]:
-    """Wait for Prefect's limit ``rig`` and hold it; signals are handled between tries."""
-    with ExitStack() as held:
-        while True:
-            try:
-                held.enter_context(
-                    prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
-                )
-                break
-            except TimeoutError:
-                observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
-        yield
-
-
-class _Meter:
-    """Meter of wall time, processor time and peak memory since its construction."""
-
-    def __init__(self) -> None:
-        with suppress(OSError):  # Linux: reset the peak
-            Path("/proc/self/clear_refs").write_text("5")
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
-
-    def read(self) -> tuple[float, float, int]:
-        return time.perf_counter() - self._wall, time.process_time() - self._cpu, peak_bytes()
 
 
 def peak_bytes() -> int:

@@ -47,7 +47,8 @@ class ReadingCosts:
 
         Stages share no results of the model, so each computes the overview: ``overview`` counts both.
         """
-        drawn, readings = self.of_map(patch_index), 2 if policy in GLANCING_POLICIES else 1
+        drawn = self.of_map(patch_index)
+        readings = 2 if policy in GLANCING_POLICIES else 1
         return replace(drawn, overview=readings * drawn.overview, score=self.score(policy))
 
     def score(self, policy: str) -> int:

@@ -30,17 +30,20 @@ if TYPE_CHECKING:
     import prefect.settings as prefect_settings
     import uvicorn
 else:
-    prefect, prefect_artifacts = deferred("prefect"), deferred("prefect.artifacts")
+    prefect = deferred("prefect")
+    prefect_artifacts = deferred("prefect.artifacts")
     prefect_cache_policies = deferred("prefect.cache_policies")
     prefect_client = deferred("prefect.client.orchestration")
     prefect_concurrency = deferred("prefect.concurrency.sync")
-    prefect_context, prefect_deployments = deferred("prefect.context"), deferred("prefect.deployments")
+    prefect_context = deferred("prefect.context")
+    prefect_deployments = deferred("prefect.deployments")
     prefect_exceptions = deferred("prefect.exceptions")
     prefect_filters = deferred("prefect.client.schemas.filters")
     prefect_handlers = deferred("prefect.logging.handlers")
     prefect_server = deferred("prefect.server.api.server")
     prefect_settings = deferred("prefect.settings")
-    prefect_task_run, uvicorn = deferred("prefect.runtime.task_run"), deferred("uvicorn")
+    prefect_task_run = deferred("prefect.runtime.task_run")
+    uvicorn = deferred("uvicorn")
 
 
 RETRY_DELAY_S = 2.0

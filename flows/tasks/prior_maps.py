@@ -75,7 +75,8 @@ def find_prior(
     if settings.prior in (NONE, AUTO):
         return None, ()
     if settings.prior != LATEST:
-        folder, why = archive.root / "runs" / Path(settings.prior).name, "there is no such run in the archive"
+        folder = archive.root / "runs" / Path(settings.prior).name
+        why = "there is no such run in the archive"
         if folder.is_dir():
             found = _usable(archive, read_run(folder), settings, grid, class_names, scene)
             if isinstance(found, Prior):
@@ -137,7 +138,8 @@ def _usable(
         if probabilities is None or mosaic is None:
             return "its stores were cleared; reprocess computes them again"
         store = ProbabilityStore(probabilities.path / "class_probabilities.zarr")
-        names, before = store.legend.names, load_geobox(probabilities.path / "class_map.zarr")
+        names = store.legend.names
+        before = load_geobox(probabilities.path / "class_map.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
@@ -148,8 +150,7 @@ def _usable(
             return "it has another coordinate system, pixel size or direction than this scene"
         if math.hypot(*shift) > REACH_PX:
             return f"it shows another place: its corner lies {math.hypot(*shift):.0f} px from that of this scene"
-    camera = run.settings["camera"]
-    if any(camera[part] != getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")):
+    if any(run.settings["camera"][part] != getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")):
         return "its camera has another pitch or focal length"
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):

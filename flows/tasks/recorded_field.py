@@ -51,19 +51,14 @@ class OpenedRecording:
     notes: tuple[str, ...]
     geobox: GeoBox | None  # of the run that captured the lines, if it is of the same field
 
-    @property
-    def passes(self) -> RecordedPasses:
-        """Return the passes that its lines contain."""
-        return RecordedPasses(self.field.source)
-
     def scene(self) -> tuple[RasterScene, tuple[str, ...]]:
         """Return the field as a scene with size, bands and the labels of the settings, and notes.
 
         Raises SceneError: the labels are not valid.
         """
         height, width = self.field.source.field_shape
-        wavelength_nm = self.recording.wavelength_nm
-        found, notes = None, tuple[str, ...]()
+        found = None
+        notes: tuple[str, ...] = ()
         if self.settings.labels is not None:
             found, notes = load_field_labels(self.settings.labels, (height, width))
         scene = RasterScene(
@@ -72,12 +67,12 @@ class OpenedRecording:
             raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), None if found is None else found.index),
             light=Once.of(
                 SceneRadiance(
-                    np.zeros((1, len(wavelength_nm)), np.float32),
-                    np.full(len(wavelength_nm), self.settings.camera.full_scale_e, np.float32),
+                    np.zeros((1, len(self.recording.wavelength_nm)), np.float32),
+                    np.full(len(self.recording.wavelength_nm), self.settings.camera.full_scale_e, np.float32),
                 )
             ),
             white_reference=self.recording.sweeps[0].references.white_reference,
-            wavelength_nm=wavelength_nm,
+            wavelength_nm=self.recording.wavelength_nm,
             fwhm_nm=self.recording.fwhm_nm,
             class_names=() if found is None else found.names,
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
@@ -103,7 +98,8 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     recording = open_recording(str(settings.sweeps), settings.camera, files)
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
-    camera, geobox = recording.camera, None
+    camera = recording.camera
+    geobox = None
     if (run := find_recorded_run(str(settings.sweeps))) is not None:  # its full scan has the exposure of its camera
         camera = replace(camera, exposure_ms=float(run.run.settings["camera"]["exposure_ms"]))
         if camera.exposure_ms != settings.camera.exposure_ms:
@@ -119,8 +115,9 @@ def open_recorded(settings: Settings) -> OpenedRecording:
                 "camera.focal_length_mm"
             )
         settings = replace(settings, scan_step=step)
-    field = RecordedField(source, recording.key())
-    return OpenedRecording(settings, recording, field, (*recording.notes, *notes), geobox)
+    return OpenedRecording(
+        settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes), geobox
+    )
 
 
 def _field_shape(

@@ -64,24 +64,24 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
     Raises SettingsError: the camera does not allow the exposure or frame time, or a driver cannot be imported;
     PoseError: the field exceeds the mirror's range.
     """
-    camera, rig = settings.camera, settings.rig
-    drivers.import_factory(rig, "mirror_driver")
-    drivers.import_factory(rig, "camera_driver")
-    for exposed in {exposing(camera, sweep) for sweep in planned} | {camera}:
-        check_times(exposed.exposure_ms, exposed.frame_ms, camera.max_rate_hz)
-    if rig.mounting != STRAIGHT:
+    drivers.import_factory(settings.rig, "mirror_driver")
+    drivers.import_factory(settings.rig, "camera_driver")
+    for exposed in {exposing(settings.camera, sweep) for sweep in planned} | {settings.camera}:
+        check_times(exposed.exposure_ms, exposed.frame_ms, settings.camera.max_rate_hz)
+    if settings.rig.mounting != STRAIGHT:
         for sweep in planned:
-            rig.mounting.to_device(sweep_positions(sweep, camera))
-    source = RigSource(
-        camera,
-        scene.wavelength_nm,
-        scene.shape,
-        lambda: open_devices(settings),
-        KeptInMemory(),
-        rig=rig,
-        vector_pairs=settings.cost.vector_pairs,
+            settings.rig.mounting.to_device(sweep_positions(sweep, settings.camera))
+    return RigField(
+        RigSource(
+            settings.camera,
+            scene.wavelength_nm,
+            scene.shape,
+            lambda: open_devices(settings),
+            KeptInMemory(),
+            rig=settings.rig,
+            vector_pairs=settings.cost.vector_pairs,
+        )
     )
-    return RigField(source)
 
 
 @contextmanager

@@ -51,7 +51,7 @@ from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NothingToMend, SceneError, SettingsError
+from pipeline.errors import NothingToMend, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -146,10 +146,9 @@ class CaptureRun:
     @property
     def recorder(self) -> SweepRecorder:
         """Return the recorder of sweeps."""
-        scene, settings = self.scene, self.settings
-        bands = scene.wavelength_nm, scene.fwhm_nm
+        bands = self.scene.wavelength_nm, self.scene.fwhm_nm
         return SweepRecorder(
-            self.archive, self.source, self.source_key, *bands, self.camera, settings.cost, settings.pool
+            self.archive, self.source, self.source_key, *bands, self.camera, self.settings.cost, self.settings.pool
         )
 
 
@@ -203,10 +202,10 @@ class SurveyRun(CaptureRun):
 
         It follows from the accepted loss, unless the settings limit multiply-adds. A prior map leaves less to gain.
         """
-        settings, cascade = self.settings, self.cascade
-        if cascade is None or settings.macs is not None or settings.policy != "gain":
+        cascade = self.cascade
+        if cascade is None or self.settings.macs is not None or self.settings.policy != "gain":
             return None
-        least = cascade.within(settings.expected_loss / 100)
+        least = cascade.within(self.settings.expected_loss / 100)
         return least if least is None or self.prior is None else PRIOR_MAP_GAIN * least
 
     @property
@@ -233,9 +232,8 @@ class SurveyRun(CaptureRun):
     @property
     def frame(self) -> FieldFrame:
         """Return the frame of all images of the survey."""
-        scene = self.scene
-        bands = scene.wavelength_nm, scene.fwhm_nm
-        return FieldFrame(self.grid, self.camera.ifov_rad, *bands, scene.missing, scene.geobox)
+        bands = self.scene.wavelength_nm, self.scene.fwhm_nm
+        return FieldFrame(self.grid, self.camera.ifov_rad, *bands, self.scene.missing, self.scene.geobox)
 
     @property
     def work(self) -> FieldWork:
@@ -251,10 +249,9 @@ class SurveyRun(CaptureRun):
     @property
     def capture(self) -> LineSpec:
         """Return line spacing and light of the first pass or of the uniform scan."""
-        settings = self.settings
-        exposure_ms, step = settings.scan_exposure_ms, settings.scan_step or 1
+        exposure_ms, step = self.settings.scan_exposure_ms, self.settings.scan_step or 1
         if not self.plan.plain:
-            exposure_ms, step = settings.coarse_exposure_ms, self.plan.coarse[0].step
+            exposure_ms, step = self.settings.coarse_exposure_ms, self.plan.coarse[0].step
         return LineSpec(self.light.light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
 
     @property
@@ -272,9 +269,10 @@ class SurveyRun(CaptureRun):
     @property
     def second_pass(self) -> SecondPass | None:
         """Return the planner of the second pass; None for a uniform scan or a raster."""
-        plan, field = self.plan, (self.grid, self.camera, self.settings.cost)
+        plan = self.plan
         if plan.plain:
             return None
+        field = (self.grid, self.camera, self.settings.cost)
         of_recording = () if self.recorded is None else (self.recorded.fine_pass, self.recorded.exposures_ms)
         return SecondPass(*field, plan.coarse, plan.full, plan.fine_s, plan.margin_px, *of_recording)
 
@@ -337,7 +335,8 @@ class SurveyRun(CaptureRun):
         self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None
     ) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
-        settings, everything = self.settings, self.kept_patches
+        settings = self.settings
+        everything = self.kept_patches
         return {
             "asked": {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss},
             "patches": len(patch_index),
@@ -359,9 +358,9 @@ class SurveyRun(CaptureRun):
         """Return as many patches as are expected to be read at full resolution, or as the budget pays for."""
         if self.budget is not None:
             return self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel())  # all gain the same
-        cascade, least, every = self.cascade, self.least_gain, self.kept_patches
-        if self.part:
-            every = np.intersect1d(every, self.scanned.patch_index)
+        cascade = self.cascade
+        least = self.least_gain
+        every = np.intersect1d(self.kept_patches, self.scanned.patch_index) if self.part else self.kept_patches
         return every if cascade is None or least is None else every[: round(cascade.fraction_at(least) * len(every))]
 
 
@@ -377,34 +376,37 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
-    path = weights_path(settings)
-    model = SurveyModel.open(path, settings.device, settings.unknown, planning=planning)
-    described, refused = model.described, farm_refusal(settings)
+    model = SurveyModel.open(weights_path(settings), settings.device, settings.unknown, planning=planning)
+    described = model.described
+    refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
-    outside = beyond_training(settings, scene, described, model.trained_on, path)
+    outside = beyond_training(settings, scene, described, model.trained_on, model.path)
     ood_detector = model.asked_ood(settings.unknown)
-    name, found = settings.name or Path(scene.name).stem, None
+    name = settings.name or Path(scene.name).stem
+    found = None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
-        asked = (settings, name, grid, described.class_names, scene)
-        found = (None, ()) if archive is None else find_prior(archive, *asked)
-    passes, planned = None if recorded is None else recorded.passes, _PlannedCapture(settings)
+        found = (
+            (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names, scene)
+        )
+    passes = None if recorded is None else RecordedPasses(recorded.field.source)
+    planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        planned = _plan_capture(settings, scene, zones, path, described, prior, passes, planning=planning)
-    settings, plan = planned.settings, planned.plan
-    read = min(len(scene.wavelength_nm), SMOOTH)  # components that a plan assumes; most mosaics have 11 to 33
-    costs = ReadingCosts(described.config, grid, read)
+        planned = _plan_capture(settings, scene, zones, model.path, described, prior, passes, planning=planning)
+    settings = planned.settings
+    # a plan assumes `SMOOTH` components; most mosaics have 11 to 33
+    costs = ReadingCosts(described.config, grid, min(len(scene.wavelength_nm), SMOOTH))
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
-    source, simulated, raster = _open_source(settings, scene, grid, plan, recorded, pixels)
+    source, simulated, raster = _open_source(settings, scene, grid, planned.plan, recorded, pixels)
     archive = open_archive(settings.out) if archive is None else archive
     if raster is not None and not planning:
-        outside += other_unit(raster, scene.wavelength_nm, model.load(), path)
+        outside += other_unit(raster, scene.wavelength_nm, model.load(), model.path)
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)
@@ -414,12 +416,12 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         source=source,
         simulated=simulated,
         scene=scene,
-        planned=_representative_sweeps(plan, settings, scene, described),
+        planned=_representative_sweeps(planned.plan, settings, scene, described),
         described=described,
         load=model.load,
         grid=grid,
         costs=costs,
-        plan=plan,
+        plan=planned.plan,
         recorded=passes,
         scans=planned.scans,
         zones=zones,
@@ -440,7 +442,8 @@ def _representative_sweeps(
     """Return the sweeps of a uniform scan, or of a first pass and full scans of exposures that a second may have."""
     if plan.plain:
         return tuple(plan.coarse)
-    record, exposures = described.record.get("scans"), [None]
+    record = described.record.get("scans")
+    exposures = [None]
     if record is not None and plan.by_record:
         ends = ScanPerformance.read(record, scene.light_fraction).offered_ms(settings.camera)
         exposures = np.geomspace(*ends, REPRESENTATIVE).tolist()
@@ -477,7 +480,8 @@ class _PlannedCapture:
     """Planned lines of a survey, the choices behind them, and settings that request exactly these lines."""
 
     settings: Settings
-    plan: CapturePlan = field(default_factory=CapturePlan.of_map)
+    # a raster has no sweeps
+    plan: CapturePlan = field(default_factory=lambda: CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True))
     scans: ScanChoice = field(default_factory=ScanChoice)
     extent: ExtentChoice | None = None
     notes: tuple[str, ...] = ()
@@ -499,11 +503,14 @@ def _plan_capture(
     Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise. With ``planning``, a visit that a
     survey would skip has a note.
     """
-    extent, extent_notes, is_part = None, tuple[str, ...](), settings.extent == EXTENT_PART
+    extent = None
+    extent_notes: tuple[str, ...] = ()
+    is_part = settings.extent == EXTENT_PART
     if is_part and prior is None:
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
         extent_notes = ("there is no prior map: the whole field is captured",)
-    layout = PassLayout.of(settings, zones.grid, zones.shown, passes)
+    shown = None if zones.kept is None else zones.kept.shown_patches(zones.grid)
+    layout = PassLayout.of(settings, zones.grid, shown, passes)
     if is_part and prior is not None:
         limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         masks = [one for one in (zones.left_out, scene.missing) if one is not None]
@@ -520,8 +527,7 @@ def _plan_capture(
     scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
     layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
     scans = replace(scans, chosen=None) if settings.zooms else scans
-    settings = replace(settings, extent=layout.extent)
-    return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
+    return _PlannedCapture(replace(settings, extent=layout.extent), plan, scans, extent, (*plan_notes, *extent_notes))
 
 
 def _scene_for(
@@ -542,7 +548,12 @@ def _scene_for(
     if not planning:  # before the stages, whose time is measured
         scene.raster.drawn()
         scene.light()
-    model.check_bands(scene.wavelength_nm)
+    basis = model.described.basis
+    if not basis.matrix(scene.wavelength_nm)[1].any():
+        raise WeightsError(
+            f"the weights {model.path.name} are for {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; the scene's bands lie at"
+            f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
+        )
     label_notes = check_labels(scene, model.described)
     size = None if settings.mask is None else load_labels_array(settings.mask).shape[:2]
     if size not in (None, scene.shape):
@@ -560,7 +571,8 @@ def noise_seed(settings: Settings) -> int:
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
     """Return the simulated rig in front of a scene, without effects."""
-    pointing, seed = None, noise_seed(settings)
+    pointing = None
+    seed = noise_seed(settings)
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, seed=seed)
     return SimulatedSource(scene, settings.simulated_rig, seed, {}, name=settings.source, pointing=pointing)

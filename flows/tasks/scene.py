@@ -86,7 +86,8 @@ def check_scene_there(scene: str) -> None:
     if scene in (RIG_FIELD, *BUILT_IN_SCENES):
         return
     try:
-        there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
+        there = path.exists()
+        what = "a link that leads nowhere," if path.is_symlink() else "no file"
     except OSError as error:  # such as a name longer than any
         raise SceneError(f"--scene {scene} cannot be the name of a file: {error.strerror}") from error
     if not there:
@@ -129,8 +130,7 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
         labels_needed=False,
     )
     file = _judged_by_known(file, known)
-    scene, notes = _placed_once(scene_of_file(file, settings.camera), file.provenance, posed=settings.pose is not None)
-    return scene, (*notes, *_gap_note(scene, "given their band's median"))
+    return _with_notes(scene_of_file(file, settings.camera), file, settings, "given their band's median")
 
 
 def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -143,7 +143,8 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
     )
     file = _judged_by_known(file, known)
     missing = file.missing if file.missing.any() else None
-    labels, bands = file.labels, len(file.wavelength_nm)
+    labels = file.labels
+    bands = len(file.wavelength_nm)
     if labels is not None and missing is not None:
         labels = np.where(missing, np.uint8(UNLABELLED), labels)
     scene = RasterScene(
@@ -162,8 +163,7 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         pixel_m=file.pixel_m,
         content=file.content,
     )
-    scene, notes = _placed_once(scene, file.provenance, posed=settings.pose is not None)
-    return file, scene, (*notes, *_gap_note(scene, "whose other bands are used"))
+    return file, *_with_notes(scene, file, settings, "whose other bands are used")
 
 
 def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
@@ -179,18 +179,20 @@ def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
     return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
 
 
-def _placed_once(scene: RasterScene, notes: tuple[str, ...], *, posed: bool) -> tuple[RasterScene, tuple[str, ...]]:
-    """Return the scene without its georeference where a pose replaces it, with a note."""
-    if scene.geobox is None or not posed:
-        return scene, notes
-    return replace(scene, geobox=None), (*notes, POSE_WINS)
+def _with_notes(
+    scene: RasterScene, file: SceneFile, settings: Settings, became: str
+) -> tuple[RasterScene, tuple[str, ...]]:
+    """Return the scene of a file, without its georeference where a pose replaces it, and notes on both.
 
-
-def _gap_note(scene: RasterScene, became: str) -> tuple[str, ...]:
-    """Return notes on pixels without a value in some or most bands."""
+    ``became`` says what became of pixels without a value in some bands.
+    """
+    notes = file.provenance
+    if scene.geobox is not None and settings.pose is not None:
+        scene = replace(scene, geobox=None)
+        notes = (*notes, POSE_WINS)
     void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
     counts = {f"some bands, {became}": scene.filled_px - void, "most bands, of no class in the map": void}
-    return tuple(f"pixels without {what}: {count}" for what, count in counts.items() if count)
+    return scene, (*notes, *(f"pixels without {what}: {count}" for what, count in counts.items() if count))
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:
@@ -230,9 +232,10 @@ def farm_refusal(settings: Settings) -> str | None:
 
 def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
     """Return the scene with some of its bands. Raises SettingsError: it has no such band."""
-    count, chosen = len(scene.wavelength_nm), list(bands)
+    count = len(scene.wavelength_nm)
     if not all(0 <= band < count for band in bands):
         raise SettingsError(f"--bands {','.join(map(str, bands))}: the scene has bands 0 to {count - 1}")
+    chosen = list(bands)
     return replace(
         scene,
         key=f"{scene.key}/only={','.join(map(str, bands))}",
@@ -249,7 +252,8 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
         return ()
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
-        known, hint = ", ".join(weights.class_names), "use weights for these"
+        known = ", ".join(weights.class_names)
+        hint = "use weights for these"
         if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # it has no name
             value = found[1] or list(bytes.fromhex(found[2]))
             hint += (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from flows.terminal.figures import format_count, format_points, known_number, spaced
 from storage.arrays.class_maps import unknown_name
@@ -20,15 +20,6 @@ def format_prediction(miou: float | None, error: float | None) -> str:
     return format_points(miou) if error is None else f"{format_points(miou)} ± {format_points(error)}"
 
 
-class WorstClass(NamedTuple):
-    """Class with the lowest IoU, and its IoU in the three maps; None where there is none."""
-
-    name: str
-    none: float | None
-    this: float
-    all: float | None
-
-
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
     """Return ``miou`` and ``overall_accuracy`` of a run's map, 0..1; None without labels."""
     accuracy = receipt.get("accuracy")
@@ -42,29 +33,18 @@ def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
     return {str(name): known_number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
 
 
-def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
-    """Return the class with the lowest IoU; None without labels."""
+def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
+    """Return the class with the lowest IoU in a sentence, ``alone`` without other maps; empty without labels."""
     this, none, every = (_by_class(one or {}) for one in (accuracy, accuracy.get("none"), accuracy.get("all")))
     known = {name: iou for name, iou in this.items() if iou is not None}
     if not known:
-        return None
-    name = min(known, key=lambda name: known[name])
-    return WorstClass(name, none.get(name), known[name], every.get(name))
-
-
-def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
-    """Return the worst class in a sentence, ``alone`` without other maps; empty without labels."""
-    worst = worst_class(accuracy)
-    if worst is None:
         return ""
-    name = worst.name.replace("_", " ")
+    worst = min(known, key=lambda name: known[name])
+    words = f"Its worst class is {spaced(worst)} with {format_points(known[worst])}"
     if alone:
-        return f"Its worst class is {name} with {format_points(worst.this)}."
-    full = "" if worst.all is None else f", a full reading {format_points(worst.all)}"
-    return (
-        f"Its worst class is {name} with {format_points(worst.this)}: the overview alone "
-        f"gives {format_points(worst.none)}{full}."
-    )
+        return f"{words}."
+    full = "" if every.get(worst) is None else f", a full reading {format_points(every[worst])}"
+    return f"{words}: the overview alone gives {format_points(none.get(worst))}{full}."
 
 
 def format_false_classes(accuracy: Mapping[str, Any]) -> str:
@@ -78,18 +58,16 @@ def format_false_classes(accuracy: Mapping[str, Any]) -> str:
     return f"Shown although the truth has none: {'; '.join(parts)}." if parts else ""
 
 
-class ErrorMatrix(NamedTuple):
-    """Confusion matrix as text, for the classes of map or labels."""
+def error_matrix(accuracy: Mapping[str, Any]) -> dict[str, list[Any]] | None:
+    """Return the confusion matrix of a receipt's accuracy as text; None where the receipt has none.
 
-    labels: list[str]  # of the columns
-    rows: list[list[str]]  # mapped class, pixels by label, user's accuracy [%]; last the producer's accuracies [%]
-
-
-def error_matrix(accuracy: Mapping[str, Any]) -> ErrorMatrix | None:
-    """Return the confusion matrix of a receipt's accuracy as a table; None where the receipt has none."""
+    It has ``labels``, the classes of the columns, and ``rows``: mapped class, pixels by label, user's accuracy [%].
+    The last row has the producer's accuracies.
+    """
     if not (counts := accuracy.get("confusion")):
         return None
-    size, known = len(counts), list(_by_class(accuracy))
+    size = len(counts)
+    known = list(_by_class(accuracy))
     names = [*known, unknown_name(known)][:size]
     label, mapped = [sum(row) for row in counts], [sum(row[one] for row in counts) for one in range(size)]
     columns = [one for one in range(size) if label[one]]
@@ -98,8 +76,8 @@ def error_matrix(accuracy: Mapping[str, Any]) -> ErrorMatrix | None:
         for one in range(size)
         if label[one] or mapped[one]
     ]
-    producers = [_right(counts[one][one], label[one]) for one in columns]
-    return ErrorMatrix([spaced(names[one]) for one in columns], [*rows, ["producer's accuracy", *producers, ""]])
+    rows.append(["producer's accuracy", *(_right(counts[one][one], label[one]) for one in columns), ""])
+    return {"labels": [spaced(names[one]) for one in columns], "rows": rows}
 
 
 def _right(right: int, pixels: int) -> str:

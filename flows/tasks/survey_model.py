@@ -50,7 +50,8 @@ class SurveyModel:
 
         Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
         """
-        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(device)))
+        described = describe_weights(path)
+        load = Once(lambda: load_weights(path).on(choose_device(device)))
         if not planning:
             load()
             if described.reader is not None:
@@ -58,16 +59,6 @@ class SurveyModel:
             if described.ood_detector is not None and unknown != UNKNOWN_OFF:
                 load_ood(path)
         return SurveyModel(path, described, load)
-
-    def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
-        """Check that the bands overlap the spectral range of the weights. Raises WeightsError: they do not."""
-        basis = self.described.basis
-        _, reached = basis.matrix(wavelength_nm)
-        if not reached.any():
-            raise WeightsError(
-                f"the weights {self.path.name} are for {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; the scene's bands lie"
-                f" at {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm: use weights trained on such data"
-            )
 
     @property
     def trained_on(self) -> TrainedOn | None:
@@ -106,7 +97,8 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
-OTHER_UNIT, SAMPLED_ROWS = 20.0, 64  # largest ratio of medians, and rows of which it is measured
+OTHER_UNIT = 20.0  # largest ratio of medians
+SAMPLED_ROWS = 64  # rows of which it is measured
 DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # tolerances of the ranges of training
 
 
@@ -129,7 +121,8 @@ def beyond_training(
         if 2 * beyond.sum() > len(beyond):
             found.append(f"bands outside of {low:.0f}-{high:.0f} nm: {beyond.sum()} of {len(beyond)}")
         found += _season(settings.moment, trained, now=settings.source == "rig")
-        usual, least = settings.camera.exposure_ms, trained.exposure_ms[0]
+        usual = settings.camera.exposure_ms
+        least = trained.exposure_ms[0]
         one, other = settings.scan_exposure_ms or usual, settings.coarse_exposure_ms or usual
         shortest = (one if settings.plain else min(usual, other)) * scene.light_fraction
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
@@ -188,7 +181,8 @@ def _season(moment: tuple[int, float] | None, trained: TrainedOn, *, now: bool) 
             of_day, *seen = [f"{date(2025, 1, 1) + timedelta(days=one - 1):%B}" for one in (day, first, last)]
             found.append(f"day {day} of the year ({of_day}; training: {' to '.join(seen)})")
     if moment is not None and trained.sun_elevation_deg is not None:
-        height, (low, _) = sun_over_farm(*moment).elevation_deg, trained.sun_elevation_deg
+        height = sun_over_farm(*moment).elevation_deg
+        low, _ = trained.sun_elevation_deg
         if height < low - SUN_DEG:
             found.append(f"a sun elevation of {height:.0f} degrees (training: {low:.0f} and more)")
     return found

@@ -29,15 +29,9 @@ class SurveyZones:
     place: FieldPlace
     grid: SceneGrid
     kept: FieldZones | None = None  # None: all of the field
-    area: tuple[BaseGeometry, ...] = ()  # in pixels, for pictures
-    no_go: tuple[BaseGeometry, ...] = ()
+
     plots: Mapping[str, BaseGeometry] | None = None  # by name, in pixels; None where there are none
     notes: tuple[str, ...] = ()
-
-    @cached_property
-    def shown(self) -> NDArray[np.bool_] | None:
-        """Return the patches (patch,) to capture; None for all."""
-        return None if self.kept is None else self.kept.shown_patches(self.grid)
 
     @cached_property
     def fractions(self) -> NDArray[np.float64] | None:
@@ -74,13 +68,16 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
 
     Raises ZoneError: a file is not valid, area or plots lie outside of the field, or zones leave no pixel.
     """
-    if files.area is None and files.no_go is None and files.plots is None:
-        return SurveyZones(place, grid)
     notes: list[str] = []
     shape = grid.height, grid.width
 
     def read(source: str, *, named_by: str | None = None, needed: bool = True) -> dict[str, BaseGeometry]:
-        found = _read(source, place, notes, named_by)
+        """Return the polygons of a file by name, in pixels of the field."""
+        found = read_zones(source, named_by=named_by)
+        notes.extend(found.notes)
+        found = replace(found, crs=crs_on(place, found.crs, source, ZoneError))
+        if found.crs is None:
+            notes.append(f"{source} is in pixels of the scene, x to the right and y down from its upper left corner")
         shapes = {name: on_field(one, found.crs, place) for name, one in found.shapes.items()}
         if not any(one.intersection(NoPlace(shape).outline).area > 0 for one in shapes.values()):
             if needed:
@@ -101,17 +98,7 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
     if kept is not None and not kept.kept.any():
         all_of_it = "all of the field" if files.area is None else f"all of the area of {files.area}"
         raise ZoneError(f"the no-go zones of {files.no_go} cover {all_of_it}: nothing is left to survey")
-    return SurveyZones(place, grid, kept, area or (), no_go or (), plots, tuple(notes))
-
-
-def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None) -> ZoneFile:
-    """Read a file of polygons with its CRS; pixels on a field without georeference."""
-    found = read_zones(source, named_by=named_by)
-    notes += found.notes
-    crs = crs_on(place, found.crs, source, ZoneError)
-    if crs is None:
-        notes.append(f"{source} is in pixels of the scene, x to the right and y down from its upper left corner")
-    return replace(found, crs=crs)
+    return SurveyZones(place, grid, kept, plots, tuple(notes))
 
 
 def _format_beside(found: ZoneFile, place: FieldPlace) -> str:

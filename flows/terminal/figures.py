@@ -26,12 +26,12 @@ def format_bytes(count: float | None) -> str:
     """Return bytes in decimal units with three digits."""
     if not _known(count):
         return DASH
-    size, units = float(count), ("B", "kB", "MB", "GB", "TB")
-    for unit in units[:-1]:
+    size = float(count)
+    for unit in ("B", "kB", "MB", "GB"):
         if abs(size) < 999.5:
             return f"{size:.3g} {unit}"
         size /= 1000
-    return f"{size:.3g} {units[-1]}"
+    return f"{size:.3g} TB"
 
 
 def format_count(count: float | None) -> str:

@@ -55,7 +55,8 @@ _OF_LIMITED_MEMORY = ("failed to map segment", "could not find/load shared objec
 
 def format_refusal(error: BaseException) -> str | None:
     """Return the message for an error of memory or disk, with what to do; None for other errors."""
-    text, limit = str(error), resource.getrlimit(resource.RLIMIT_AS)[0]
+    text = str(error)
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     limited = limit != resource.RLIM_INFINITY
     known = (*_OF_MEMORY, *(_OF_LIMITED_MEMORY if limited else ()))
     if isinstance(error, MemoryError) or any(words in text.lower() for words in known):

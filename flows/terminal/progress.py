@@ -101,7 +101,8 @@ def heard_by(listener: Listener | None) -> Iterator[None]:
 
 
 LINE_EVERY_S = 30.0
-TITLE, NARROW = 34, 110  # columns of a title; a console of fewer is narrow
+TITLE = 34  # columns of a title
+NARROW = 110  # a console of fewer columns is narrow
 BARS = (8, 24)  # columns of a bar: narrow, wide
 TIME = 7
 
@@ -120,7 +121,8 @@ class StageProgress:
     """One bar per stage; a context manager around the work."""
 
     def __init__(self, console: Console, titles: Mapping[str, str] | None = None) -> None:
-        self.console, self.titles = console, titles or {}
+        self.console = console
+        self.titles = titles or {}
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, float] = {}
         self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is

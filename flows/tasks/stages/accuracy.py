@@ -66,11 +66,17 @@ def evaluate(
 
     def build(path: Path) -> None:
         """Write the figures of the map and, with controls, of the overview, a full reading and other placements."""
-        drawn, names = load_class_map(class_map.path / "class_map.zarr"), gains.work.weights.load().class_names
+        drawn = load_class_map(class_map.path / "class_map.zarr")
+        names = gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
-        result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-        result |= {"none": NOT_JUDGED, "all": NOT_JUDGED, "gap_closed": None, "controls": {}}
+        result: dict[str, Any] = map_figures(names, counts) | {
+            "confusion": counts.tolist(),
+            "none": NOT_JUDGED,
+            "all": NOT_JUDGED,
+            "gap_closed": None,
+            "controls": {},
+        }
         if controls:
             readings, scores = gains.work.readings(mosaic, gains.capture, report)
             readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
@@ -99,10 +105,9 @@ def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDAr
 
     Registration corrects relative errors only. The simulator knows the absolute one.
     """
-    errors = simulated.pointing
-    if not isinstance(errors, PointingErrors) or not pointing:
+    if not isinstance(simulated.pointing, PointingErrors) or not pointing:
         return np.zeros(2)
-    return errors.offset(load_registration(pointing[0])["reference"])
+    return simulated.pointing.offset(load_registration(pointing[0])["reference"])
 
 
 def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axis) -> NDArray[np.uint8]:

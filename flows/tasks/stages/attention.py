@@ -66,7 +66,8 @@ class PatchGains:
 
     def within_zones(self, scores: Scores) -> Scores:
         """Return (patch,) scores times the fraction of each patch that zones leave; 0 outside of the scene."""
-        grid, fractions = self.frame.grid, self.zones.fractions
+        grid = self.frame.grid
+        fractions = self.zones.fractions
         if self.frame.missing is not None:
             void = patch_pixels(grid, self.frame.missing).mean(axis=(1, 2)) >= grid.valid_fraction().ravel()
             scores = np.where(void, 0.0, scores)
@@ -95,12 +96,11 @@ def score(
 
     Without a second pass, ``scanned`` is the plan, and ``budget`` limits its patches.
     """
-    grid = gains.frame.grid
 
     def planned() -> tuple[Scores, FinePlan]:
         """Return the scores, and the plan of the second pass."""
         if second_pass is None and budget is None:
-            return np.zeros(int(np.prod(grid.patch_shape))), scanned
+            return np.zeros(int(np.prod(gains.frame.grid.patch_shape))), scanned
         if second_pass is not None and scan_record is not None:
             return gain_by_record(gains, mosaic, second_pass, scan_record, lambda done: report(0.5 * done))
         scores = gains.by_policy(mosaic, lambda done: report(0.5 * done))
@@ -108,8 +108,7 @@ def score(
             return scores, second_pass.plan(scores)
         assert budget is not None
         components = len(open_mosaic(mosaic.path / "mosaic.zarr").components)
-        paid = replace(budget, costs=replace(budget.costs, bands=components))
-        chosen = paid.choose(scores)
+        chosen = replace(budget, costs=replace(budget.costs, bands=components)).choose(scores)
         reason = f"{scanned.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
         gain = float(np.where(np.isfinite(scores), scores, 0.0)[chosen].sum())
         return scores, replace(scanned, patch_index=np.sort(chosen), reason=reason, expected_gain=gain)
@@ -120,12 +119,12 @@ def score(
         found = replace(found, patch_index=gains.kept(found.patch_index))
         read = found.patch_index
         if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
-            read = gains.kept(grid.every_patch())  # the segmentation chooses among them
+            read = gains.kept(gains.frame.grid.every_patch())  # the segmentation chooses among them
         # raises an error before the second pass where the map will not fit the memory
         gains.work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
         rank = np.full(scores.shape, -1, np.int32)
         rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
-        shape = grid.patch_shape
+        shape = gains.frame.grid.patch_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), gains.policy))
         write_table(path / "plan.json", asdict(found) | {"patch_index": found.patch_index.tolist()})
 
@@ -165,8 +164,7 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of the second pass: sweeps, and the patches that they cover."""
     plan = read_table(attention.path / "plan.json")
-    sweeps = [Sweep(**sweep) for sweep in plan.pop("sweeps")]
-    return FinePlan(sweeps, np.array(plan.pop("patch_index"), np.intp), **plan)
+    return FinePlan([Sweep(**one) for one in plan.pop("sweeps")], np.array(plan.pop("patch_index"), np.intp), **plan)
 
 
 def read_in_full(attention: StageRef, class_map: StageRef) -> NDArray[np.intp]:

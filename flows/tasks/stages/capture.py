@@ -75,7 +75,8 @@ class SweepRecorder:
         def build(path: Path) -> None:
             """Capture the sweeps one after the other, and write the record of the source beside their cubes."""
             found = SignalStatistics(len(self.wavelength_nm), sum(one.lines for one in sweeps) * self.camera.samples)
-            before, manifest = 0, load_manifest(inputs[-1]) if self.source.simulates else None
+            manifest = load_manifest(inputs[-1]) if self.source.simulates else None
+            before = 0
             report(0.0)  # before the first line, which takes a rig some time
             folder = self.archive.spool_folder(key)
             with self.source.lit(chosen_effects(inputs[-1]), clock).opened(folder) as source:
@@ -106,10 +107,11 @@ class SweepRecorder:
         references = source.references(sweep)
         header = SweepHeader(sweep, references, self.wavelength_nm, self.fwhm_nm, source.name, simulation=effects)
         samples, bands = references.dark.shape
-        about = {"sweep": asdict(sweep), **self.source_key}
         statistics = LineStatistics(found, sweep, references, self.camera)
         with (
-            Spool.open(folder, samples, bands, header=about, name=sweep.name) as spool,
+            Spool.open(
+                folder, samples, bands, header={"sweep": asdict(sweep), **self.source_key}, name=sweep.name
+            ) as spool,
             RawCubeWriter(path / f"{sweep.name}.zarr", header, statistics.add) as cube,
         ):
 

@@ -127,11 +127,17 @@ def condense(
         done = written(condenser)
         better = with_shared_directions(condenser, done, found, signal.false_alarm)
         if better is not None:
-            condenser, done = better, written(better)
-        record = {"components": len(condenser.components), "bands": condenser.components.bands, "step": condenser.step}
+            condenser = better
+            done = written(condenser)
         every = sum(int(cube.valid_line.sum()) * cube.shape[1] for cube in cubes)
-        record |= {"spectra": sum(one.known for one in done), "rare": sum(len(one.rare) for one in done)}
-        record |= {"saturated": sum(one.saturated for one in done) / max(every, 1)}
+        record = {
+            "components": len(condenser.components),
+            "bands": condenser.components.bands,
+            "step": condenser.step,
+            "spectra": sum(one.known for one in done),
+            "rare": sum(len(one.rare) for one in done),
+            "saturated": sum(one.saturated for one in done) / max(every, 1),
+        }
         write_table(path / SIGNAL_RECORD, record)
         rig_record = passes[0].path / RIG_RECORD
         if rig_record.is_file():  # the raw lines may be deleted
@@ -150,12 +156,11 @@ def with_shared_directions(
 ) -> Condenser | None:
     """Return a condenser with additional components that many rare spectra share; None where there are none."""
     rare, spectra = sum(len(one.rare) for one in done), sum(one.known for one in done)
-    components = condenser.components
-    if rare <= max(2 * components.bands, SHARED_FRACTION * spectra):
+    if rare <= max(2 * condenser.components.bands, SHARED_FRACTION * spectra):
         return None
     some = [one.residuals[:: -(-rare // MOST_COMPARED)] for one in done]
-    shared = with_shared(components, np.concatenate(some) * np.float32(RESIDUAL_STEP), false_alarm)
-    if len(shared) == len(components):
+    shared = with_shared(condenser.components, np.concatenate(some) * np.float32(RESIDUAL_STEP), false_alarm)
+    if len(shared) == len(condenser.components):
         return None
     return replace(condenser, components=shared, law=ResidualLaw.learned(found.spectra, shared))
 
@@ -172,19 +177,21 @@ def _write_sweeps(
     path: Path, sweeps: Sequence[tuple[RawCube, Condenser]], found: SignalStatistics, report: Report
 ) -> list[CondensedSweep]:
     """Write scores and residuals of every sweep."""
-    origin, done = np.zeros(found.bands) if found.origin is None else found.origin, []
+    origin = np.zeros(found.bands) if found.origin is None else found.origin
+    done = []
     for number, (cube, condenser) in enumerate(sweeps):
-        mean = np.nan_to_num(condenser.components.mean)
-        out, first = path / f"{cube.sweep.name}.zarr", sweeps[0][0]
+        first = sweeps[0][0]
+        out = path / f"{cube.sweep.name}.zarr"
         shutil.rmtree(out, ignore_errors=True)
         bands = cube.wavelength_nm, cube.fwhm_nm
-        header = SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation)
         writer = SignalCubeWriter(
             out,
-            header,
+            SweepHeader(cube.sweep, cube.references, *bands, cube.source, cube.started, cube.simulation),
             condenser.components,
             step=condenser.step,
-            largest=condenser.components.largest(found.largest + np.abs(origin - mean)),
+            largest=condenser.components.largest(
+                found.largest + np.abs(origin - np.nan_to_num(condenser.components.mean))
+            ),
             frames_of=first.sweep.name if number and cube.references.same_as(first.references) else None,
         )
 
@@ -245,7 +252,8 @@ def condense_raster(
 
     def build(path: Path) -> None:
         """Read the raster twice: for components, and for scores."""
-        found, whole = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width), True
+        found = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width)
+        whole = True
         for first, values, valid in blocks():
             found.add(values, valid)
             whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)

@@ -64,7 +64,8 @@ def segment(
 
     With ``least_gain``, patches are chosen here, by their expected gain.
     """
-    grid, work = gains.frame.grid, gains.work
+    grid = gains.frame.grid
+    work = gains.work
 
     def build(path: Path) -> None:
         """Write class map and class probabilities; again without the prior map if it does not agree."""
@@ -89,22 +90,19 @@ def segment(
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **gains.frame.key, **gains.zones.key}
     params |= {"capture": list(gains.capture), "part": part, "unknown": None if unknown is None else asdict(unknown)}
     params["least_gain"] = least_gain
-    if prior is None:
-        return Wanted(build, params, [mosaic, attention])
-    known: dict[str, Any] = {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
-    known["reader"] = None if reader is None else reader.key
-    earlier = [prior.probabilities, *(one.mosaic for one in prior.scan_passes)]
-    return Wanted(
-        build,
-        {**params, **known, "shifts": [list(scan_pass.shift_px) for scan_pass in prior.scan_passes]},
-        [mosaic, attention, *earlier],
-    )
+    if prior is not None:
+        params |= {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
+        params["shifts"] = [list(one.shift_px) for one in prior.scan_passes]
+        params["reader"] = None if reader is None else reader.key
+    return Wanted(build, params, [mosaic, attention, *([] if prior is None else prior.stores)])
 
 
 def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, goes_on: bool) -> tuple[str, ...]:
     """Create empty stores of class map and class probabilities; return the names of the classes."""
-    frame, weights = gains.frame, gains.work.weights.load()
-    legend, shape = ClassNames(weights.class_names, weights.class_colours), (frame.grid.height, frame.grid.width)
+    frame = gains.frame
+    shape = (frame.grid.height, frame.grid.width)
+    weights = gains.work.weights.load()
+    legend = ClassNames(weights.class_names, weights.class_colours)
     create_class_map(path / MAP, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
     create_probabilities(path / PROBABILITIES, shape, legend, grid=frame.angular_grid(), goes_on=goes_on)
     return legend.names
@@ -112,12 +110,12 @@ def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, g
 
 def finish_maps(path: Path, gains: PatchGains, *, compared: bool) -> None:
     """Blank nodata and pixels outside of zones, and write the fraction of each patch that changed."""
-    missing, left_out, probabilities = gains.frame.missing, gains.zones.left_out, path / PROBABILITIES
-    if missing is not None:
-        blank_pixels(path / MAP, missing, NO_CLASS)
-        blank_pixels(probabilities, missing, NOT_BELIEVED | ({OLD_CLASS: UNLABELLED} if compared else {}))
-    if left_out is not None:
-        blank_pixels(path / MAP, left_out, NO_CLASS)
+    probabilities = path / PROBABILITIES
+    if gains.frame.missing is not None:
+        blank_pixels(path / MAP, gains.frame.missing, NO_CLASS)
+        blank_pixels(probabilities, gains.frame.missing, NOT_BELIEVED | ({OLD_CLASS: UNLABELLED} if compared else {}))
+    if gains.zones.left_out is not None:
+        blank_pixels(path / MAP, gains.zones.left_out, NO_CLASS)
     if (old_class := ProbabilityStore(probabilities).old_class()) is not None:
         grid = gains.frame.grid
         write_changes(probabilities, changed_fractions(old_class != UNLABELLED, grid), grid.patch)
@@ -188,14 +186,15 @@ def ground(
     class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, map_choice: MapChoice, report: Report
 ) -> Wanted:
     """Project class map, ages, changes and picture to the ground, by the pose of the rig."""
-    grid = ground_grid
 
     def build(path: Path) -> None:
         """Write the map in blocks, then the area of each class."""
         found = load_class_map(class_map.path / "class_map.zarr")
         probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
         colours = colours_of(mosaic)
-        unsure, age_days, changes = np.isnan(found.confidence), probabilities.age(), probabilities.changes()
+        unsure = np.isnan(found.confidence)
+        age_days = probabilities.age()
+        changes = probabilities.changes()
 
         def shown(pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
             """Return the images of a block by name, at places (row, column, 2); nodata is 255, NaN and 0.
@@ -217,23 +216,23 @@ def ground(
 
         writer = GroundMapWriter(
             path / STORE,
-            grid.geobox,
+            ground_grid.geobox,
             ClassNames(found.names, found.colours),
-            about={"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()},
+            about={"rig_pose": asdict(ground_grid.frame.view.pose), "scene_pixels": ground_grid.counts()},
             goes_on=changes is not None,
         )
-        for rows, columns in map_blocks(grid.shape, BLOCK):
-            writer.write_block(rows, columns, shown(grid.scene_pixels(rows, columns)))
-            report(rows.stop / grid.shape[0])
-        areas = areas_by_number(PosedField(grid), found.classes, len(found.names))
+        for rows, columns in map_blocks(ground_grid.shape, BLOCK):
+            writer.write_block(rows, columns, shown(ground_grid.scene_pixels(rows, columns)))
+            report(rows.stop / ground_grid.shape[0])
+        areas = areas_by_number(PosedField(ground_grid), found.classes, len(found.names))
         assert areas is not None
         writer.finish(areas)
 
     params = {
-        "pose": asdict(grid.frame.view.pose),
+        "pose": asdict(ground_grid.frame.view.pose),
         "map": asdict(map_choice),
-        "ifov_rad": grid.frame.view.ifov_rad,
-        "scene_shape": grid.scene_shape,
+        "ifov_rad": ground_grid.frame.view.ifov_rad,
+        "scene_shape": ground_grid.scene_shape,
     }
     return Wanted(build, params, [class_map, mosaic])
 

@@ -95,9 +95,7 @@ class MosaicRecipe:
             return MosaicWork(
                 interlaced_paths(self.sweeps(), self.camera, self.grid), self.camera, self.grid, self.kernel
             )
-        tables: Tables = {}
-        if self.geolocation is not None:
-            tables = open_geolocation(self.geolocation.path / TIE_POINTS)
+        tables: Tables = {} if self.geolocation is None else open_geolocation(self.geolocation.path / TIE_POINTS)
         placed = []
         for one in self.sweeps():  # no stored tie points if lines are too uneven
             stored = tables.get(one.lines.sweep.name)
@@ -143,12 +141,13 @@ def write_mosaic(
         opened_tiles(maker)  # before threads use it
     if not pool.elsewhere and budget.workers < min(pool.count, len(tiles)):
         pool = WorkerPool(pool.scheduler, budget.workers)
-    places = [(tile.rows, tile.columns) for tile in tiles]
 
     def take(place: Place, made: tuple[Values, Counts]) -> None:
         writer.write_tile(place[0].start, place[1].start, *made)
 
-    run_blocks(maker, places, pool, take=take, report=report, inputs=recipe.inputs)
+    run_blocks(
+        maker, [(tile.rows, tile.columns) for tile in tiles], pool, take=take, report=report, inputs=recipe.inputs
+    )
     free_tiles()
     return budget
 
@@ -190,7 +189,8 @@ def register_coarse(
         found = register_sweeps(broad, camera, prior_px=pointing_px)
         report(0.8)
         placed = [replace(one, shift=found.of(one.lines.sweep.name)).placed(camera) for one in sweeps]
-        gains, names = light_gains(found, placed, camera, frame.wavelength_nm), [shift.name for shift in found.shifts]
+        gains = light_gains(found, placed, camera, frame.wavelength_nm)
+        names = [shift.name for shift in found.shifts]
         record = {
             "method": "seams",
             "reference": found.reference,
@@ -269,7 +269,8 @@ def locate(
     signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Compute the geolocation grid, which all surveys along the same path share."""
-    grid, sweeps = PixelGrid.of_scene(frame.grid), open_sweeps(signal, registration, camera)
+    grid = PixelGrid.of_scene(frame.grid)
+    sweeps = open_sweeps(signal, registration, camera)
     params = {
         "camera": {name: getattr(camera, name) for name in ("samples", "pitch_um", "focal_length_mm")},
         "grid": asdict(grid),
@@ -321,7 +322,7 @@ def rectify(
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, **frame.key}
-    return Wanted(build, params, [signal, geolocation, *_there(registration)])
+    return Wanted(build, params, [signal, geolocation, *([] if registration is None else [registration])])
 
 
 @stage("rectify_fine", "mosaic of all passes", MERGED)
@@ -353,7 +354,7 @@ def rectify_fine(
         write_table(path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(frame.grid), "resampling": resampling, "light": light.light, **frame.key}
-    return Wanted(build, params, [signal, *_there(registration)])
+    return Wanted(build, params, [signal, *([] if registration is None else [registration])])
 
 
 def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
@@ -371,7 +372,3 @@ def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicW
         grid=frame.angular_grid(),
         simulation=sweeps[0].simulation if sweeps else None,
     )
-
-
-def _there(registration: StageRef | None) -> list[StageRef]:
-    return [] if registration is None else [registration]

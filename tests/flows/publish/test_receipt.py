@@ -278,7 +278,8 @@ def test_a_report_has_the_confusion_matrix() -> None:
         assert row in page.replace("&#39;", "'"), row
     ious = {"unknown" if name == "soil" else name: iou for name, iou in receipt["accuracy"]["per_class_iou"].items()}
     told = error_matrix(receipt["accuracy"] | {"per_class_iou": ious, "confusion": np.eye(len(ious) + 1).tolist()})
-    assert [row[0] for row in told.rows[:-1]] == [*(name.replace("_", " ") for name in ious), "unknown spectrum"]
+    assert told is not None
+    assert [row[0] for row in told["rows"][:-1]] == [*(name.replace("_", " ") for name in ious), "unknown spectrum"]
 
 
 def test_a_report_names_the_file_of_the_scene() -> None:

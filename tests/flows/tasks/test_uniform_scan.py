@@ -226,7 +226,8 @@ def test_flags_of_two_passes_select_two_passes(recorded: Path, name: str, value:
     """A flag without a use in a uniform scan is not ignored."""
     flags = {"scene": "farm", "weights": str(recorded)}
     assert load_settings(None, {**flags, name: value}).budget == 0.5
-    assert load_settings(None, flags).undecided
+    assert not load_settings(None, flags).plain
+    assert not load_settings(None, flags).zooms
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (32, 32)])
