@@ -279,7 +279,8 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     """Return elements whose response is missing or odd beside their neighbours'."""
     size = min(WINDOW, len(response))
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
-    local: Floats = scipy.ndimage.median_filter(_without_gaps(response), around, mode="reflect")
+    filled = _without_gaps(response)
+    local: Floats = scipy.ndimage.median_filter(filled, around, mode="reflect")
     least = np.maximum(LIT_SIGMAS * noise, LIT_FRACTION * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
     relative = np.full(response.shape, np.nan)
@@ -292,7 +293,6 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     if len(response) < NEAR:
         return dead
     # Beyond the nearest neighbours as well; two odd elements side by side do not hide each other.
-    filled = _without_gaps(response)
     low, high = (scipy.ndimage.rank_filter(filled, rank, (NEAR, 1), mode="reflect") for rank in (2, -3))
     beyond = (response < low * (1 - ODD_FRACTION)) | (response > high * (1 + ODD_FRACTION))
     odd: Bools = (np.abs(off) > ODD_SIGMAS * spread) & beyond
