@@ -25,7 +25,8 @@ PRECISIONS = [np.float64, np.float32]
 def test_grazing_view_keeps_its_precision(precision: type, angle: float):
     """For o -> +z the normal and the line rotation match their limits, in the precision of the input."""
     o = np.array([0.6 * np.sin(angle), 0.8 * np.sin(angle), np.cos(angle)]).astype(precision)
-    normal, eps = direction_to_normal(o), 4 * float(np.finfo(precision).eps)
+    normal = direction_to_normal(o)
+    eps = 4 * float(np.finfo(precision).eps)
     exact = [0.6 * np.cos(angle / 2), 0.8 * np.cos(angle / 2), -np.sin(angle / 2)]
     assert normal.dtype == precision
     assert normal == pytest.approx(exact, rel=2 * eps, abs=0)

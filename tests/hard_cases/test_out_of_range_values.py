@@ -18,7 +18,8 @@ from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_al
 from tests.models.conftest import coarse_prediction, make_weights
 
 WEIGHTS = make_weights(0)
-GRID, NM = SceneGrid(48, 64, 8), np.linspace(420, 980, 7)
+GRID = SceneGrid(48, 64, 8)
+NM = np.linspace(420, 980, 7)
 MOST = WEIGHTS.normalisation.most_value
 VALUES = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.padded_shape, 7)).astype(np.float32)
 PATCHES = np.array([3, 9, 20, 21])
@@ -68,7 +69,8 @@ def test_out_of_range_value_counts_as_nan(value: float, y: int, x: int, bands: s
 def test_out_of_range_columns_count_as_nan(value: float) -> None:
     """Columns that arrive already normalised, for the overview or for the map, are checked too."""
     columns = np.random.default_rng(3).normal(0, 1, (*GRID.padded_shape, 4)).astype(np.float32)
-    patches, found = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32), []
+    patches = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32)
+    found = []
     for one in (value, np.nan):
         coarse, fine = columns.copy(), patches.copy()
         coarse[4, 6, 2], fine[1, 3, 5, 0] = one, one

@@ -55,23 +55,19 @@ def test_a_coarse_pass_of_single_recorded_lines_is_not_displaced() -> None:
     found = _mosaic(_captured(recorded, COARSE))[8:-8, 8:-8, 0]
     expected = 0.1 + 0.01 * np.arange(80)
     np.testing.assert_allclose(found, np.broadcast_to(expected[8:-8, None], found.shape), atol=1e-3)
-    live = _mosaic(SimulatedSweep(source, COARSE))[8:-8, 8:-8, 0]
-    np.testing.assert_allclose(found, live, atol=1e-3)
+    np.testing.assert_allclose(found, _mosaic(SimulatedSweep(source, COARSE))[8:-8, 8:-8, 0], atol=1e-3)
 
 
 def test_mosaics_use_recorded_positions_not_the_planned_swath() -> None:
     """A sweep with another swath and start, but the same positions, gives the same mosaic bit for bit."""
-    source = _ramp()
-    one = record(source, FULL)
-    expected = _mosaic(one)
+    one = record(_ramp(), FULL)
     other = replace(one, sweep=replace(one.sweep, swath_px=3.0, start_px=11.0))
-    np.testing.assert_array_equal(_mosaic(other), expected)
+    np.testing.assert_array_equal(_mosaic(other), _mosaic(one))
 
 
 def test_lines_beyond_a_gap_do_not_change_rows_before_it() -> None:
     """Rows before two lost lines keep their bits when the lines behind the gap are four times as bright."""
-    source = _ramp()
-    one = record(source, replace(FULL, start_px=FULL.start_px - 0.4))
+    one = record(_ramp(), replace(FULL, start_px=FULL.start_px - 0.4))
     one = replace(one, valid_line=~np.isin(np.arange(FULL.lines), (40, 41)))
 
     def other(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:

@@ -33,7 +33,8 @@ def test_a_planned_pass_is_cut_at_the_ends_of_the_recording() -> None:
 
 def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
     """A plan shifted by half a pixel has one line more than the recording and loses it. A single line stays."""
-    passes, beside = passes_over(FULL), replace(FULL, start_px=-40.0, lines=81)
+    passes = passes_over(FULL)
+    beside = replace(FULL, start_px=-40.0, lines=81)
     (found,) = passes.full_scan([beside])
     assert (found.lines, found.start_px) == (80, -39.0)
     assert passes.first_pass([beside]) == [found]

@@ -93,8 +93,8 @@ def test_light_ratio_withstands_noise_and_changes():
 
 def test_drift_between_captured_sweeps_is_removed():
     """Two simulated sweeps with different light and colour agree to 0.5 % in every band after correction."""
-    camera, rng = LineCamera(samples=120), np.random.default_rng(3)
-    values = np.kron(rng.uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
+    camera = LineCamera(samples=120)
+    values = np.kron(np.random.default_rng(3).uniform(0.3, 1, (15, 26, 8)), np.ones((8, 8, 1)))
     scene = raster_from_values(values, camera, name="t", wavelength_nm=np.linspace(400, 1000, 8))
     source = SimulatedSource(scene, Rig(camera), 0, effects_on("rotation", "shot", "read-noise"))
     sweeps = full_sweeps(SceneGrid(100, 150, 16), camera, "x", overlap_px=64)[:2]

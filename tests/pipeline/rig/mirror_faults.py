@@ -178,7 +178,8 @@ def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chu
         while data:
             size = random.randint(1, 3)
             pieces.append(Chunk(delay_s, data[:size]))
-            data, delay_s = data[size:], delay_s + 1e-3
+            data = data[size:]
+            delay_s = delay_s + 1e-3
     return pieces
 
 
@@ -299,10 +300,12 @@ class CellLost(Fault):
         if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
             return None
         register, offset, length, _ = read_vector(request.frame.payload)
-        memory, cells = device.state.memory, slice(offset // CELL, (offset + length) // CELL)
+        memory = device.state.memory
+        cells = slice(offset // CELL, (offset + length) // CELL)
         if register != VECTOR_MEMORY or not self.chance.comes():
             return None
-        before, reply = memory[cells].copy(), device.carry_out(request)
+        before = memory[cells].copy()
+        reply = device.carry_out(request)
         differing = np.flatnonzero(memory[cells] != before)
         if differing.size:
             place = self.chance.random.choice(differing.tolist())

@@ -25,7 +25,8 @@ KINDS = (*IN_BANDS, "beside fields", "beside points", "bright line", "pixel")
 def sparse_case(number: int) -> Case:
     """Return the case of a number, always the same; the kinds alternate."""
     rng = np.random.default_rng([11, number])
-    kind, rig = KINDS[number % len(KINDS)], random_rig(rng)
+    kind = KINDS[number % len(KINDS)]
+    rig = random_rig(rng)
     samples = rig.camera.samples
     if kind in IN_BANDS:
         values = _cube(rng, kind)
@@ -92,7 +93,8 @@ def _line(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
     """Return dark land with one bright stripe across it, which has a dark gap."""
     bands = int(rng.choice([1, 3, 12]))
     values = np.full((*SHAPE, bands), rng.uniform(0, 0.2))
-    row, high = int(rng.integers(20, 120)), int(rng.integers(3, 12))
+    row = int(rng.integers(20, 120))
+    high = int(rng.integers(3, 12))
     values[row : row + high] = 1.0
     column = int(rng.integers(40, 85))
     values[row : row + high, column : column + int(rng.integers(2, 12))] = 0.0

@@ -85,7 +85,8 @@ def test_sweep_without_common_pixels_with_the_mosaic_is_empty() -> None:
     """Without a usable line, beside the field, or on a mosaic of NaN, there is nothing to compare."""
     source = SimulatedSource(textured(), Rig(CAMERA), 0, effects_on("rotation"))
     broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
-    blind, mosaic = replace(broad, usable=np.zeros(140, bool)), brightness(textured())
+    blind = replace(broad, usable=np.zeros(140, bool))
+    mosaic = brightness(textured())
     assert anchor_sweep(blind, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
     assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
     beside = BroadSweep.read(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)

@@ -151,8 +151,8 @@ def test_light_follows_the_clock() -> None:
     """A sweep that starts an hour later in the morning is brighter; references are those of the survey's start."""
     scene = image_scene(np.full((8, 8, 3), 0.1), CAMERA, [500.0, 600.0, 700.0])
     rig = Rig(CAMERA, sky=Sky(started=datetime(2025, 6, 21, 5, tzinfo=UTC)))
-    chosen, sweep = effects_on("rotation", "drift"), Sweep("a", "fine", "x", 0.0, 0.0, 2)
-    now = SimulatedSource(scene, rig, chosen=chosen)
+    sweep = Sweep("a", "fine", "x", 0.0, 0.0, 2)
+    now = SimulatedSource(scene, rig, chosen=effects_on("rotation", "drift"))
     later = replace(now, clock={"a": 3600.0, "b": 0.0})
     assert (later.started_s(sweep), later.started_s(replace(sweep, name="c")), now.started_s(sweep)) == (3600, 0, 0)
     brighter = later.render(sweep, range(2)).astype(int) - 64
@@ -189,8 +189,10 @@ def test_calibration_removes_effects_that_the_frames_show(names: tuple[str, ...]
 
     The raw numbers differ from those without the effects: there was something to remove.
     """
-    source, sweep = white_reference_source_of(*names), WHITE_REFERENCE_SWEEP
-    raw, position = source.render(sweep, range(sweep.lines)), line_positions(sweep, WHITE_REFERENCE_CAMERA)
+    source = white_reference_source_of(*names)
+    sweep = WHITE_REFERENCE_SWEEP
+    raw = source.render(sweep, range(sweep.lines))
+    position = line_positions(sweep, WHITE_REFERENCE_CAMERA)
     values, _ = calibrate(raw, source.references(sweep), saturated_dn=65535 * sweep.binning, position=position)
     np.testing.assert_allclose(values, 0.4, atol=2e-4)
     plain = white_reference_source_of().render(sweep, range(6)).astype(int)

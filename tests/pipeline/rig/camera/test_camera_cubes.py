@@ -161,8 +161,7 @@ def test_references_that_do_not_fit_are_refused() -> None:
         as_references(dark, mean_frame(frames(3000, shape=(40, 9))))
     with pytest.raises(ShapeError, match="at least one frame"):
         mean_frame(np.zeros((0, 2, 3), np.uint16))
-    one = mean_frame(frames(64, 1))
-    assert not one.stuck.any()
+    assert not mean_frame(frames(64, 1)).stuck.any()
 
 
 def test_stuck_elements_need_eight_frames() -> None:

@@ -36,7 +36,8 @@ TOO_LONG = b'configure({"exposure": 6, "framePeriod": 5})'
 def test_every_command_gets_its_documented_bytes(sent: bytes, end: bytes, reply: bytes | None) -> None:
     """The reply follows an echo of the command, whether it is sent in one piece or byte by byte."""
     for size in (1, len(sent + end)):
-        talk, came = CameraConnection(CameraDevice(LinesOf(), ManualClock())), b""
+        talk = CameraConnection(CameraDevice(LinesOf(), ManualClock()))
+        came = b""
         for at in range(0, len(sent + end), size):
             chunks, goes_on = talk.feed((sent + end)[at : at + size])
             assert goes_on

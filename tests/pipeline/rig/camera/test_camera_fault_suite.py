@@ -128,10 +128,12 @@ def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
 
 def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
     """Capture a sweep with a fault and its rest without: every line is captured once and right."""
-    kept, lines = KeptInMemory(), list[Line]()
+    kept = KeptInMemory()
+    lines: list[Line] = []
     for noted in (scan_passes.asked_s, scan_passes.captured_s, scan_passes.errors):
         noted.clear()
-    began_s, captures = scan_passes.rig.line.clock.now(), scan_passes.rig.emulated.camera.captures
+    began_s = scan_passes.rig.line.clock.now()
+    captures = scan_passes.rig.emulated.camera.captures
     captures.clear()  # of the previous session
     scan_passes.strike(camera, mirror)
     scan_passes.go_on(kept, lines)

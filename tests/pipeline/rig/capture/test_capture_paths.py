@@ -74,7 +74,8 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
 )
 def test_rows_are_assigned_to_lines_by_frame_number(seen: CapturedLines, row: list[int]):
     """Numbers count from the capture's first frame. Lines that the cube lacks are left out."""
-    located, there = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA), np.array(row) >= 0
+    located = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA)
+    there = np.array(row) >= 0
     assert located.row.tolist() == row
     assert [located.is_valid(line) for line in range(len(row))] == there.tolist()
     np.testing.assert_array_equal(located.positions.position, PATH.middle[: len(row)][there].astype(np.float64))
@@ -82,8 +83,7 @@ def test_rows_are_assigned_to_lines_by_frame_number(seen: CapturedLines, row: li
 
 def test_a_complete_capture_without_an_index_is_in_order():
     """As many rows as lines are unambiguous; fewer rows are refused."""
-    unnumbered = frames([-1] * 6)
-    assert capture_paths.locate_lines(unnumbered, PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
+    assert capture_paths.locate_lines(frames([-1] * 6), PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
     with pytest.raises(capture_paths.UnusableCaptureError, match="fetch frameIndex"):
         capture_paths.locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA)
     with pytest.raises(capture_paths.UnusableCaptureError, match="has no number of the 6 frames"):

@@ -61,7 +61,8 @@ class Session:
 
     def times(self) -> None:
         """Record the duration of each transaction: the wait before its first byte, and the rest."""
-        exchange, write = self.driver.wire.exchange, self.transport.write
+        exchange = self.driver.wire.exchange
+        write = self.transport.write
         first: list[float] = []
 
         def written(data: bytes, deadline: float) -> None:

@@ -122,7 +122,8 @@ def taken(
 @pytest.mark.parametrize("name", WITHOUT)
 def test_effect_that_the_rig_lacks_changes_nothing(name: str):
     """The effect's bound is 0 and the numbers are those without it; on a rig that has the effect they differ."""
-    effect, lacking = BY_NAME[name], rig_without(name)
+    effect = BY_NAME[name]
+    lacking = rig_without(name)
     assert effect.bound(probe(), lacking).value == 0
     for variant in effect.variants:
         for on, off in zip(taken({effect: variant}, lacking), taken({}, lacking), strict=True):

@@ -51,11 +51,13 @@ def test_bare_aluminium_matches_fresnel_by_hand():
 def test_factor_follows_the_angle_of_incidence():
     """The cosine of the angle of incidence is -n_z, at any place of the field."""
     block = SweepBlock(RIG, sweep_at(-2300, 1700, 50), range(50), NM, (640, 640))
-    incidence, at_rest = np.arccos(-block.normals[:, 2]), reflectance("aluminium", NM, np.radians([45.0]))
+    incidence = np.arccos(-block.normals[:, 2])
+    at_rest = reflectance("aluminium", NM, np.radians([45.0]))
     np.testing.assert_allclose(factors(block.sweep), reflectance("aluminium", NM, incidence) / at_rest, rtol=1e-6)
 
 
-VIGNETTING_RIG, VIGNETTING_NM = Rig(), np.array([700.0])
+VIGNETTING_RIG = Rig()
+VIGNETTING_NM = np.array([700.0])
 VIGNETTING_FLAT = np.full((2, 8, 1), 10_000, np.float32)
 
 
@@ -119,5 +121,4 @@ def test_glass_matches_fresnel_by_hand() -> None:
 )
 def test_metals_match_published_reflectances_at_normal_incidence(coating: str, nm: float, fraction: float) -> None:
     """Evaporated films (Hass in the American Institute of Physics Handbook, table 6g) agree within 2 points."""
-    found = reflectance(coating, np.array([nm]), np.zeros(1))
-    assert found[0, 0] == pytest.approx(fraction, abs=0.02)
+    assert reflectance(coating, np.array([nm]), np.zeros(1))[0, 0] == pytest.approx(fraction, abs=0.02)

@@ -52,8 +52,8 @@ def poisson_fit(counts: Radiance, level: float) -> float:
 
 def test_deviates_are_normal() -> None:
     """A million deviates pass a chi-square test in 1000 classes; their first four moments are within 4 sigma."""
-    drawn, edges = deviates(1_000_000), stats.norm.ppf(np.arange(1, 1000) / 1000)
-    assert fit(drawn, edges, np.full(1000, 1e-3)) > 1e-3
+    drawn = deviates(1_000_000)
+    assert fit(drawn, stats.norm.ppf(np.arange(1, 1000) / 1000), np.full(1000, 1e-3)) > 1e-3
     z = drawn.astype(np.float64)
     for moment, truth, sd in ((1, 0, 1), (2, 1, 2**0.5), (3, 0, 15**0.5), (4, 3, 96**0.5)):
         assert abs((z**moment).mean() - truth) < 4 * sd / 1000
@@ -143,7 +143,8 @@ def test_compiled_loops_match_their_formulae() -> None:
         wanted += [radius * np.cos(turn), radius * np.sin(turn)]
     np.testing.assert_allclose(drawn, np.concatenate(wanted), atol=2e-5)
     light = np.random.default_rng(2).uniform(-100, 60_000, count).astype(np.float32)
-    mean, z = np.maximum(light, 0).astype(np.float64), drawn.astype(np.float64)
+    mean = np.maximum(light, 0).astype(np.float64)
+    z = drawn.astype(np.float64)
     skew = mean / (mean + 400) / 6
     numbers = np.rint(np.clip(mean + np.sqrt(mean + 400) * z + skew * (z * z - 1) + DARK_DN, 0, 65_535))
     apart = np.abs(read(light, drawn) - numbers)
@@ -154,7 +155,8 @@ def test_compiled_loops_match_their_formulae() -> None:
 @pytest.mark.parametrize("value", [np.inf, np.nan, -np.inf])
 def test_loop_reports_non_finite_light(value: float) -> None:
     """NaN and infinity are found in the last place; minus infinity is dark."""
-    light, raw = even(100.0, 1030), np.empty(1030, np.uint16)
+    light = even(100.0, 1030)
+    raw = np.empty(1030, np.uint16)
     light[-1] = value
     told = read_merged(light, np.zeros(1, np.float32), deviates(1030), 20.0, 1.0, DARK_DN, 65_535, raw)
     assert told == (value == -np.inf)
@@ -163,7 +165,8 @@ def test_loop_reports_non_finite_light(value: float) -> None:
 def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability that the cheap draw lies below each edge, by solving its square for the deviate."""
     variance = level + read**2
-    bend, slope = level / (6 * variance), np.sqrt(variance)
+    bend = level / (6 * variance)
+    slope = np.sqrt(variance)
     if bend == 0:
         return np.asarray(stats.norm.cdf((edges - level) / slope))
     root = np.sqrt(np.maximum(slope**2 + 4 * bend * (edges - level + bend), 0))

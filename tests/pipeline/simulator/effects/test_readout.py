@@ -90,8 +90,7 @@ def test_full_wells_have_read_noise_but_no_shot_noise() -> None:
 
 def test_dark_current_follows_the_temperature_and_has_shot_noise() -> None:
     """200 e-/s at 25 deg C become 1360 e- in 1 s at 50 deg C, with a variance of 1360."""
-    detector = Detector(temperature_deg_c=50.0)
-    rig = Rig(camera=replace(COUNTING, exposure_ms=1000.0), detector=detector)
+    rig = Rig(camera=replace(COUNTING, exposure_ms=1000.0), detector=Detector(temperature_deg_c=50.0))
     counts = read_out(even(0), block_of(rig), {DARK_CURRENT: "exact", SHOT: "exact"}).astype(np.float64)
     assert counts.mean() == pytest.approx(1360, rel=1e-3)
     assert counts.var() == pytest.approx(1360, rel=0.01)
@@ -118,7 +117,8 @@ def test_mean_dark_frame_matches_that_of_many_lines(dark_dn: float, exposure_ms:
     mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
     expected = dark_frame(block, ALL_EXACT)
     assert (expected.max() == 4095) == (exposure_ms == 500)
-    fine, sd = expected < 4000, np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
+    fine = expected < 4000
+    sd = np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
     assert np.abs((mean - expected) / sd)[fine].max() < 5.5
     assert abs((mean - expected)[fine].mean()) < 0.05
 
@@ -134,7 +134,8 @@ def test_noiseless_sensor_has_no_noise() -> None:
 
 def test_other_effects_do_not_change_the_draws() -> None:
     """With read noise or dark current off, the shot noise of every element is still that of the same photons."""
-    rig, light = Rig(), even(10_000, 4)
+    rig = Rig()
+    light = even(10_000, 4)
     noise = {
         name: read_out(light, block_of(rig, range(4)), chosen).astype(np.float64).ravel()
         for name, chosen in {

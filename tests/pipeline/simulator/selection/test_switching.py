@@ -121,7 +121,9 @@ def test_effects_switch_as_in_the_design_table(case: Case, on: str, off: str):
 @pytest.mark.parametrize("case", [pytest.param(row.values[0], id=row.id) for row in TABLE])
 def test_light_of_the_decision_keeps_its_bound(case: Case):
     """Some lines of both sweeps, with everything on and with the choice, differ by at most the decision's error."""
-    scene, rig, decision = scene_of(case), case.rig, decided(case)
+    scene = scene_of(case)
+    rig = case.rig
+    decision = decided(case)
     white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     ends = (0.0, 0.0 if case.seconds is None else case.seconds - rig.camera.scan_seconds(SWEEPS[1].lines))
     misplaced_e = misplaced_fraction(decision.exact, decision.chosen) * (
