@@ -33,10 +33,10 @@ NONE = torch.zeros(1, 0, dtype=torch.int64)
 PLACE = torch.zeros(1, 2)
 
 
-def _encoder(layers: int = 2) -> Encoder:
+def _encoder() -> Encoder:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        return Encoder(16, layers, 2, 2)
+        return Encoder(16, 2, 2, 2)
 
 
 def _image(height: int, width: int, batch: int = 1, seed: int = 0) -> Tensor:
@@ -58,8 +58,7 @@ def test_1_scene_without_live_tokens_is_finite():
     image = _image(64, 96)
     nothing = model.read_overview(image, None, torch.zeros(6, dtype=torch.bool))
     assert nothing.logits.isfinite().all()
-    patches = cut(image, 8)[:, [0, 95]]
-    assert model.read_patches(nothing, patches, torch.tensor([[0, 95]])).isfinite().all()
+    assert model.read_patches(nothing, cut(image, 8)[:, [0, 95]], torch.tensor([[0, 95]])).isfinite().all()
 
 
 @torch.inference_mode()
@@ -225,8 +224,7 @@ def test_15_constant_band_normalises_to_zero(value: float):
     sample[:, 1] = value
     normal = Normalisation.measured(sample).apply(sample, np.ones(4, bool))
     assert normal[:, 1] == pytest.approx(0, abs=1e-5)  # whitening mixes in no other column
-    alone = Normalisation.measured(sample[:, [1, 1]])
-    assert not alone.apply(sample[:, [1, 1]], np.ones(2, bool)).any()
+    assert not Normalisation.measured(sample[:, [1, 1]]).apply(sample[:, [1, 1]], np.ones(2, bool)).any()
     order = [1, 3, 0, 2]
     permuted = Normalisation.measured(sample[:, order]).apply(sample[:, order], np.ones(4, bool))
     assert permuted == pytest.approx(normal[:, order], abs=1e-4)
@@ -296,8 +294,7 @@ def test_23_map_does_not_depend_on_the_batch():
         alone = model.composite(*model(image[one], detail[one], numbers[one], places[one]), numbers[one])
         assert (alone - together[one]).abs().max() <= 4e-6
     turned = numbers.flip(1)
-    reordered = model.composite(*model(image, detail, turned, places), turned)
-    assert (reordered - together).abs().max() <= 4e-6
+    assert (model.composite(*model(image, detail, turned, places), turned) - together).abs().max() <= 4e-6
 
 
 @torch.inference_mode()
@@ -375,13 +372,12 @@ def test_30_saved_weights_read_any_number_of_bands(tmp_path: Path):
 def test_31_one_and_two_threads_select_the_same_patches(threads: None):
     """All four policies give the same plan on 1 and 2 threads; torch's global random state stays unchanged."""
     weights = plain_weights()
-    grid = SceneGrid(96, 96, 8)
     columns = noise(0, 96, 96, 4).numpy()
     before = torch.random.get_rng_state()
     plans = []
     for count in (1, 2):
         torch.set_num_threads(count)
-        seen = coarse_prediction_of_columns(weights, columns, grid)
+        seen = coarse_prediction_of_columns(weights, columns, SceneGrid(96, 96, 8))
         policies = ("gain", "entropy", "sobel", "random")
         plans.append([frame_patches(score_patches(policy, seen), 0.3) for policy in policies])
     assert all((one == two).all() for one, two in zip(*plans, strict=True))

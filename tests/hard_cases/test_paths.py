@@ -14,10 +14,10 @@ from tests.pipeline.rectify.aiming import CAMERA, aim
 SWATH = 2600.0
 
 
-def points_between(first: float, last: float, count: int = 400) -> np.ndarray:
-    """Return points (n, 2) that lines between two scan positions see, in the middle half of the line."""
+def points_between(first: float, last: float) -> np.ndarray:
+    """Return points (400, 2) that lines between two scan positions see, in the middle half of the line."""
     rng = np.random.default_rng(7)
-    x, y = points_of_scan(SWATH, CAMERA, rng.uniform(first, last, count), rng.uniform(-0.016, 0.016, count))
+    x, y = points_of_scan(SWATH, CAMERA, rng.uniform(first, last, 400), rng.uniform(-0.016, 0.016, 400))
     return np.stack([y, x], axis=-1)
 
 

@@ -66,9 +66,8 @@ def test_a_recorded_coarse_sweep_is_preferred_to_the_full_scan() -> None:
     source = simulated()
     coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
     recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
-    part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4)
     expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]
-    assert_same(list(recorded.lines(part)), expected)
+    assert_same(list(recorded.lines(Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4))), expected)
 
 
 def test_a_backward_recording_returns_lines_in_order_of_time() -> None:
@@ -113,19 +112,11 @@ def test_an_invalid_line_is_used_only_without_a_valid_neighbour() -> None:
 
 def test_a_recorded_line_that_serves_two_planned_lines_is_valid_once() -> None:
     """Recorded lines 1.25 px apart serve a plan of 1 px. If two planned lines share one, only one of them is valid."""
-    wide = _lines_apart(1.25)
-    found = list(recorded_source(simulated(), [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
-    places = [line.mirror_x for line in found]
-    assert len(set(places)) == sum(line.valid for line in found) < 10
-
-
-def _lines_apart(distance_px: float) -> RecordedSweep:
-    """Return a recording of 40 centred lines that are ``distance_px`` apart; their data are zeros."""
-    scan = distance_px * (np.arange(40) - 19.5)
+    scan = 1.25 * (np.arange(40) - 19.5)
     position = np.concatenate([line_positions(Sweep("one", "fine", "x", 0.0, at, 1), CAMERA) for at in scan.tolist()])
     frame = np.zeros((64, 3), np.float32)
-    return RecordedSweep(
-        Sweep("uneven", "fine", "x", 0.0, -19.5, 40),
+    wide = RecordedSweep(
+        Sweep("wide", "fine", "x", 0.0, -19.5, 40),
         References(frame, frame + 1, np.ones(3, np.float32)),
         position,
         np.arange(40.0),
@@ -133,6 +124,8 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
         np.ones(40, bool),
         lambda numbers: np.zeros((len(numbers), 64, 3), np.uint16),
     )
+    found = list(recorded_source(simulated(), [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
+    assert len({line.mirror_x for line in found}) == sum(line.valid for line in found) < 10
 
 
 @pytest.mark.parametrize(

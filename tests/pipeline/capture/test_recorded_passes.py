@@ -68,9 +68,8 @@ def test_recorded_lines_that_serve_several_sweeps_count_once() -> None:
 
 def test_a_missing_line_is_named() -> None:
     """Lines finer than the recorded ones and lines in a gap are refused with their number."""
-    sparse = Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than recorded"):
-        passes_over(sparse).first_pass([FULL])
+        passes_over(Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)).first_pass([FULL])
     gap = replace(FULL, lines=20), replace(FULL, name="rest", start_px=10.5, lines=30)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep fine was never captured"):
         passes_over(*gap).fine_pass([replace(FULL, name="fine", start_px=-25.5, lines=50)])

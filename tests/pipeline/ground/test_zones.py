@@ -114,9 +114,8 @@ def test_ground_behind_the_rig_has_no_pixels() -> None:
 @pytest.mark.parametrize("turn", [0.0, 30.0])
 def test_a_georeferenced_image_maps_polygons_by_its_transform(turn: float) -> None:
     """Rows and columns follow the GeoBox, also if it is turned. Pixel areas are the product of its sides."""
-    place = PlacedPicture(
-        GeoBox(SHAPE, Affine.translation(4e5, 5.7e6) @ Affine.rotation(turn) @ Affine.scale(0.5, -0.5), 32632)
-    )
+    affine = Affine.translation(4e5, 5.7e6) @ Affine.rotation(turn) @ Affine.scale(0.5, -0.5)
+    place = PlacedPicture(GeoBox(SHAPE, affine, 32632))
     field = shapely.Polygon([place.geobox.affine @ at for at in ((10, 20), (30, 20), (30, 50), (10, 50))])
     found = pixels_inside([on_field(field, place.crs, place)], SHAPE)
     assert found[20:50, 10:30].all()
@@ -164,11 +163,9 @@ def test_plot_confidence_is_the_mean_of_known_pixels() -> None:
     """Pixels of 0.5, 0.7 and 0.9 and an unknown one have the mean of the three. Without a known pixel it is None."""
     classes = np.array([[0, 0], [0, 1]], np.uint8)
     confidence = np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
-    plots = {"all": shapely.box(0, 0, 2, 2), "unknown": shapely.box(1, 1, 2, 2)}
-    whole, unknown = (
-        figures_of_plot(name, shape, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
-        for name, shape in plots.items()
-    )
+    values = (NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
+    whole = figures_of_plot("all", shapely.box(0, 0, 2, 2), *values)
+    unknown = figures_of_plot("unknown", shapely.box(1, 1, 2, 2), *values)
     assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
     assert (whole.fractions["unknown"], unknown.fractions["unknown"], unknown.confidence) == (0.25, 1.0, None)
 

@@ -48,16 +48,10 @@ def _patchy(rng: np.random.Generator) -> np.ndarray:
     return np.asarray(expected_gain.ravel())
 
 
-def partial_scan(
-    expected_gain: np.ndarray,
-    seconds: float,
-    rows: PatchRows = ROWS,
-    camera: LineCamera = CAMERA,
-    cost: CostModel = COST,
-) -> PartialScan | None:
+def partial_scan(expected_gain: np.ndarray, seconds: float) -> PartialScan | None:
     """Return the runs of a partial scan in a number of seconds, at most one for each sweep."""
-    times = RunTimes.of_scan(rows.sweeps, camera, cost, EXPOSURE_MS)
-    return choose_runs(rows, expected_gain, times, seconds=seconds)
+    times = RunTimes.of_scan(ROWS.sweeps, CAMERA, COST, EXPOSURE_MS)
+    return choose_runs(ROWS, expected_gain, times, seconds=seconds)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
@@ -107,7 +101,8 @@ def test_runs_of_two_swaths_reach_98_percent_of_the_best_gain(seed: int, fractio
     rows = PatchRows.of(uniform_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
     assert len(rows.sweeps) == 2
     given_s = fraction * cost.seconds(list(rows.sweeps), WIDER)
-    scan_pass = partial_scan(expected_gain, given_s, rows, WIDER, cost)
+    times = RunTimes.of_scan(rows.sweeps, WIDER, cost, EXPOSURE_MS)
+    scan_pass = choose_runs(rows, expected_gain, times, seconds=given_s)
     assert scan_pass is not None
     setup_s = cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
     line_s = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3

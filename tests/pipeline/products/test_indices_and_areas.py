@@ -62,13 +62,8 @@ def test_indices_that_a_camera_cannot_give_are_refused(name: str, words: str) ->
 
 def test_an_index_of_ratios_needs_no_reflectance() -> None:
     """The formula decides whether an index needs reflectance. The white level of a cube shows whether it has it."""
-    assert [find_index(name).wants_reflectance for name in ("NDVI", "PRI", "SAVI", "EVI", "MCARI")] == [
-        False,
-        False,
-        True,
-        True,
-        True,
-    ]
+    assert not any(find_index(name).wants_reflectance for name in ("NDVI", "PRI"))
+    assert all(find_index(name).wants_reflectance for name in ("SAVI", "EVI", "MCARI"))
     assert white_level(np.linspace(0, 1.2, 500)) == 1.0
     assert white_level(np.linspace(0, 255, 500)) > 250
     assert white_level(np.full(4, np.nan)) == 1.0

@@ -62,8 +62,7 @@ def test_a_pass_is_registered_to_a_fifth_of_a_pixel(along: Axis):
     assert (found.untied, found.narrow) == ((), ())
     held = pointing.offset(found.reference or "")
     for sweep in sweeps:
-        left = found.of(sweep.name).offset - (pointing.offset(sweep.name) - held)
-        assert np.abs(left).max() < 0.2
+        assert np.abs(found.of(sweep.name).offset - (pointing.offset(sweep.name) - held)).max() < 0.2
     assert np.nanmax(np.abs([window.residual_px for window in found.windows])) < 0.2
 
 
@@ -138,9 +137,8 @@ def test_saturated_samples_are_left_out(factor: int):
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
     bright = replace(scene, light=Once.of(SceneRadiance(scene.electrons * 2.4, scene.white_reference_electrons)))
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
-    broad = BroadSweep.read(
-        SimulatedSweep(SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation")), sweep), CAMERA
-    )
+    source = SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation"))
+    broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
     middle = broad.image.shape[0] // 2, broad.image.shape[1] // 2
     assert np.isnan(broad.image[middle])
     assert np.isfinite(broad.image[0]).all()
@@ -160,11 +158,9 @@ def test_turn_is_the_derivative_of_places_by_the_swath():
     """Far off the axis it predicts the view of a sample whose swath lies 1 px further along."""
     broad = BroadSweep.read(SimulatedSweep(source_of(), Sweep("s", "fine", "x", 1500.0, -900.0, 3)), CAMERA)
     image = PlacedImage(broad, CAMERA, np.zeros((3, 2)))
-    slope = CAMERA.pixel_slopes()[140]
-    (here,), (there,) = (
-        np.stack(points_of_scan(1500.0 + step, CAMERA, np.array([-899.0]), np.array([slope])), axis=-1)
-        for step in (-0.5, 0.5)
-    )
+    slope = CAMERA.pixel_slopes()[140:141]
+    (here,) = np.stack(points_of_scan(1499.5, CAMERA, np.array([-899.0]), slope), axis=-1)
+    (there,) = np.stack(points_of_scan(1500.5, CAMERA, np.array([-899.0]), slope), axis=-1)
     line, turn = image.line_and_turn(*(here + there) / 2)
     assert line == 1
     np.testing.assert_allclose(turn[:, 0], there - here, atol=1e-5)

@@ -150,10 +150,8 @@ def test_the_turn_of_the_line_is_part_of_the_model():
     """A window at a line's end gives the offset of the line's centre, not of the end."""
     turn = np.array([[1.0, 0.0], [0.034, 1.0]])
     shift = np.array([50.0, -20.0])
-    windows = [
-        WindowShift(0, 1, (line, line), np.stack([np.eye(2), turn]), turn @ shift, np.full(2, 0.05))
-        for line in (100.0, 900.0)
-    ]
+    turns = np.stack([np.eye(2), turn])
+    windows = [WindowShift(0, 1, (line, line), turns, turn @ shift, np.full(2, 0.05)) for line in (100.0, 900.0)]
     found = solve_sweeps(windows, ("a", "b"), (1000, 1000), reference=0)
     np.testing.assert_allclose(found.shifts[1].offset, shift, atol=1e-3)
 

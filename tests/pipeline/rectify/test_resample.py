@@ -111,8 +111,7 @@ def test_values_of_invalid_elements_do_not_matter(kernel: Kernel, kind: type[np.
     valid = rng.random((9, 9, 3)) > 0.1
     kept = values.copy()
     at = rng.uniform(-0.4, 8.4, (100, 2))
-    for one, other in zip(
-        resample(values, valid, at, kernel), resample(values * valid, valid, at, kernel), strict=True
-    ):
+    results = (resample(given, valid, at, kernel) for given in (values, values * valid))
+    for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(values, kept)

@@ -380,9 +380,6 @@ class Echo(Fault):
         return [Chunk(TURNAROUND_S, data)]
 
 
-_SETTING = frozenset({Command.SET_VALUES})
-_VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
-_UPLOAD = frozenset({Command.SET_VECTOR})
 _BYTES = 1024  # bytes to the controller within which it strikes
 HARMLESS = ("split-replies", "stale-bytes", "pro-at-connect")  # the driver copes with these
 
@@ -413,14 +410,14 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "mute": _reply(lost, lasting=True),
     "slow-bytes": _reply(slow, lasting=True),
     "answers-no": (AnswersNo, 6),
-    "error-range": _code(ErrorCode.OUT_OF_RANGE, _SETTING, 4),
-    "error-vector-index": _code(ErrorCode.VECTOR_INDEX, _VECTORS),
+    "error-range": _code(ErrorCode.OUT_OF_RANGE, frozenset({Command.SET_VALUES}), 4),
+    "error-vector-index": _code(ErrorCode.VECTOR_INDEX, frozenset({Command.SET_VECTOR, Command.GET_VECTOR})),
     "error-unknown": _code(0xBEEF),
     "wrong-firmware": (OtherFirmware, 64),
     "cell-lost": (CellLost, 16),
     "pro-at-connect": (ProAtConnect, 64),
     "silent-reset": (partial(SilentReset, boot_s=0.0), 64),
-    "reset-in-upload": (partial(SilentReset, boot_s=1.0, commands=_UPLOAD), 16),
+    "reset-in-upload": (partial(SilentReset, boot_s=1.0, commands=frozenset({Command.SET_VECTOR})), 16),
     "never-stable": _bit(Status.NOT_STABLE),
     "trimmed": _bit(Status.TRIMMED),
     "mirror-warm": _bit(Status.MIRROR_WARM),

@@ -51,14 +51,12 @@ def with_noise(clean: Floats, noise: Floats, seed: int) -> Values:
     return (clean + noise * np.random.default_rng([seed, 1]).normal(size=clean.shape)).astype(np.float32)
 
 
-def statistics_of(
-    values: Values, valid: Bools | None = None, *, lines: int = 64, expected: int | None = None
-) -> SignalStatistics:
-    """Return statistics of a field that is added some lines at a time."""
+def statistics_of(values: Values, valid: Bools | None = None, *, expected: int | None = None) -> SignalStatistics:
+    """Return statistics of a field that is added 64 lines at a time."""
     known = np.ones(values.shape[:2], np.bool_) if valid is None else valid
     found = SignalStatistics(values.shape[2], expected or values.shape[0] * values.shape[1])
-    for first in range(0, len(values), lines):
-        found.add(values[first : first + lines], known[first : first + lines])
+    for first in range(0, len(values), 64):
+        found.add(values[first : first + 64], known[first : first + 64])
     return found
 
 

@@ -124,10 +124,9 @@ def test_a_weak_component_shared_by_neighbours_is_found() -> None:
 @pytest.mark.parametrize("bands", [12, 32])
 def test_noise_alone_gives_components_at_most_at_the_stated_rate(bands: int) -> None:
     """The count in 60 fields of noise is at most the 99.9 % quantile for a false-alarm rate of 10 %."""
-    noise = np.linspace(1, 3, bands)
     alarms = 0
     for seed in range(TRIALS):
-        values = with_noise(np.full((48, 48, bands), 100.0), noise, seed)
+        values = with_noise(np.full((48, 48, bands), 100.0), np.linspace(1, 3, bands), seed)
         alarms += len(find_components(statistics_of(values), least=0, false_alarm=FALSE_ALARM)) > 0
     assert alarms <= binom.ppf(0.999, TRIALS, FALSE_ALARM)
 

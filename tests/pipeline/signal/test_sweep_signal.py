@@ -72,19 +72,19 @@ def statistics_of_lines(lines: MadeLines) -> SignalStatistics:
     return found
 
 
-def condense(lines: MadeLines, step: float = 1.0, alarms: float = 0.01) -> tuple[Stored, CondensedSweep]:
+def condense(lines: MadeLines, step: float = 1.0) -> tuple[Stored, CondensedSweep]:
     """Store all lines of a sweep."""
     found = statistics_of_lines(lines)
     components = find_components(found)
-    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, alarms, step)
+    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 0.01, step)
     shape = lines.raw.shape[:2]
     stored = Stored(components, step, np.zeros((*shape, len(components)), np.int32), np.zeros(shape, np.uint8))
     return stored, condenser.sweep(lines, stored.write)
 
 
-def made_lines(seed: int = 3, **how: float) -> MadeLines:
+def made_lines(**how: float) -> MadeLines:
     """Return lines of 3 materials; the third block is not full."""
-    return MadeLines.of(raw_of(field_of(seed, SHAPE, BANDS, **how).values))
+    return MadeLines.of(raw_of(field_of(3, SHAPE, BANDS, **how).values))
 
 
 def values_of(lines: MadeLines) -> NDArray[np.float32]:

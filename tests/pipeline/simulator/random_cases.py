@@ -177,16 +177,11 @@ def _optics(rng: np.random.Generator, distance_m: float | None) -> Optics:
     )
 
 
-def _coating(rng: np.random.Generator) -> Coating:
-    """Return a metal, or ``ideal`` in half of the cases."""
+def _mirror(rng: np.random.Generator) -> MirrorMotion:
     metals: tuple[Coating, ...] = ("aluminium", "gold", "silver")
     metal = metals[int(rng.uniform(0, 3))]
-    return metal if rng.random() < 0.5 else "ideal"
-
-
-def _mirror(rng: np.random.Generator) -> MirrorMotion:
     return MirrorMotion(
-        coating=_coating(rng),
+        coating=metal if rng.random() < 0.5 else "ideal",
         natural_hz=float(rng.uniform(5, 100)),
         damping=float(rng.choice([0.3, 0.7, 1.0, 2.0])),
         settled_s=float(rng.uniform(0.05, 0.5)),

@@ -37,9 +37,8 @@ def sparse_case(number: int) -> Case:
         lines = int(rng.integers(1, 6)) if kind != "bright line" else 120
         start = float(rng.uniform(-20, 20)) if kind != "bright line" else -60.0
         sweeps = (Sweep("lone", "fine", "x", float(rng.uniform(-10, 10)), start, lines),)
-        values = {"beside fields": _beside, "beside points": _beside, "bright line": _line, "pixel": _pixel}[kind](
-            rng, kind, sweeps[0]
-        )
+        made = {"beside fields": _beside, "beside points": _beside, "bright line": _line, "pixel": _pixel}[kind]
+        values = made(rng, kind, sweeps[0])
     return Case(_scene(rng, values, rig), rig, sweeps, None, number)
 
 

@@ -117,8 +117,7 @@ def test_thinned_scenes_keep_their_light(level: int) -> None:
 def test_edge_of_the_scene_is_repeated_outside(pattern: str) -> None:
     """A scene has the same light as one padded with 320 px of its edge, also through the far tails."""
     y, x = np.mgrid[:41, :52]
-    noise = np.random.default_rng(3).random((41, 52))
-    plane = {"rows": y % 2, "columns": x // 3 % 2, "noise": noise}[pattern]
+    plane = {"rows": y % 2, "columns": x // 3 % 2, "noise": np.random.default_rng(3).random((41, 52))}[pattern]
     values = np.repeat(plane[..., None] + 0.0, len(NM), axis=2)
     wide = np.pad(values, ((320, 320), (320, 320), (0, 0)), mode="edge")
     sweep = Sweep("s", "fine", "x", 0.0, -24.0, 49)
@@ -147,12 +146,11 @@ FINE = Sweep("fine", "fine", "x", swath_px=900.0, start_px=-700.0, lines=20)
 PLAIN = {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"}
 
 
-def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
-    """Return a raster of 3 components, different at every pixel, mixed to ``bands``."""
-    rng = np.random.default_rng(seed)
+def grainy() -> RasterScene:
+    """Return a raster of 3 components, different at every pixel, mixed to 5 bands."""
+    rng = np.random.default_rng(0)
     planes = rng.uniform(0, 1, (90, 110, 3)).astype(np.float32)
-    electrons = rng.uniform(1e3, 9e3, (3, bands)).astype(np.float32)
-    return made_scene(planes, electrons, np.linspace(400, 1000, bands))
+    return made_scene(planes, rng.uniform(1e3, 9e3, (3, 5)).astype(np.float32), np.linspace(400, 1000, 5))
 
 
 def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> SweepBlock:

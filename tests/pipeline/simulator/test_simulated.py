@@ -35,9 +35,9 @@ def source_of(values: np.ndarray, camera: LineCamera = CAMERA, **options: object
     return SimulatedSource(scene, Rig(camera), **options)
 
 
-def raw_of(source: Source, sweep: Sweep = SWEEP, first: int = 0) -> np.ndarray:
+def raw_of(source: Source, sweep: Sweep = SWEEP) -> np.ndarray:
     """Return all lines of a sweep, (line, sample, band)."""
-    return np.stack([line.data for line in source.lines(sweep, first)])
+    return np.stack([line.data for line in source.lines(sweep)])
 
 
 def test_lines_do_not_depend_on_the_first_line_read() -> None:
@@ -123,9 +123,8 @@ def sweeps_of(*sizes: int, step: int = 1) -> list[Sweep]:
 
 def test_start_times_of_sweeps_match_hand_calculation() -> None:
     """Set-ups take .45 s, one load of up to 1500 positions 1.6 s, and a line 100 ms."""
-    assert sweep_starts(sweeps_of(10, 20, 5), CAMERA, COST) == pytest.approx(
-        {"sweep 0": 2.05, "sweep 1": 3.5, "sweep 2": 5.95}
-    )
+    starts = sweep_starts(sweeps_of(10, 20, 5), CAMERA, COST)
+    assert starts == pytest.approx({"sweep 0": 2.05, "sweep 1": 3.5, "sweep 2": 5.95})
     starts = sweep_starts(sweeps_of(1000, 1000, 5), CAMERA, COST)  # the second begins in the first load
     assert starts == pytest.approx({"sweep 0": 2.05, "sweep 1": 102.5, "sweep 2": 204.55})
 
@@ -168,11 +167,11 @@ WHITE_REFERENCE_SWEEP = Sweep("s", "fine", "x", swath_px=900.0, start_px=-1500.0
 BANDS = 12
 
 
-def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
+def even_scene() -> RasterScene:
     """Return an even scene under light with a deep absorption, 40 % of the white reference; values are reflectances."""
     nm = np.linspace(740, 784, BANDS)
     white_reference_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
-    return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))
+    return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, 2.0))
 
 
 def white_reference_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
@@ -238,10 +237,8 @@ def test_band_response_smooths_the_white_reference() -> None:
     scene = even_scene()
     detailed = 1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))
     scene = replace(scene, white_reference=detailed.astype(np.float32))
-    plain, wide = (
-        SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(WHITE_REFERENCE_SWEEP).white_reference
-        for names in ((), ("response",))
-    )
+    sources = [SimulatedSource(scene, RIG, chosen=effects_on(*names)) for names in ((), ("response",))]
+    plain, wide = (source.references(WHITE_REFERENCE_SWEEP).white_reference for source in sources)
     np.testing.assert_array_equal(plain, scene.white_reference)
     assert wide.min() > plain.min() + 0.05
     np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)

@@ -130,8 +130,7 @@ def test_references_are_found_in_a_folder() -> None:
 
 def frames(level: float, count: int = 40, shape: tuple[int, int] = (40, 10)) -> np.ndarray:
     """Return noisy frames (frame, sample, band) around a level."""
-    rng = np.random.default_rng(3)
-    return np.clip(np.rint(rng.normal(level, 4, (count, *shape))), 0, 4095).astype(np.uint16)
+    return np.clip(np.rint(np.random.default_rng(3).normal(level, 4, (count, *shape))), 0, 4095).astype(np.uint16)
 
 
 def test_mean_frame_is_exact() -> None:

@@ -12,17 +12,15 @@ from tests.pipeline.rig.in_process import InProcessCameraLine, ManualClock
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "
-EXPOSURE = b'configure({"exposure": 4.5, "framePeriod": 5})'
 NO = b'{"success": false, "response": null, "errorMessage": "%s"}'
 YES = b'{"success": true, "response": %s, "errorMessage": ""}'
-TOO_LONG = b'configure({"exposure": 6, "framePeriod": 5})'
 
 
 @pytest.mark.parametrize(
     ("sent", "end", "reply"),
     [
-        (EXPOSURE, b"\r", YES % b'{"exposure": 4.5, "framePeriod": 5.0}'),
-        (TOO_LONG, b"\r", NO % b"exposure longer than frame period"),
+        (b'configure({"exposure": 4.5, "framePeriod": 5})', b"\r", YES % b'{"exposure": 4.5, "framePeriod": 5.0}'),
+        (b'configure({"exposure": 6, "framePeriod": 5})', b"\r", NO % b"exposure longer than frame period"),
         (CAPTURE, b"\r\n", YES % b'{"folder": "/captured/000000"}'),
         (b"isCapturing", b"\r", YES % b"false"),
         (b"stopCapture", b"\r", YES % b"false"),

@@ -170,9 +170,8 @@ def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: P
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
         often = 1 if seed % 2 == 0 else int(rng.integers(3, 7))
-        occasions = {CameraFault.FULL: 2, CameraFault.BUSY: 2, CameraFault.CUT_CUBE: 2}.get(
-            fault, TRANSFERS if fault in OF_FILES else COMMANDS
-        )
+        usual = TRANSFERS if fault in OF_FILES else COMMANDS
+        occasions = 2 if fault in (CameraFault.FULL, CameraFault.BUSY, CameraFault.CUT_CUBE) else usual
         faults = CameraFaults({fault: often}, seed, int(rng.integers(occasions)))
         session(scan_passes, undisturbed, faults)
         struck += faults.left[fault] < often

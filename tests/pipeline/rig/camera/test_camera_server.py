@@ -74,8 +74,7 @@ def test_capture_and_fetch_return_the_cameras_lines() -> None:
 def test_an_interrupted_transfer_resumes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several interruptions lose no byte and repeat none."""
     monkeypatch.setattr(camera_files, "OVERLAP", 16)
-    faults = {CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}
-    with camera(faults, tries=3) as (driver, device, lines):
+    with camera({CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}, tries=3) as (driver, device, lines):
         folder = driver.capture(100).folder
         wait_for(driver, 5.0)
         kept = KeptInMemory()

@@ -95,9 +95,7 @@ def test_captures_with_a_wrong_number_of_steps_are_refused(sweep: Sweep, last: i
     """With one edge too few or too many the wrong lines are unknown, also within the four cells of a coarse line."""
     path = capture_paths.next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
     count = last // sweep.step
-    taken = capture_paths.CaptureRecord(
-        sweep, 2, 2 + count, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last
-    )
+    taken = capture_paths.CaptureRecord(sweep, 2, 2 + count, "/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last)
     seen = frames(list(range(count)))
     assert capture_paths.locate_lines(seen, path, taken, CAMERA).row.tolist() == list(range(count))
     for index in (0, last - 3, last - 2, last - 1, last + 1):

@@ -143,10 +143,9 @@ def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
         once = log_in.call_count
         opened = rig.opened
         assert once > 0
+        dark = small_source().references(COARSE).dark
         for sharing in (source, source.saying(lambda words: None)):
-            np.testing.assert_allclose(
-                sharing.references(COARSE).dark, small_source().references(COARSE).dark, atol=0.1
-            )
+            np.testing.assert_allclose(sharing.references(COARSE).dark, dark, atol=0.1)
         assert (log_in.call_count, rig.opened) == (once, opened)
         elsewhere = KeptInMemory()
         CaptureJournal(elsewhere).record_references(CaptureJournal(kept).references[None])

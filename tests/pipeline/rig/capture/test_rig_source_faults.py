@@ -67,12 +67,11 @@ def test_an_interrupted_transfer_resumes_in_the_next_process():
     """The camera disconnects within a file: the received bytes are kept, and nothing is captured again."""
     with small_rig() as rig:
         faults = rig.emulated.camera.faults
-        kept = KeptUntil(
-            acts={
-                b"raw_0.hdr": lambda: setattr(faults, "left", {CameraFault.BREAKS_OFF: 1}),
-                b"raw_0": lambda: faults.left.update({CameraFault.REFUSES_FILES: 9}),
-            }
-        )
+        acts = {
+            b"raw_0.hdr": lambda: setattr(faults, "left", {CameraFault.BREAKS_OFF: 1}),
+            b"raw_0": lambda: faults.left.update({CameraFault.REFUSES_FILES: 9}),
+        }
+        kept = KeptUntil(acts=acts)
         with pytest.raises(DeviceGone, match=r"bytes of \S+/raw_0 are kept, and a later fetch continues there"):
             list(rig.source(kept).lines(FINE))
         half = next(len(data) for name, data in kept.files.items() if name.endswith("/raw_0"))

@@ -148,10 +148,9 @@ def test_all_sweeps_see_the_same_sway():
     """Sweeps of other names and either axis see the same crop at the same place and time; another seed does not."""
     point = np.array([[40.0]]), np.array([[-25.0]])
     line = replace(SWEEP, lines=1)
-    seen = WIND.displaced(SweepBlock(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640)), *point, "exact")
-    across = replace(line, name="other", along="y")
-    turned = WIND.displaced(
-        SweepBlock(Rig(air=BREEZE), across, range(1), np.ones(1), (201, 640)), *point[::-1], "exact"
-    )
+    block = SweepBlock(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640))
+    seen = WIND.displaced(block, *point, "exact")
+    across = replace(block, sweep=replace(line, name="other", along="y"))
+    turned = WIND.displaced(across, *point[::-1], "exact")
     np.testing.assert_allclose(turned[::-1], seen)
     assert not np.allclose(wind_shown(seed=3), wind_shown())

@@ -61,9 +61,8 @@ def test_scene_far_out_of_focus_is_refused():
 def test_defocus_disc_narrows_at_grazing_incidence():
     """At 70 deg of incidence the disc is 0.34 as wide along the scan as along the line."""
     normal = np.array([np.sin(np.deg2rad(70)), 0, -np.cos(np.deg2rad(70))])
-    assert DEFOCUS.moments(rig_at(30.0), NM, "disc", normal).disc == pytest.approx(
-        [4.73, 4.73 * np.cos(np.deg2rad(70))], abs=0.005
-    )
+    disc = DEFOCUS.moments(rig_at(30.0), NM, "disc", normal).disc
+    assert disc == pytest.approx([4.73, 4.73 * np.cos(np.deg2rad(70))], abs=0.005)
 
 
 @pytest.mark.parametrize(("distance", "focus"), [(None, 30.0), (30.0, 30.0), (math.inf, math.inf)])

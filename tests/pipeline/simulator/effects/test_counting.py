@@ -45,13 +45,11 @@ def test_bright_scene_needs_shot_noise_but_no_read_noise() -> None:
 
 def test_dim_scene_at_1_s_needs_dark_current() -> None:
     """The current of 200 e- exceeds the noise of 24 e-; a cooled sensor at 100 ms does not need it."""
-    slow = replace(RIG, camera=LineCamera(exposure_ms=1000.0))
-    bound = counting.DARK_CURRENT.bound(probe(200, 400), slow)
+    bound = counting.DARK_CURRENT.bound(probe(200, 400), replace(RIG, camera=LineCamera(exposure_ms=1000.0)))
     assert bound.value > 8
     assert bound.why == "200 e- in 1000 ms at 25 deg C, beside 24.5 e- of noise"
-    assert (
-        counting.DARK_CURRENT.bound(probe(200, 400), Rig(detector=Detector(temperature_deg_c=-30.0))).value < TOLERANCE
-    )
+    cold = Rig(detector=Detector(temperature_deg_c=-30.0))
+    assert counting.DARK_CURRENT.bound(probe(200, 400), cold).value < TOLERANCE
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
@@ -109,9 +107,8 @@ def test_bright_roof_saturates(unit: Unit) -> None:
     assert lost / (5.0 if unit == "dn" else np.sqrt(30_400)) < bound.value
     assert "above the limit of 2.02e+04 e-" in bound.why
     ideal = Rig(detector=Detector(noiseless=True))
-    assert counting.SATURATION.bound(
-        replace(probe(100, 30_000, unit), unit_least_dn=0.29), ideal
-    ).value == pytest.approx((lost - 20) / 5 / 0.29)
+    seen = replace(probe(100, 30_000, unit), unit_least_dn=0.29)
+    assert counting.SATURATION.bound(seen, ideal).value == pytest.approx((lost - 20) / 5 / 0.29)
     assert counting.SATURATION.bound(probe(100, 6000), Rig(detector=Detector(full_well_e=5000))).value > 0
     assert counting.SATURATION.bound(probe(100, 6000), RIG).value == 0
 

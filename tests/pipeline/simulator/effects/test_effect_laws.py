@@ -228,12 +228,10 @@ def test_manifest_lists_every_effect():
 
 def test_every_effect_of_every_module_is_registered_once():
     """The effects of a forgotten module would never be computed."""
-    modules = [
-        importlib.import_module(f"{package.__name__}.{one.name}") for one in pkgutil.iter_modules(package.__path__)
-    ]
+    names = [f"{package.__name__}.{one.name}" for one in pkgutil.iter_modules(package.__path__)]
     there = [
         one
-        for module in modules
+        for module in map(importlib.import_module, names)
         if module is not registry
         for name, one in vars(module).items()
         if not name.startswith("__") and type(one).__module__ == module.__name__

@@ -58,30 +58,25 @@ def test_factor_follows_the_angle_of_incidence():
 
 VIGNETTING_RIG = Rig()
 VIGNETTING_NM = np.array([700.0])
-VIGNETTING_FLAT = np.full((2, 8, 1), 10_000, np.float32)
-
-
-def vignetting_factors(sweep, variant="held"):
-    """Return the factor of every line, (line,)."""
-    return factors(sweep, VIGNETTING, variant, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
 
 
 @pytest.mark.parametrize(("variant", "at"), [("held", "positions"), ("middle", "middle")])
 def test_vignetting_equals_the_throughput_of_the_calibration(variant, at):
     """Lines are multiplied by the throughput that calibration divides by, at any place of the field."""
     sweep = sweep_at(-2300, 1700, 50, 4)
-    fractions = mirror_throughput(
-        getattr(SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640)), at)
-    ).reshape(50, -1)
-    np.testing.assert_allclose(vignetting_factors(sweep, variant), fractions.mean(axis=1), rtol=1e-7)
+    block = SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640))
+    fractions = mirror_throughput(getattr(block, at)).reshape(50, -1)
+    found = factors(sweep, VIGNETTING, variant, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
+    np.testing.assert_allclose(found, fractions.mean(axis=1), rtol=1e-7)
 
 
 def test_vignetting_changes_by_138_dn_over_640_lines():
     """The change is 3.4 %, 138 of 4095 DN (139 if rounded first); the bound counts the difference from rest."""
     sweep = sweep_at(0, -320, 640)
-    held = vignetting_factors(sweep)
+    held = factors(sweep, VIGNETTING, "held", VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
     assert 4095 * np.ptp(held) == pytest.approx(138.5, abs=0.5)
-    bound = VIGNETTING.bound(probe_of(VIGNETTING_FLAT, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)
+    flat = np.full((2, 8, 1), 10_000, np.float32)
+    bound = VIGNETTING.bound(probe_of(flat, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)
     assert bound.value == pytest.approx(2000 * np.abs(held - 1).max(), rel=1e-5)
     assert "0.983 to 1.017" in bound.why
 

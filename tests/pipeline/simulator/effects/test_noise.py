@@ -44,9 +44,7 @@ def fit(counts: Radiance, edges: NDArray[np.float64], chances: NDArray[np.float6
 
 def poisson_fit(counts: Radiance, level: float) -> float:
     """Return the p-value of counts against Poisson, in about 200 classes with tails of 1e-4."""
-    edges = np.unique(
-        stats.poisson.ppf(np.concatenate([[1e-4, 1e-3], np.linspace(0.005, 0.995, 199), [0.9999]]), level)
-    )
+    edges = np.unique(stats.poisson.ppf(np.r_[1e-4, 1e-3, np.linspace(0.005, 0.995, 199), 0.9999], level))
     return fit(counts, edges, np.diff(stats.poisson.cdf(edges, level), prepend=0, append=1))
 
 
@@ -201,6 +199,5 @@ def test_least_expected_keeps_a_patch_within_its_variation() -> None:
     for read in (0.0, 1.0, 5.0, 20.0):
         assert counting.chip_variation(read) <= counting.MOST_VARIATION
     light = np.array(counting.least_expected(0.0))
-    assert np.sqrt(counting.CHIP_SAMPLES * counting.divergence(light, 0.0)) / 2 == pytest.approx(
-        counting.MOST_VARIATION, rel=0.01
-    )
+    variation = np.sqrt(counting.CHIP_SAMPLES * counting.divergence(light, 0.0)) / 2
+    assert variation == pytest.approx(counting.MOST_VARIATION, rel=0.01)

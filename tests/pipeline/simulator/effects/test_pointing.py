@@ -161,9 +161,7 @@ def test_pointing_offset_moves_the_view_but_not_reported_positions():
 
 
 MIRROR_EFFECTS_CAMERA = LineCamera(samples=64, exposure_ms=4.0)
-MOTION = replace(
-    MirrorMotion(), positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=5.0, drift_px_per_min=500.0
-)
+MOTION = MirrorMotion(positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=5.0, drift_px_per_min=500.0)
 AIR = Air(distance_m=30.0, relief="step", nearest_m=3.0, wind_amplitude_m=0.005, wind_hz=20.0)
 MIRROR_EFFECTS_RIG = Rig(camera=MIRROR_EFFECTS_CAMERA, mirror=MOTION, air=AIR)
 SWATH = Sweep("swath", "fine", "x", 3.0, -25.0, 40)

@@ -197,10 +197,9 @@ def test_fixed_pattern_gains_have_the_stated_spread() -> None:
 
 def test_fixed_pattern_gains_belong_to_the_unit() -> None:
     """Another sensor has other gains; more bands keep the gains of the first ones."""
-    assert not np.array_equal(
-        spectrometer.PRNU.gains(RIG, 5), spectrometer.PRNU.gains(Rig(detector=Detector(unit=1)), 5)
-    )
-    np.testing.assert_array_equal(spectrometer.PRNU.gains(RIG, 9)[:, :5], spectrometer.PRNU.gains(RIG, 5))
+    gains = spectrometer.PRNU.gains
+    assert not np.array_equal(gains(RIG, 5), gains(Rig(detector=Detector(unit=1)), 5))
+    np.testing.assert_array_equal(gains(RIG, 9)[:, :5], gains(RIG, 5))
 
 
 def test_fixed_pattern_gains_never_fall_below_0() -> None:

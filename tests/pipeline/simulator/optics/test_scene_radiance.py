@@ -53,9 +53,8 @@ def views_of(count: int, far: float = 6.0) -> RayViews:
 
 def scan_pass(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> np.ndarray:
     """Return the light (n, band) of one exposure."""
-    return SceneSampler(footprint_of(scene), views_of(COUNT)).scan_pass(
-        scene, [views], along_y=along_y, exposure_ratio=1.0
-    )
+    sampler = SceneSampler(footprint_of(scene), views_of(COUNT))
+    return sampler.scan_pass(scene, [views], along_y=along_y, exposure_ratio=1.0)
 
 
 @pytest.mark.parametrize(("kind", "along_y"), [(kind, bool(number % 2)) for number, kind in enumerate(KINDS)])
@@ -143,9 +142,8 @@ def test_mixing_does_not_depend_on_the_row(nodes: int, bands: int) -> None:
     components = 6
     place = np.linspace(0, nodes - 1, bands)
     between = np.stack([np.interp(place, np.arange(nodes), one) for one in np.eye(nodes)])
-    fractions, spectra = (
-        rng.uniform(0, 1, shape).astype(np.float32) for shape in ((nodes, kernels), (components, bands))
-    )
+    fractions = rng.uniform(0, 1, (nodes, kernels)).astype(np.float32)
+    spectra = rng.uniform(0, 1, (components, bands)).astype(np.float32)
     one = rng.uniform(0, 1, (kernels, 1, components)).astype(np.float32)
     light = np.full((1031, bands), np.nan, np.float32)
     _Mixing.of(fractions, between, spectra).write(np.repeat(one, len(light), axis=1), light)

@@ -120,9 +120,8 @@ def test_scene_returns_the_values_it_was_made_of() -> None:
     electrons = np.full((3, 2), 100, np.float32)
     white_reference = np.full(2, 0.5, np.float32)
     white = np.full(2, 200, np.float32)
-    mixed = RasterScene(
-        "m", "k", SceneRaster.of(planes), Once.of(SceneRadiance(electrons, white)), white_reference, WAVELENGTH
-    )
+    light = Once.of(SceneRadiance(electrons, white))
+    mixed = RasterScene("m", "k", SceneRaster.of(planes), light, white_reference, WAVELENGTH)
     np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
 
 
@@ -155,8 +154,7 @@ def test_key_follows_the_content() -> None:
 
 def test_bright_end_of_a_large_scene_is_sampled() -> None:
     """Above 2^24 values the percentile is read from a part of the pixels, and stays right to 0.1 %."""
-    row = np.linspace(0, 1, 6_000, dtype=np.float32)
-    values = np.broadcast_to(row[:, None, None], (6_000, 3_000, 2))
+    values = np.broadcast_to(np.linspace(0, 1, 6_000, dtype=np.float32)[:, None, None], (6_000, 3_000, 2))
     scene = raster_from_values(values, CAMERA, name="large", wavelength_nm=WAVELENGTH, key="k")
     np.testing.assert_allclose(scene.white_reference * 0.6, 0.999, rtol=1e-3)
 
@@ -178,9 +176,8 @@ def test_raster_is_drawn_on_first_use() -> None:
     """Size and labels are stated before; the drawn planes and labels must match them."""
     draw = Mock(return_value=(np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)))
     light = Once.of(SceneRadiance(np.ones(2, np.float32), np.ones(2, np.float32)))
-    scene = RasterScene(
-        "s", "k", SceneRaster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
-    )
+    raster = SceneRaster((4, 5, 2), labelled=True, draw=draw)
+    scene = RasterScene("s", "k", raster, light, np.ones(2, np.float32), WAVELENGTH)
     assert (scene.shape, scene.labelled, draw.call_count) == ((4, 5), True, 0)
     assert scene.labels.shape == scene.planes.shape[:2]
     assert replace(scene, key="other").planes is scene.planes
