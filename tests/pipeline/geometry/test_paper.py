@@ -297,7 +297,7 @@ def test_e18_patch_counts_and_patch_numbers_follow_the_formula():
     ],
 )
 def test_line_models_err_as_in_the_table(field_deg: float, px: tuple[float, ...]):
-    """Over a disk to ``field_deg`` along X the exact rotation with the local scale (L3) errs; exact rays (L4) do not."""
+    """Over a disk to ``field_deg`` along X the exact rotation with the local scale (L3) errs; exact rays do not."""
     turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     radius = np.tan(np.deg2rad(field_deg)) / mirror.REST_TANGENT * np.array([1.0, 0.8, 0.4])
     position = radius[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)

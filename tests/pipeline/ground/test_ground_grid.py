@@ -69,7 +69,7 @@ def test_places_interpolated_between_tie_points_are_exact(pose: dict[str, float]
     x, y = (np.arange(part.start, part.stop) + 0.5 for part in (columns, rows))
     affine = grid.geobox.affine
     exact = grid.frame.map_to_ground(np.stack(np.meshgrid(affine.c + affine.a * x, affine.f + affine.e * y), axis=-1))
-    assert (np.abs(grid.ground_m(rows, columns) - exact).max() / step) < bound
+    assert np.abs(grid.ground_m(rows, columns) - exact).max() / step < bound
 
 
 def test_resolution_is_the_rounded_median_footprint():

@@ -179,7 +179,7 @@ def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chu
             size = random.randint(1, 3)
             pieces.append(Chunk(delay_s, data[:size]))
             data = data[size:]
-            delay_s = delay_s + 1e-3
+            delay_s += 1e-3
     return pieces
 
 

@@ -108,7 +108,10 @@ def small_rig(
     """
     told = {"pulses": "position", "with_crc": True, **settings}
     viewed = small_source() if source is None else source
-    of_devices = {"mirror_faults": mirror_faults, "camera_faults": CameraFaults(dict(faults or {}), 0, passes)}
-    rig = FaultyRig(viewed, ManualClock(50.0), wired=told["pulses"], mounting=mounting, **of_devices)
+    clock = ManualClock(50.0)
+    camera_faults = CameraFaults(dict(faults or {}), 0, passes)
+    rig = FaultyRig(
+        viewed, clock, mirror_faults=mirror_faults, wired=told["pulses"], camera_faults=camera_faults, mounting=mounting
+    )
     with InProcessRig(rig) as line:
         yield SmallRig(line, SurveyRig(**told), vector_pairs, viewed.wavelength_nm)

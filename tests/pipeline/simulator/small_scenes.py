@@ -23,11 +23,12 @@ from pipeline.simulator.selection import survey_probe
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
     """Return a scene of planes (y, x, component) and electrons (component, band); white is their maximum."""
-    of_scene = np.asarray(electrons, np.float32)
-    light = Once.of(SceneRadiance(of_scene, of_scene if of_scene.ndim == 1 else of_scene.max(axis=0)))
+    light = np.asarray(electrons, np.float32)
+    white = light if light.ndim == 1 else light.max(axis=0)
+    radiance = Once.of(SceneRadiance(light, white))
     nm = np.asarray(wavelength_nm, np.float64)
     raster = SceneRaster.of(np.ascontiguousarray(planes, np.float32))
-    return RasterScene("made", "made", raster, light, np.ones(len(nm), np.float32), nm, **more)
+    return RasterScene("made", "made", raster, radiance, np.ones(len(nm), np.float32), nm, **more)
 
 
 def image_scene(values: ArrayLike, camera: LineCamera, wavelength_nm: ArrayLike) -> RasterScene:

@@ -260,7 +260,7 @@ def test_flat_scene_gives_flat_lines() -> None:
 def test_undeflected_sweep_equals_the_operator_of_training(step: int) -> None:
     """Around the undeflected direction lines match the closed-form operator that training uses, with slit and smear."""
     rng = np.random.default_rng(0)
-    (y, x) = np.mgrid[:40, :640]
+    y, x = np.mgrid[:40, :640]
     values = np.ones((40, 640, 1))
     for _ in range(12):  # waves of 6 to 60 px
         fy, fx = rng.normal(size=2) / rng.uniform(6, 60)

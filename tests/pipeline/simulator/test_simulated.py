@@ -189,13 +189,12 @@ def test_calibration_removes_effects_that_the_frames_show(names: tuple[str, ...]
     The raw numbers differ from those without the effects: there was something to remove.
     """
     source = white_reference_source_of(*names)
-    sweep = WHITE_REFERENCE_SWEEP
-    raw = source.render(sweep, range(sweep.lines))
-    position = line_positions(sweep, WHITE_REFERENCE_CAMERA)
-    values, _ = calibrate(raw, source.references(sweep), saturated_dn=65535 * sweep.binning, position=position)
+    raw = source.render(WHITE_REFERENCE_SWEEP, range(6))
+    position = line_positions(WHITE_REFERENCE_SWEEP, WHITE_REFERENCE_CAMERA)
+    values, _ = calibrate(raw, source.references(WHITE_REFERENCE_SWEEP), saturated_dn=65535, position=position)
     np.testing.assert_allclose(values, 0.4, atol=2e-4)
-    plain = white_reference_source_of().render(sweep, range(6)).astype(int)
-    assert np.abs(raw[:6].astype(int) - plain).max() > 20
+    plain = white_reference_source_of().render(WHITE_REFERENCE_SWEEP, range(6)).astype(int)
+    assert np.abs(raw.astype(int) - plain).max() > 20
 
 
 def test_binned_frames_are_sums() -> None:

@@ -114,4 +114,4 @@ def test_rendered_contrast_matches_that_of_the_blur(blur: Any):
     passed = passed * disc_contrast(np.zeros(1), np.full(1, 1 / 16), moments.disc)
     if moments.waves is not None:
         passed = passed * pupil_contrast(moments.waves[1] / 16)
-    assert (np.ptp(after, axis=(0, 1)) / np.ptp(before, axis=(0, 1))) == pytest.approx(passed, abs=1.5e-3)
+    assert np.ptp(after, axis=(0, 1)) / np.ptp(before, axis=(0, 1)) == pytest.approx(passed, abs=1.5e-3)

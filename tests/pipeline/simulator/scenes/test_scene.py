@@ -116,12 +116,9 @@ def test_scene_returns_the_values_it_was_made_of() -> None:
     """A scene made of values returns them; a scene of components returns their mixture."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
-    planes = np.ones((4, 5, 3), np.float32)
-    electrons = np.full((3, 2), 100, np.float32)
-    white_reference = np.full(2, 0.5, np.float32)
-    white = np.full(2, 200, np.float32)
-    light = Once.of(SceneRadiance(electrons, white))
-    mixed = RasterScene("m", "k", SceneRaster.of(planes), light, white_reference, WAVELENGTH)
+    raster = SceneRaster.of(np.ones((4, 5, 3), np.float32))
+    light = Once.of(SceneRadiance(np.full((3, 2), 100, np.float32), np.full(2, 200, np.float32)))
+    mixed = RasterScene("m", "k", raster, light, np.full(2, 0.5, np.float32), WAVELENGTH)
     np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
 
 
