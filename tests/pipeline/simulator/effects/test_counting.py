@@ -88,9 +88,9 @@ def test_sensor_without_defects_has_a_bound_of_0() -> None:
 
 def test_larger_defect_fraction_keeps_the_defects_of_a_smaller_one() -> None:
     """A larger fraction adds elements; another unit has others; dead and hot elements are drawn separately."""
-    faults = ((0.01, 0), (0.05, 0), (0.05, 1))
     few, many, other = (
-        Rig(detector=Detector(dead_fraction=part, hot_fraction=part, unit=unit)) for part, unit in faults
+        Rig(detector=Detector(dead_fraction=fraction, hot_fraction=fraction, unit=unit))
+        for fraction, unit in ((0.01, 0), (0.05, 0), (0.05, 1))
     )
     assert (counting.dead_elements(many, 20) >= counting.dead_elements(few, 20)).all()
     assert not np.array_equal(counting.dead_elements(many, 20), counting.dead_elements(other, 20))

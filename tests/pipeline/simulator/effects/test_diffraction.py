@@ -72,8 +72,9 @@ def test_few_kernels_have_the_contrast_of_the_pupil(aperture_mm: float, keystone
     """In 60 bands no wave errs by more than 0.002, 0.0017 from 0.1 to 0.2 cycles per px, and 0.0008 below 0.03."""
     rig = Rig(optics=Optics(aperture_mm=aperture_mm, keystone_px=keystone_px))
     nm = np.linspace(400, 1000, 60)
-    blurs = [blur.moments(rig, nm, blur.variants[0]) for blur in (DIFFRACTION, ABERRATION, KEYSTONE)]
-    found = fold((rig.camera.slit_px, 1.0), (1, 1), 1, Moments.together(blurs, len(nm)))
+    each = [blur.moments(rig, nm, blur.variants[0]) for blur in (DIFFRACTION, ABERRATION, KEYSTONE)]
+    blurs = Moments.together(each, len(nm))
+    found = fold((rig.camera.slit_px, 1.0), (1, 1), 1, blurs)
     rng = np.random.default_rng(0)
     frequency, turn = rng.uniform(0.0, 0.8, 200), rng.uniform(0, np.pi, 200)
     frequency[:60], frequency[60:90] = rng.uniform(0.1, 0.2, 60), rng.uniform(0.002, 0.03, 30)
