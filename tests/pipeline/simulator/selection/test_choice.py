@@ -27,9 +27,9 @@ _COSTS = st.sampled_from((0.0, 0.3, 1.0, 7.7, 24.7)) | st.floats(0, 30)
 
 
 @st.composite
-def made_up(draw: st.DrawFn) -> list[MadeUp]:
-    """Draw up to six effects, perhaps with quantisation, each with up to three variants."""
-    names = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=6))
+def made_up(draw: st.DrawFn, most: int = 6) -> list[MadeUp]:
+    """Draw some effects, perhaps with quantisation, each with up to three variants."""
+    names = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most))
     effects = []
     for name in names:
         cheap = [(f"v{i}", draw(_BOUNDS), draw(_COSTS)) for i in range(draw(st.integers(0, 2)))]
