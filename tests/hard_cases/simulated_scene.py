@@ -66,7 +66,8 @@ def left_out(scene: RasterScene, rig: Rig) -> dict[str, tuple[float, float]]:
 
     Changes are in units of the noise of each sample, over a few lines; all other effects are exact.
     """
-    decision, block = decided(scene, rig), block_of(scene, rig)
+    decision = decided(scene, rig)
+    block = block_of(scene, rig)
     exact = expected_light(scene, block, decision.exact)
     noise = noise_electrons(exact, rig)
     slack = ROUNDING * float((np.abs(exact) / noise).max())

@@ -34,8 +34,7 @@ def test_dead_column_is_invalid(kind: str) -> None:
     references.white[5] = references.dark[5]
     if kind == "flagged":
         references = replace(references, bad=find_bad_elements(references.dark, references.white))
-    raw = np.full((2, 12, 10), 500, np.uint16)
-    values, valid = calibrate(raw, references, saturated_dn=FULL)
+    values, valid = calibrate(np.full((2, 12, 10), 500, np.uint16), references, saturated_dn=FULL)
     assert np.isnan(values[:, 5]).all()
     assert np.argwhere(~valid).tolist() == [[0, 5], [1, 5]]
 
@@ -59,7 +58,8 @@ def test_element_with_impossible_references_is_invalid(changed: dict[str, float]
 @pytest.mark.parametrize(("samples", "bands"), [(1, 1), (1, 10), (12, 1), (2, 2)])
 def test_smallest_frames_calibrate(samples: int, bands: int) -> None:
     """One line, one sample and one band calibrate like any other; if all elements are bad, all values are NaN."""
-    references, raw = frames(samples, bands), np.full((1, samples, bands), 1060, np.uint16)
+    references = frames(samples, bands)
+    raw = np.full((1, samples, bands), 1060, np.uint16)
     values, valid = calibrate(raw, references, saturated_dn=FULL)
     np.testing.assert_allclose(values, (1060 - 60.5) / 2000, rtol=1e-6)
     assert valid.all()

@@ -22,17 +22,17 @@ from tests.models.conftest import coarse_prediction, plain_weights
 NM = np.linspace(400, 1000, 9)
 
 
-def _scene(height: int, width: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0.1, 0.5, (height, width, 9)).astype(np.float32)
+def _scene(height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 0.5, (height, width, 9)).astype(np.float32)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(("dead", "lives"), [(1, True), (4, True), (5, False), (9, False)])
 def test_17_pixel_with_most_bands_dead_is_nan(dead: int, lives: bool, bad: float):
     """With up to half of the bands dead a flat spectrum keeps its columns to 0.3; with more the pixel is NaN."""
-    weights, values = plain_weights(), np.full((2, 9), 0.35, np.float32)
+    values = np.full((2, 9), 0.35, np.float32)
     values[1, np.random.default_rng(0).permutation(9)[:dead]] = bad
-    whole, broken = weights.columns(values, NM)
+    whole, broken = plain_weights().columns(values, NM)
     assert np.isnan(broken).tolist() == [not lives] * 4
     if lives:
         assert broken == pytest.approx(whole, abs=0.3)  # the columns are 0.5 from the median; exact with a live band
@@ -41,7 +41,9 @@ def test_17_pixel_with_most_bands_dead_is_nan(dead: int, lives: bool, bad: float
 @pytest.mark.parametrize("size", [8, 32])
 def test_18_dead_pixels_affect_at_most_the_next_token(size: int):
     """With the tokens' output set to 0, a dead patch or token changes nothing farther away than one token."""
-    weights, grid, values = plain_weights(), SceneGrid(128, 128, 8), _scene(128, 128)
+    weights = plain_weights()
+    grid = SceneGrid(128, 128, 8)
+    values = _scene(128, 128)
     with torch.no_grad():
         for parameter in weights.segmenter.from_token.parameters():
             parameter.zero_()
@@ -57,14 +59,13 @@ def test_18_dead_pixels_affect_at_most_the_next_token(size: int):
 
 def test_18_dead_pixels_in_a_coarse_pass_need_no_copy():
     """A dead pixel in every patch adds less than half of the columns' size to the peak memory of a coarse pass."""
-    weights, peaks = plain_weights(), []
+    weights = plain_weights()
+    peaks = []
     for bad in (0.3, np.nan):
         values = _scene(256, 256)
         values[3::8, 4::8] = bad
         tracemalloc.start()
-        seen = read_coarse_pass(
-            weights, [values[row : row + 16] for row in range(0, 256, 16)], NM, SceneGrid(256, 256, 8)
-        )
+        seen = read_coarse_pass(weights, np.split(values, 16), NM, SceneGrid(256, 256, 8))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert np.isfinite(seen.columns).all()

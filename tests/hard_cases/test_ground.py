@@ -64,8 +64,7 @@ def test_ground_that_falls_as_steeply_as_the_rays_is_not_met(slope: float):
 @pytest.mark.parametrize(("lat", "epsg"), [(85.3, 5041), (89.9999, 5041), (90.0, 5041), (-88.0, 5042), (-90.0, 5042)])
 def test_map_near_a_pole_is_stereographic(lat: float, epsg: int):
     """Beyond UTM's limits, 84 N and 80 S, the default is stereographic up to the pole, and areas agree to 1 %."""
-    shape = (120, 90)
-    grid = ground_grid(view(lat_deg=lat), shape)
+    grid = ground_grid(view(lat_deg=lat), (120, 90))
     assert grid.geobox.crs.epsg == epsg
     pixel_m2 = grid.geobox.resolution.x**2 / Proj(grid.frame.crs).get_factors(9.5, lat).areal_scale
     exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))

@@ -46,7 +46,8 @@ def test_4_step_without_labels_changes_no_weight():
 @pytest.mark.parametrize("size", [0.0, 1e-30, 1e-6])
 def test_13_norms_of_zero_tokens_are_zero(size: float):
     """There is no cosine decoder; the existing norms give 0 for zero tokens, with bounded gradients."""
-    attention, norm = TokenAttention(16, 2), ChannelNorm(8)
+    attention = TokenAttention(16, 2)
+    norm = ChannelNorm(8)
     pixels, tokens = torch.full((1, 8, 2, 2), size).requires_grad_(), torch.full((1, 3, 8), size).requires_grad_()
     for x, layer in ((pixels, norm), (tokens, attention.query_norm), (tokens, attention.key_norm)):
         out = layer(x)
@@ -60,8 +61,10 @@ def test_14_segmenter_with_two_classes_has_gradients():
     """There is no mask_norm, which is a sign for two classes: logits have values of any size, and gradients."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model, image = Segmenter(SegmenterConfig(**SIZES)), torch.randn(1, 4 + PLANES, 32, 32)
-    labels, none = (image[:, 0] > 0).long(), torch.zeros(1, 0, dtype=torch.int64)
+        model = Segmenter(SegmenterConfig(**SIZES))
+        image = torch.randn(1, 4 + PLANES, 32, 32)
+    labels = (image[:, 0] > 0).long()
+    none = torch.zeros(1, 0, dtype=torch.int64)
     logits = model.composite(*model(image, image, none, torch.zeros(1, 2)), none)
     loss = map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(2), soft_dice=True)
     loss.backward()  # type: ignore[no-untyped-call]
@@ -87,7 +90,8 @@ def test_26_loss_of_half_precision_logits_sums_in_float32(kind: torch.dtype):
     generator = torch.Generator().manual_seed(0)
     logits = torch.randn(1, 3, 250, 400, generator=generator).to(kind)
     labels = torch.randint(0, 3, (1, 250, 400), generator=generator)
-    weight, losses = torch.tensor([1.0, 2.0, 0.5]), pixel_losses(logits, labels)
+    weight = torch.tensor([1.0, 2.0, 0.5])
+    losses = pixel_losses(logits, labels)
     assert losses.dtype == torch.float32
     exact = nn.functional.cross_entropy(logits.double(), labels, weight.double())
     assert float(map_loss(logits, losses, labels, weight, soft_dice=False)) == pytest.approx(float(exact), rel=1e-5)

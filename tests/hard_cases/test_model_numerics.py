@@ -33,10 +33,10 @@ NONE = torch.zeros(1, 0, dtype=torch.int64)
 PLACE = torch.zeros(1, 2)
 
 
-def _encoder(layers: int = 2) -> Encoder:
+def _encoder() -> Encoder:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        return Encoder(16, layers, 2, 2)
+        return Encoder(16, 2, 2, 2)
 
 
 def _image(height: int, width: int, batch: int = 1, seed: int = 0) -> Tensor:
@@ -54,19 +54,22 @@ def threads() -> Iterator[None]:
 @torch.inference_mode()
 def test_1_scene_without_live_tokens_is_finite():
     """The overview is finite if all tokens are dead, and so are patches that are read after it."""
-    model, image, dead = make_network(layers=2), _image(64, 96), torch.zeros(6, dtype=torch.bool)
-    nothing = model.read_overview(image, None, dead)
+    model = make_network(layers=2)
+    image = _image(64, 96)
+    nothing = model.read_overview(image, None, torch.zeros(6, dtype=torch.bool))
     assert nothing.logits.isfinite().all()
-    patches = cut(image, 8)[:, [0, 95]]
-    assert model.read_patches(nothing, patches, torch.tensor([[0, 95]])).isfinite().all()
+    assert model.read_patches(nothing, cut(image, 8)[:, [0, 95]], torch.tensor([[0, 95]])).isfinite().all()
 
 
 @torch.inference_mode()
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1e30])
 def test_2_values_of_a_dead_token_do_not_leak(bad: float):
     """NaN, infinity or -1e30 in a dead token changes the transformer's output for all other tokens by at most 1e-6."""
-    model, image, said = make_network(layers=2), _image(64, 96), list[Tensor]()
-    living, spoiled = torch.tensor([True, True, False, True, True, True]), image.clone()
+    model = make_network(layers=2)
+    image = _image(64, 96)
+    said: list[Tensor] = []
+    living = torch.tensor([True, True, False, True, True, True])
+    spoiled = image.clone()
     spoiled[..., 15:17, 79:81] = bad  # convolutions spread it to the token's border
     model.from_token.register_forward_hook(lambda module, given, out: said.append(given[0].flatten(2)))
     overviews = [model.read_overview(one, None, living) for one in (image, spoiled)]
@@ -80,7 +83,8 @@ def test_2_values_of_a_dead_token_do_not_leak(bad: float):
 @pytest.mark.parametrize("count", [0, 3])
 def test_3_empty_batch_gives_empty_maps(count: int):
     """A batch of no scene passes the whole segmenter, with and without patches, also for sizes of partial tokens."""
-    model, numbers = make_network(layers=2), torch.zeros(0, count, dtype=torch.int64)
+    model = make_network(layers=2)
+    numbers = torch.zeros(0, count, dtype=torch.int64)
     image = torch.zeros(0, 4 + PLANES, 32, 48)
     logits, patches = model(image, image, numbers, torch.zeros(0, 2))
     assert logits.shape == (0, 3, 32, 48)
@@ -104,9 +108,10 @@ def test_4_batch_without_labels_has_zero_loss(images: int, soft_dice: bool):
 @torch.inference_mode()
 def test_5_map_without_patches_is_the_overview():
     """With K = 0 training's forward pass, the overview and the survey's map come from the same logits, bit by bit."""
-    weights, grid = plain_weights(), SceneGrid(48, 64, 8)
-    seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), grid)
-    image, model = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None], weights.segmenter
+    weights = plain_weights()
+    seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), SceneGrid(48, 64, 8))
+    image = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None]
+    model = weights.segmenter
     logits, patches = model(image, image, NONE, PLACE)
     whole = model.composite(logits, patches, NONE)
     assert torch.equal(whole, logits)
@@ -120,7 +125,9 @@ def test_5_map_without_patches_is_the_overview():
 @torch.inference_mode()
 def test_6_map_of_all_patches_ignores_their_order():
     """With K = all, the order changes no logit by more than 1e-5, and no pixel keeps the overview's logits."""
-    model, image, maps = make_network(layers=2), _image(32, 48), []
+    model = make_network(layers=2)
+    image = _image(32, 48)
+    maps = []
     for seed in range(3):
         order = torch.randperm(24, generator=torch.Generator().manual_seed(seed))[None]
         logits, patches = model(image, image, order, PLACE)
@@ -166,7 +173,9 @@ def test_11_bfloat16_agrees_with_float32(size: tuple[int, int]):
     u / sqrt(3). Independent errors of ``depth`` layers add up to u sqrt(depth). Single errors differ between
     processors, which sum in other orders and fuse other layers.
     """
-    model, image, numbers = make_network(layers=2), _image(*size), torch.arange(0, size[0] * size[1] // 64, 3)[None]
+    model = make_network(layers=2)
+    image = _image(*size)
+    numbers = torch.arange(0, size[0] * size[1] // 64, 3)[None]
     exact = model.composite(*model(image, image, numbers, PLACE), numbers)
     with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
         warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
@@ -174,22 +183,22 @@ def test_11_bfloat16_agrees_with_float32(size: tuple[int, int]):
     depth = sum(isinstance(part, torch.nn.Conv2d | torch.nn.Linear) for part in model.modules())
     assert (exact - rough).square().mean().sqrt() <= 2.0**-8 * math.sqrt(depth) * exact.square().mean().sqrt()
     best = exact.softmax(dim=1).topk(2, dim=1).values
-    sure = best[:, 0] - best[:, 1] >= 0.1
-    assert (exact.argmax(dim=1) == rough.argmax(dim=1))[sure].all()
+    assert (exact.argmax(dim=1) == rough.argmax(dim=1))[best[:, 0] - best[:, 1] >= 0.1].all()
 
 
 @torch.inference_mode()
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
 def test_11_attention_stays_finite_in_half_precision(kind: torch.dtype):
     """Normalised queries and keys keep attention finite in 16 bits, for inputs of 300."""
-    encoder, x = _encoder().to(kind), (300 * noise(0, 1, 8, 16)).to(kind)
-    assert encoder(x).isfinite().all()
+    encoder = _encoder().to(kind)
+    assert encoder((300 * noise(0, 1, 8, 16)).to(kind)).isfinite().all()
 
 
 @torch.inference_mode()
 def test_12_position_codes_of_a_distant_tile_are_exact():
     """The origin of a tile is added in float64: codes of its tokens are exact to 1e-6 at 1e7 tokens."""
-    origin, read = np.array([9_999_997, 10_000_000.25]), list[Tensor]()
+    origin = np.array([9_999_997, 10_000_000.25])
+    read: list[Tensor] = []
     model = make_network(layers=2, dim=32)
     model.to_token.weight.zero_()
     model.to_token.bias.zero_()
@@ -213,11 +222,9 @@ def test_15_constant_band_normalises_to_zero(value: float):
     """A column without variance is exactly 0 alone, and 0 to 1e-5 beside other columns, in any order of them."""
     sample = np.random.default_rng(0).normal(0.5, 0.1, (500, 4)).astype(np.float32)
     sample[:, 1] = value
-    normalisation = Normalisation.measured(sample)
-    normal = normalisation.apply(sample, np.ones(4, bool))
+    normal = Normalisation.measured(sample).apply(sample, np.ones(4, bool))
     assert normal[:, 1] == pytest.approx(0, abs=1e-5)  # whitening mixes in no other column
-    alone = Normalisation.measured(sample[:, [1, 1]])
-    assert not alone.apply(sample[:, [1, 1]], np.ones(2, bool)).any()
+    assert not Normalisation.measured(sample[:, [1, 1]]).apply(sample[:, [1, 1]], np.ones(2, bool)).any()
     order = [1, 3, 0, 2]
     permuted = Normalisation.measured(sample[:, order]).apply(sample[:, order], np.ones(4, bool))
     assert permuted == pytest.approx(normal[:, order], abs=1e-4)
@@ -249,9 +256,9 @@ def test_20_class_numbers_out_of_range_are_refused(label: int, guess: int):
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (37, 53), (100, 31)])
 def test_21_map_has_the_size_of_the_scene(size: tuple[int, int]):
     """Scenes that patches do not divide evenly are padded and cropped back, from one pixel upwards."""
-    weights, grid = plain_weights(), SceneGrid(*size, 8)
+    weights = plain_weights()
     values = np.random.default_rng(0).uniform(0.1, 0.5, (*size, 5))
-    seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), grid)
+    seen = coarse_prediction(weights, values, np.linspace(450, 950, 5), SceneGrid(*size, 8))
     patch_index = frame_patches(score_patches("gain", seen), 0.5)
     drawn = segment(weights, seen, np.zeros((len(patch_index), 8, 8, 4), np.float32), patch_index)
     assert drawn.classes.shape == size
@@ -263,10 +270,10 @@ def test_22_uniform_scene_has_equal_scores():
     grid = SceneGrid(36, 50, 8)
     columns, probability = (np.full((*grid.padded_shape, n), of, np.float32) for n, of in ((4, 0.3), (3, 1 / 3)))
     seen = CoarsePrediction(grid, columns, probability)
-    fraction, scores = seen.grid.valid_fraction().ravel(), score_patches("entropy", seen)
+    fraction = seen.grid.valid_fraction().ravel()
+    scores = score_patches("entropy", seen)
     assert np.ptp(scores[fraction == 1]) <= 1e-6
-    ranked = fraction[select_patches(scores, len(scores))]
-    assert (np.diff(ranked) <= 0).all()
+    assert (np.diff(fraction[select_patches(scores, len(scores))]) <= 0).all()
     assert np.ptp(score_patches("sobel", seen)) <= 1e-6
 
 
@@ -276,7 +283,9 @@ def test_23_map_does_not_depend_on_the_batch():
 
     Some processors multiply matrices of another size in another order: a difference of 1.2e-6 was observed.
     """
-    model, image, detail = make_network(layers=2), _image(32, 64, 8), _image(32, 64, 8, 1)
+    model = make_network(layers=2)
+    image = _image(32, 64, 8)
+    detail = _image(32, 64, 8, 1)
     places = torch.arange(16).view(8, 2)
     numbers = torch.stack([torch.randperm(32, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
     together = model.composite(*model(image, detail, numbers, places), numbers)
@@ -285,14 +294,14 @@ def test_23_map_does_not_depend_on_the_batch():
         alone = model.composite(*model(image[one], detail[one], numbers[one], places[one]), numbers[one])
         assert (alone - together[one]).abs().max() <= 4e-6
     turned = numbers.flip(1)
-    reordered = model.composite(*model(image, detail, turned, places), turned)
-    assert (reordered - together).abs().max() <= 4e-6
+    assert (model.composite(*model(image, detail, turned, places), turned) - together).abs().max() <= 4e-6
 
 
 @torch.inference_mode()
 def test_23_transformer_is_equivariant_to_token_order():
     """Only the codes carry positions: permuted tokens give the permuted output."""
-    encoder, tokens = _encoder(), noise(0, 2, 12, 16)
+    encoder = _encoder()
+    tokens = noise(0, 2, 12, 16)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(1))
     assert (encoder(tokens[:, order]) - encoder(tokens)[:, order]).abs().max() <= 2e-6
 
@@ -306,8 +315,8 @@ def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
 
 def test_25_entropy_of_certain_pixels_is_0():
     """A probability of 0 adds 0: the entropy is never NaN, and neither below 0 nor above it in float32."""
-    sure, tiny = np.eye(4, dtype=np.float32), np.array([[1.0, 1e-45, 0, 0]], np.float32)
-    entropy = pixel_entropy(np.concatenate([sure, tiny]))
+    tiny = np.array([[1.0, 1e-45, 0, 0]], np.float32)
+    entropy = pixel_entropy(np.concatenate([np.eye(4, dtype=np.float32), tiny]))
     assert entropy.min() >= 0
     assert entropy.max() <= 1e-40
 
@@ -315,7 +324,9 @@ def test_25_entropy_of_certain_pixels_is_0():
 @pytest.mark.parametrize("size", [0.0, 1e30])
 def test_27_zero_and_huge_corrections_keep_gradients_finite(size: float):
     """A full network with zero output leaves the overview unchanged; logits of 1e30 replace it."""
-    model, image, numbers = make_network(layers=2), _image(32, 32), torch.tensor([[0, 5]])
+    model = make_network(layers=2)
+    image = _image(32, 32)
+    numbers = torch.tensor([[0, 5]])
     with torch.no_grad():
         for parameter in model.full_classes.parameters():
             parameter.zero_()
@@ -323,7 +334,8 @@ def test_27_zero_and_huge_corrections_keep_gradients_finite(size: float):
     logits, patches = model(image, image, numbers, PLACE)
     under = cut(logits, 8)[:, numbers[0]]
     assert torch.equal(patches, under) if size == 0 else (patches.argmax(dim=2) == 1).all()
-    labels, drawn = torch.full((1, 32, 32), 2), model.composite(logits, patches, numbers)
+    labels = torch.full((1, 32, 32), 2)
+    drawn = model.composite(logits, patches, numbers)
     assert drawn.softmax(dim=1).isfinite().all()
     map_loss(drawn, pixel_losses(drawn, labels), labels, torch.ones(3), soft_dice=True).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
@@ -333,10 +345,11 @@ def test_27_zero_and_huge_corrections_keep_gradients_finite(size: float):
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_29_steps_with_non_finite_loss_are_skipped_and_end_a_run(value: float, monkeypatch: pytest.MonkeyPatch):
     """Such steps are counted; three in a row stop the training."""
-    labels = np.zeros((16, 16), np.uint8)
-    example = Example("e", np.zeros((16, 16, 4), np.float16), labels, (16, 16))
-    config, settings = SegmenterConfig(**SMALL), TrainingSettings(steps=4, batch=1, crop=16)
-    honest, calls = training.batch_loss, iter(range(100))
+    example = Example("e", np.zeros((16, 16, 4), np.float16), np.zeros((16, 16), np.uint8), (16, 16))
+    config = SegmenterConfig(**SMALL)
+    settings = TrainingSettings(steps=4, batch=1, crop=16)
+    honest = training.batch_loss
+    calls = iter(range(100))
     monkeypatch.setattr(training, "batch_loss", lambda *a, **k: honest(*a, **k) * (value if next(calls) % 2 else 1))
     _, summary = train(config, [example], np.zeros(4, np.float32), settings)
     assert summary["skipped_steps"] == 2
@@ -347,9 +360,10 @@ def test_29_steps_with_non_finite_loss_are_skipped_and_end_a_run(value: float, m
 
 def test_30_saved_weights_read_any_number_of_bands(tmp_path: Path):
     """Weights from a file give finite probabilities for scenes of 1, 3 and 200 bands."""
-    weights, path = plain_weights(), tmp_path / "w.safetensors"
-    save_weights(weights, path)
-    loaded, grid = load_weights(path), SceneGrid(16, 16, 8)
+    path = tmp_path / "w.safetensors"
+    save_weights(plain_weights(), path)
+    loaded = load_weights(path)
+    grid = SceneGrid(16, 16, 8)
     for bands in (1, 3, 200):
         seen = coarse_prediction(loaded, np.full((16, 16, bands), 0.3), np.linspace(500, 900, bands), grid)
         assert np.isfinite(seen.probability).all()
@@ -357,12 +371,13 @@ def test_30_saved_weights_read_any_number_of_bands(tmp_path: Path):
 
 def test_31_one_and_two_threads_select_the_same_patches(threads: None):
     """All four policies give the same plan on 1 and 2 threads; torch's global random state stays unchanged."""
-    weights, grid = plain_weights(), SceneGrid(96, 96, 8)
+    weights = plain_weights()
     columns = noise(0, 96, 96, 4).numpy()
-    before, plans = torch.random.get_rng_state(), []
+    before = torch.random.get_rng_state()
+    plans = []
     for count in (1, 2):
         torch.set_num_threads(count)
-        seen = coarse_prediction_of_columns(weights, columns, grid)
+        seen = coarse_prediction_of_columns(weights, columns, SceneGrid(96, 96, 8))
         policies = ("gain", "entropy", "sobel", "random")
         plans.append([frame_patches(score_patches(policy, seen), 0.3) for policy in policies])
     assert all((one == two).all() for one, two in zip(*plans, strict=True))

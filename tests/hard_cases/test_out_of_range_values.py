@@ -18,7 +18,8 @@ from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_al
 from tests.models.conftest import coarse_prediction, make_weights
 
 WEIGHTS = make_weights(0)
-GRID, NM = SceneGrid(48, 64, 8), np.linspace(420, 980, 7)
+GRID = SceneGrid(48, 64, 8)
+NM = np.linspace(420, 980, 7)
 MOST = WEIGHTS.normalisation.most_value
 VALUES = np.random.default_rng(0).uniform(0.1, 0.5, (*GRID.padded_shape, 7)).astype(np.float32)
 PATCHES = np.array([3, 9, 20, 21])
@@ -26,9 +27,7 @@ FINE = np.random.default_rng(1).uniform(0.1, 0.5, (len(PATCHES), 8, 8, 7)).astyp
 FAR = np.float32(np.finfo(np.float32).max)
 
 sizes = st.floats(float(np.log10(MOST * 1.001)), 38.5).map(lambda power: np.float32(min(10.0**power, float(FAR))))
-OUT_OF_RANGE = st.one_of(
-    sizes, sizes.map(lambda size: -size), st.sampled_from([np.inf, -np.inf, np.nan, 1e9, 1e18, 1e30, FAR])
-)
+OUT_OF_RANGE = sizes | sizes.map(lambda size: -size) | st.sampled_from([np.inf, -np.inf, np.nan, 1e9, 1e18, 1e30, FAR])
 
 
 def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[CoarsePrediction, DrawnMap]:
@@ -68,7 +67,8 @@ def test_out_of_range_value_counts_as_nan(value: float, y: int, x: int, bands: s
 def test_out_of_range_columns_count_as_nan(value: float) -> None:
     """Columns that arrive already normalised, for the overview or for the map, are checked too."""
     columns = np.random.default_rng(3).normal(0, 1, (*GRID.padded_shape, 4)).astype(np.float32)
-    patches, found = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32), []
+    patches = np.random.default_rng(4).normal(0, 1, (2, 8, 8, 4)).astype(np.float32)
+    found = []
     for one in (value, np.nan):
         coarse, fine = columns.copy(), patches.copy()
         coarse[4, 6, 2], fine[1, 3, 5, 0] = one, one

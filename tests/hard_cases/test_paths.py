@@ -14,17 +14,16 @@ from tests.pipeline.rectify.aiming import CAMERA, aim
 SWATH = 2600.0
 
 
-def points_between(first: float, last: float, count: int = 400) -> np.ndarray:
-    """Return points (n, 2) that lines between two scan positions see, in the middle half of the line."""
+def points_between(first: float, last: float) -> np.ndarray:
+    """Return points (400, 2) that lines between two scan positions see, in the middle half of the line."""
     rng = np.random.default_rng(7)
-    x, y = points_of_scan(SWATH, CAMERA, rng.uniform(first, last, count), rng.uniform(-0.016, 0.016, count))
+    x, y = points_of_scan(SWATH, CAMERA, rng.uniform(first, last, 400), rng.uniform(-0.016, 0.016, 400))
     return np.stack([y, x], axis=-1)
 
 
 def test_lines_at_one_position_form_one_knot() -> None:
     """Groups of one to four lines make 40 uniform knots, each of exactly its own lines; no step has length 0."""
-    scan = np.repeat(np.arange(40.0), [2, 3, 4, 1] * 10)
-    (scan_path,) = make_scan_paths(aim(SWATH, scan), CAMERA)
+    (scan_path,) = make_scan_paths(aim(SWATH, np.repeat(np.arange(40.0), [2, 3, 4, 1] * 10)), CAMERA)
     assert scan_path.uniform
     assert len(scan_path) == 40
     assert np.diff(scan_path.starts, append=100).tolist() == [2, 3, 4, 1] * 10
@@ -67,10 +66,8 @@ def test_camera_with_one_sample_has_a_geolocation(samples: int, binning: int) ->
     camera = LineCamera(samples=samples)
     (scan_path,) = make_scan_paths(aim(SWATH, np.arange(10.0)), camera, binning=binning)
     x, y = points_of_scan(SWATH, camera, 4.0, np.array([0, 0.4 * samples, 700]) * camera.ifov_rad)
-    points = np.stack([y, x], axis=-1)
-    found = path_geolocation(scan_path, camera, points, along="x", binning=binning)
-    expected = [samples >= binning] * 2 + [False]
-    np.testing.assert_array_equal(np.isfinite(found[:, 1]), expected)
+    found = path_geolocation(scan_path, camera, np.stack([y, x], axis=-1), along="x", binning=binning)
+    np.testing.assert_array_equal(np.isfinite(found[:, 1]), [samples >= binning] * 2 + [False])
 
 
 def test_lost_frames_leave_a_gap_without_geolocation() -> None:
@@ -80,6 +77,6 @@ def test_lost_frames_leave_a_gap_without_geolocation() -> None:
     assert numbers.lost == 12
     np.testing.assert_array_equal(numbers.number, scan)
     (scan_path,) = make_scan_paths(aim(SWATH, scan), CAMERA)
-    gap, rest = points_between(29.51, 41.49), np.vstack([points_between(2, 29.49), points_between(41.51, 77)])
-    assert np.isnan(path_geolocation(scan_path, CAMERA, gap, along="x")).all()
+    rest = np.vstack([points_between(2, 29.49), points_between(41.51, 77)])
+    assert np.isnan(path_geolocation(scan_path, CAMERA, points_between(29.51, 41.49), along="x")).all()
     assert np.isfinite(path_geolocation(scan_path, CAMERA, rest, along="x")).all()

@@ -11,7 +11,8 @@ from pipeline.geometry.scan import Axis, CostModel, Sweep, memory_loads
 from pipeline.planning.coverage import full_sweeps
 from pipeline.planning.fine_pass import FinePlan, SecondPass, every_nth
 
-CAMERA, COST = LineCamera(), CostModel()
+CAMERA = LineCamera()
+COST = CostModel()
 GRID = SceneGrid(200, 900, 32)
 
 
@@ -43,8 +44,7 @@ def test_plans_with_free_setups_keep_to_the_time():
 @pytest.mark.parametrize("shape", [(1, 1), (20, 32)])
 def test_field_of_one_patch_is_one_sweep(along: Axis, shape: tuple[int, int]):
     """Fields of 1 x 1 and 20 x 32 px take one sweep with at most 5 extra lines, along either axis."""
-    grid = SceneGrid(*shape, max(shape))
-    plan = planned(grid, np.ones(1), 1e3, along)
+    plan = planned(SceneGrid(*shape, max(shape)), np.ones(1), 1e3, along)
     (sweep,) = plan.sweeps
     assert sweep.lines <= (shape[0] if along == "x" else shape[1]) + 5
     assert plan.patch_index.tolist() == [0]
@@ -72,7 +72,8 @@ def test_gain_on_one_side_takes_sweeps_on_that_side_only():
 
 def test_28_patches_with_negative_gain_are_never_planned():
     """Patches with negative, NaN or -inf scores get no sweep and leave the time unspent; a positive one is planned."""
-    grid, score = SceneGrid(256, 256, 16), np.full(256, -0.3)
+    grid = SceneGrid(256, 256, 16)
+    score = np.full(256, -0.3)
     score[[3, 70, 200]] = -5.0, np.nan, -np.inf
     plan = planned(grid, score, 10.0)
     assert (plan.patch_index.tolist(), plan.sweeps, plan.expected_gain) == ([], [], 0.0)

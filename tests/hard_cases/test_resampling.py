@@ -39,9 +39,8 @@ def test_bands_of_a_cube_match_the_same_band_alone(kernel: Kernel, bands: int) -
 @pytest.mark.parametrize("lines", [32_766, 32_767, 32_768, 40_000])
 def test_line_numbers_beyond_16_bits_are_resampled_exactly(kernel: Kernel, lines: int) -> None:
     """Sweeps of 32 766 to 40 000 lines return exact values at their first, middle and last lines."""
-    values, valid = ramp(lines, 4), np.ones((lines, 4), bool)
     at = np.array([[lines - 1, 3], [lines - 1, 0], [lines - 3, 2], [lines // 2, 1], [32_766 - 3, 2]])
-    out, _ = resample(values, valid, at, kernel)
+    out, _ = resample(ramp(lines, 4), np.ones((lines, 4), bool), at, kernel)
     np.testing.assert_array_equal(out[:, 0], 10 * at[:, 0] + at[:, 1])
 
 
@@ -87,9 +86,8 @@ def test_overshoot_at_a_step_is_kept() -> None:
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])
 def test_positions_without_a_line_give_nan(kernel: Kernel, kind: type[np.generic]) -> None:
     """A block of the grid that no line reaches is NaN with a fraction of 0, and raises no warning."""
-    values = ramp(5, 5, 3).astype(kind)
     at = np.array([[np.nan, np.nan], [np.nan, 2], [np.inf, 1], [-np.inf, -np.inf], [1e300, 0]])
-    out, fraction = resample(values, np.ones((5, 5), bool), at, kernel)
+    out, fraction = resample(ramp(5, 5, 3).astype(kind), np.ones((5, 5), bool), at, kernel)
     assert out.shape == (5, 3)
     assert np.isnan(out).all()
     assert not fraction.any()
@@ -109,24 +107,26 @@ def test_float64_positions_keep_offsets_that_float32_loses() -> None:
 @pytest.mark.parametrize("shape", [(1, 6), (6, 1), (1, 1), (2, 2), (3, 3)])
 def test_images_smaller_than_the_kernel_return_their_pixels(kernel: Kernel, shape: tuple[int, int]) -> None:
     """Images of one line, one sample or up to 3 x 3 px return their values at centres; outside the fraction is 0."""
-    values, valid = ramp(*shape, 2), np.ones(shape, bool)
+    values = ramp(*shape, 2)
+    valid = np.ones(shape, bool)
     centres = np.argwhere(valid).astype(float)
     out, fraction = resample(values, valid, centres, kernel)
     np.testing.assert_array_equal(out.reshape(values.shape), values)
     assert (fraction == 1).all()
     for away in ([1, 0], [0, 1], [-1, -1]):
-        beyond = centres + np.multiply(away, shape)
-        assert not resample(values, valid, beyond, kernel)[1].any()
+        assert not resample(values, valid, centres + np.multiply(away, shape), kernel)[1].any()
 
 
 def test_concurrent_threads_give_the_results_of_one_thread() -> None:
     """Four threads also read read-only memory and leave torch's thread count unchanged."""
     rng = np.random.default_rng(3)
-    values, valid = rng.random((40, 40, 70), np.float32), rng.random((40, 40, 70)) > 0.001
+    values = rng.random((40, 40, 70), np.float32)
+    valid = rng.random((40, 40, 70)) > 0.001
     values.flags.writeable = False
     places = [rng.uniform(-1, 40, (3000, 2)) for _ in range(8)]
     alone = [resample(values, valid, at) for at in places]
-    before, together = torch.get_num_threads(), threading.Barrier(4)
+    before = torch.get_num_threads()
+    together = threading.Barrier(4)
 
     def work(first: int) -> list[tuple[np.ndarray, np.ndarray]]:
         together.wait()
@@ -143,11 +143,10 @@ def test_concurrent_threads_give_the_results_of_one_thread() -> None:
 
 def test_new_threads_inherit_the_torch_thread_count() -> None:
     """A worker thread has the process's number of torch threads before and after it resamples."""
-    values, valid, at = ramp(9, 9), np.ones((9, 9), bool), np.full((10, 2), 4.5)
 
     def work() -> tuple[int, int]:
         before = torch.get_num_threads()
-        resample(values, valid, at)
+        resample(ramp(9, 9), np.ones((9, 9), bool), np.full((10, 2), 4.5))
         return before, torch.get_num_threads()
 
     with ThreadPoolExecutor(1) as pool:

@@ -35,8 +35,7 @@ def test_point_source_keeps_every_bound(slit_um: float) -> None:
     """One bright pixel on black: leaving out each effect changes the light by a finite amount within its bound."""
     values = np.zeros((60, 80, 2))
     values[29, 39] = 1.0  # line 15 points there
-    rig = replace(RIG, camera=replace(CAMERA, slit_um=slit_um))
-    found = left_out(scene_of(values), rig)
+    found = left_out(scene_of(values), replace(RIG, camera=replace(CAMERA, slit_um=slit_um)))
     assert {"diffraction", "aberration", "slit", "keystone"} <= set(found)
     assert max(change for change, _ in found.values()) > 1
     for change, counted in found.values():
@@ -45,7 +44,8 @@ def test_point_source_keeps_every_bound(slit_um: float) -> None:
 
 def test_scene_of_one_pixel_can_be_scanned() -> None:
     """One sample of one line in one band, every part on, is finite; effects that need detail have an error of 0."""
-    scene, rig = scene_of(np.ones((1, 1, 1))), replace(EVERYTHING, camera=LineCamera(samples=1))
+    scene = scene_of(np.ones((1, 1, 1)))
+    rig = replace(EVERYTHING, camera=LineCamera(samples=1))
     sweep = replace(SWEEP, lines=1)
     decision = decided(scene, rig, 0.0, sweep)
     light = expected_light(scene, block_of(scene, rig, range(1), sweep), decision.chosen)

@@ -65,7 +65,8 @@ def test_stiff_and_slow_mirrors_keep_every_bound(natural_hz: float, damping: flo
 def test_light_ends_at_sunset() -> None:
     """Light decreases until sunset and is 0 for the 4 h after it; raw numbers without noise are then the dark level."""
     rig = replace(RIG, sky=EVENING)
-    seconds, levels = np.arange(3600.0), []
+    seconds = np.arange(3600.0)
+    levels = []
     sunset_s = float(seconds[sun_elevation_deg(EVENING, seconds) <= 0][0])
     for beside in (-600.0, -60.0, -10.0, 10.0, 600.0, 4 * 3600.0):
         block = replace(block_of(FLAT, rig, range(1)), started_s=sunset_s + beside)
@@ -124,11 +125,10 @@ def test_scene_that_reaches_to_the_horizon_keeps_every_bound(relief: str, focus_
     """The farthest part lies at infinity: after a step, parallax there is the lever over the scene's 30 m."""
     air = Air(distance_m=30.0, nearest_m=20.0, farthest_m=math.inf, relief=relief)  # type: ignore[arg-type]
     rig = replace(RIG, air=air, optics=Optics(focus_m=focus_m))
-    found = left_out(TEXTURE, rig)
-    for change, counted in found.values():
+    for change, counted in left_out(TEXTURE, rig).values():
         assert change <= counted < math.inf
-    block, along = block_of(TEXTURE, rig), np.array([[-31.5, 31.5]])
-    moved, _ = PARALLAX.displaced(block, along, np.full((1, 2), -29.5), "exact")
+    along = np.array([[-31.5, 31.5]])
+    moved, _ = PARALLAX.displaced(block_of(TEXTURE, rig), along, np.full((1, 2), -29.5), "exact")
     lever = air.lever_m * (0 if relief == "flat" else -1 / 30)
     np.testing.assert_allclose(moved, lever * along, atol=1e-12)
 

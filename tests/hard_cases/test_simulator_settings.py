@@ -89,7 +89,8 @@ ASKED = st.builds(
 @example(Asked(exposure_ms=9780.0, binning=1, wavelengths=(529.3, 998.0), tolerance=1e-3, distance_m=10.0))
 def test_decision_for_permitted_settings_keeps_its_bounds(asked: Asked) -> None:
     """No setting ends in a broken bound, a non-finite number or a warning."""
-    scene, rig = asked.scene(), asked.rig()
+    scene = asked.scene()
+    rig = asked.rig()
     sweeps = (
         Sweep("coarse-0", "coarse", "x", 0.0, -20.0, SHAPE[0] // 4, 4, asked.binning),
         Sweep("full-0", "fine", "x", 0.0, -20.0, SHAPE[0]),

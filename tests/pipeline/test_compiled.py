@@ -37,7 +37,8 @@ assert made.tolist() == [0.0, 2.0, 4.0]
 
 def doubled(module: ModuleType) -> list[float]:
     """Return the module's result for 0, 1, 2; the input array is read-only."""
-    some, made = np.arange(3.0), np.empty(3)
+    some = np.arange(3.0)
+    made = np.empty(3)
     some.setflags(write=False)
     module.double(some, made)
     return list(made)
@@ -88,7 +89,8 @@ def test_loops_run_without_a_cache() -> None:
 
 def test_two_processes_may_compile_at_once(file: Path) -> None:
     """Two processes finish without errors in one empty cache folder, and leave it intact."""
-    command, environment = [sys.executable, "-c", ASK, str(file.parent)], {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", ASK, str(file.parent)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     both = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     assert [one.communicate()[1] for one in both] == ["", ""]
     assert doubled(opened(file)) == [0, 2, 4]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import unicodedata
 
 import pytest
@@ -26,14 +25,8 @@ def test_visible_text_has_no_control_characters(text: str) -> None:
 
 def test_every_character_follows_one_rule() -> None:
     """The fast path for common text accepts exactly the characters that the rule accepts."""
-    codes = [
-        *range(0x3100),
-        *range(0x3100, sys.maxunicode + 1, 13),
-        *range(0xD800, 0xE000, 3),
-        *range(0xE0000, 0xE0080),
-    ]
-    wrong = [code for code in codes if (visible(chr(code)) == chr(code)) is not is_visible(chr(code))]
-    assert wrong == []
+    codes = [*range(0x3100), *range(0x3100, 0x110000, 13), *range(0xD800, 0xE000, 3), *range(0xE0000, 0xE0080)]
+    assert [code for code in codes if (visible(chr(code)) == chr(code)) is not is_visible(chr(code))] == []
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,8 @@ from pipeline.lazy import Once
 
 def test_threads_share_one_computation() -> None:
     """Eight threads that request a value at the same time get the same one, computed once."""
-    make, together = Mock(side_effect=object), threading.Barrier(8)
+    make = Mock(side_effect=object)
+    together = threading.Barrier(8)
     once = Once(make)
 
     def ask(_: int) -> object:

@@ -27,7 +27,8 @@ def assert_same_references(found: References, expected: References) -> None:
 def test_a_recorded_sweep_returns_its_lines_unchanged(sweep: Sweep) -> None:
     """Lines and references equal those of the source that was recorded, bit for bit, from any first line."""
     source = simulated()
-    recorded, lines = recorded_source(source, [record(source, sweep)]), list(source.lines(sweep))
+    recorded = recorded_source(source, [record(source, sweep)])
+    lines = list(source.lines(sweep))
     assert_same(list(recorded.lines(sweep)), lines)
     assert_same(list(recorded.lines(sweep, 17)), lines[17:])
     assert_same_references(recorded.references(sweep), source.references(sweep))
@@ -35,7 +36,8 @@ def test_a_recorded_sweep_returns_its_lines_unchanged(sweep: Sweep) -> None:
 
 def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
     """Each coarse line is the recorded line just before its middle. The other lines are not read."""
-    source, counted = simulated(), Counted()
+    source = simulated()
+    counted = Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     found, full = list(recorded.lines(coarse)), list(source.lines(FULL))
@@ -49,11 +51,11 @@ def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
 
 def test_fine_lines_of_a_full_scan_are_found_by_position() -> None:
     """A planned run of lines reads only those lines and returns them as recorded."""
-    source, counted = simulated(), Counted()
+    source = simulated()
+    counted = Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
     found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
-    expected = list(source.lines(FULL))[30:42]
-    assert_same([replace(line, number=line.number + 30) for line in found], expected)
+    assert_same([replace(line, number=line.number + 30) for line in found], list(source.lines(FULL))[30:42])
     assert counted.numbers == list(range(30, 42))
     list(recorded.lines(Sweep("fine-1", "fine", "x", 0.0, -1.5, 8)))
     assert counted.numbers[12:] == list(range(38, 46))
@@ -61,11 +63,11 @@ def test_fine_lines_of_a_full_scan_are_found_by_position() -> None:
 
 def test_a_recorded_coarse_sweep_is_preferred_to_the_full_scan() -> None:
     """If two sweeps can serve a request, the one that has exactly its lines is read."""
-    source, coarse = simulated(), Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
+    source = simulated()
+    coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
     recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
-    part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4)
     expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]
-    assert_same(list(recorded.lines(part)), expected)
+    assert_same(list(recorded.lines(Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4))), expected)
 
 
 def test_a_backward_recording_returns_lines_in_order_of_time() -> None:
@@ -100,8 +102,7 @@ def test_two_sweeps_of_one_swath_serve_a_run_across_both() -> None:
 def test_an_invalid_line_is_used_only_without_a_valid_neighbour() -> None:
     """In a coarse pass a valid neighbour replaces an invalid line. In a fine pass the line stays invalid."""
     source = simulated()
-    whole = record(source, FULL)
-    lost = replace(whole, valid_line=np.arange(80) != 5)
+    lost = replace(record(source, FULL), valid_line=np.arange(80) != 5)
     recorded = recorded_source(source, [lost])
     coarse = recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4))
     assert coarse.line[:3].tolist() == [1, 6, 9]
@@ -111,20 +112,11 @@ def test_an_invalid_line_is_used_only_without_a_valid_neighbour() -> None:
 
 def test_a_recorded_line_that_serves_two_planned_lines_is_valid_once() -> None:
     """Recorded lines 1.25 px apart serve a plan of 1 px. If two planned lines share one, only one of them is valid."""
-    source, wide = simulated(), _lines_apart(1.25)
-    found = list(recorded_source(source, [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
-    places = [line.mirror_x for line in found]
-    assert len(set(places)) == sum(line.valid for line in found) < 10
-
-
-def _lines_apart(distance_px: float) -> RecordedSweep:
-    """Return a recording of 40 centred lines that are ``distance_px`` apart; their data are zeros."""
-    sweep = Sweep("uneven", "fine", "x", 0.0, -19.5, 40)
-    scan = distance_px * (np.arange(40) - 19.5)
+    scan = 1.25 * (np.arange(40) - 19.5)
     position = np.concatenate([line_positions(Sweep("one", "fine", "x", 0.0, at, 1), CAMERA) for at in scan.tolist()])
     frame = np.zeros((64, 3), np.float32)
-    return RecordedSweep(
-        sweep,
+    wide = RecordedSweep(
+        Sweep("wide", "fine", "x", 0.0, -19.5, 40),
         References(frame, frame + 1, np.ones(3, np.float32)),
         position,
         np.arange(40.0),
@@ -132,6 +124,8 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
         np.ones(40, bool),
         lambda numbers: np.zeros((len(numbers), 64, 3), np.uint16),
     )
+    found = list(recorded_source(simulated(), [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
+    assert len({line.mirror_x for line in found}) == sum(line.valid for line in found) < 10
 
 
 @pytest.mark.parametrize(
@@ -148,7 +142,8 @@ def _lines_apart(distance_px: float) -> RecordedSweep:
 )
 def test_a_missing_line_is_named_before_any_line_is_read(asked: Sweep, message: str) -> None:
     """Lines beyond the end of the recording, on another swath or along the other axis are refused."""
-    source, counted = simulated(), Counted()
+    source = simulated()
+    counted = Counted()
     recorded = recorded_source(source, [record(source, FULL, counted)])
     with pytest.raises(NotRecordedError, match=message):
         next(recorded.lines(asked))
@@ -172,8 +167,7 @@ def test_a_plan_is_cut_to_the_recorded_lines() -> None:
 def test_a_coarse_line_next_to_a_gap_uses_one_of_its_own_four_lines() -> None:
     """With lines 1 to 3 lost, line 0 serves the first coarse line, because it is one of that line's four."""
     source = simulated()
-    whole = record(source, FULL)
-    lost = replace(whole, valid_line=~np.isin(np.arange(80), [1, 2, 3]))
+    lost = replace(record(source, FULL), valid_line=~np.isin(np.arange(80), [1, 2, 3]))
     picked = recorded_source(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4))
     assert picked.line[:2].tolist() == [0, 5]
 

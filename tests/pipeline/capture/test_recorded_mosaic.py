@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.recorded import RecordedSource, RecordedSweep
+from pipeline.capture.recorded import RecordedSweep
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.rectify.region import mosaic_rows
@@ -27,20 +27,6 @@ def _ramp() -> SimulatedSource:
     return SimulatedSource(image_scene(values, CAMERA, np.array([500.0, 700.0])), Rig(CAMERA), chosen={})
 
 
-def _captured(source: RecordedSource, sweep: Sweep) -> RecordedSweep:
-    """Return a planned sweep as captured from a recording."""
-    lines = list(source.lines(sweep))
-    return RecordedSweep(
-        sweep,
-        source.references(sweep),
-        np.array([[line.mirror_x, line.mirror_y] for line in lines]),
-        np.array([line.time_s for line in lines]),
-        np.array([line.exposure_ms for line in lines]),
-        np.array([line.valid for line in lines]),
-        lambda numbers: np.stack([lines[number].data for number in numbers]),
-    )
-
-
 def _mosaic(lines: SweepLines) -> NDArray[np.float32]:
     return np.concatenate(list(mosaic_rows([lines], CAMERA, GRID, rows=80)))
 
@@ -52,26 +38,32 @@ def test_a_coarse_pass_of_single_recorded_lines_is_not_displaced() -> None:
     """
     source = _ramp()
     recorded = recorded_source(source, [record(source, FULL)])
-    found = _mosaic(_captured(recorded, COARSE))[8:-8, 8:-8, 0]
+    lines = list(recorded.lines(COARSE))
+    captured = RecordedSweep(
+        COARSE,
+        recorded.references(COARSE),
+        np.array([[line.mirror_x, line.mirror_y] for line in lines]),
+        np.array([line.time_s for line in lines]),
+        np.array([line.exposure_ms for line in lines]),
+        np.array([line.valid for line in lines]),
+        lambda numbers: np.stack([lines[number].data for number in numbers]),
+    )
+    found = _mosaic(captured)[8:-8, 8:-8, 0]
     expected = 0.1 + 0.01 * np.arange(80)
     np.testing.assert_allclose(found, np.broadcast_to(expected[8:-8, None], found.shape), atol=1e-3)
-    live = _mosaic(SimulatedSweep(source, COARSE))[8:-8, 8:-8, 0]
-    np.testing.assert_allclose(found, live, atol=1e-3)
+    np.testing.assert_allclose(found, _mosaic(SimulatedSweep(source, COARSE))[8:-8, 8:-8, 0], atol=1e-3)
 
 
 def test_mosaics_use_recorded_positions_not_the_planned_swath() -> None:
     """A sweep with another swath and start, but the same positions, gives the same mosaic bit for bit."""
-    source = _ramp()
-    one = record(source, FULL)
-    expected = _mosaic(one)
+    one = record(_ramp(), FULL)
     other = replace(one, sweep=replace(one.sweep, swath_px=3.0, start_px=11.0))
-    np.testing.assert_array_equal(_mosaic(other), expected)
+    np.testing.assert_array_equal(_mosaic(other), _mosaic(one))
 
 
 def test_lines_beyond_a_gap_do_not_change_rows_before_it() -> None:
     """Rows before two lost lines keep their bits when the lines behind the gap are four times as bright."""
-    source = _ramp()
-    one = record(source, replace(FULL, start_px=FULL.start_px - 0.4))
+    one = record(_ramp(), replace(FULL, start_px=FULL.start_px - 0.4))
     one = replace(one, valid_line=~np.isin(np.arange(FULL.lines), (40, 41)))
 
     def other(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:

@@ -33,7 +33,8 @@ def test_a_planned_pass_is_cut_at_the_ends_of_the_recording() -> None:
 
 def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
     """A plan shifted by half a pixel has one line more than the recording and loses it. A single line stays."""
-    passes, beside = passes_over(FULL), replace(FULL, start_px=-40.0, lines=81)
+    passes = passes_over(FULL)
+    beside = replace(FULL, start_px=-40.0, lines=81)
     (found,) = passes.full_scan([beside])
     assert (found.lines, found.start_px) == (80, -39.0)
     assert passes.first_pass([beside]) == [found]
@@ -67,9 +68,8 @@ def test_recorded_lines_that_serve_several_sweeps_count_once() -> None:
 
 def test_a_missing_line_is_named() -> None:
     """Lines finer than the recorded ones and lines in a gap are refused with their number."""
-    sparse = Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never captured.*no finer than recorded"):
-        passes_over(sparse).first_pass([FULL])
+        passes_over(Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)).first_pass([FULL])
     gap = replace(FULL, lines=20), replace(FULL, name="rest", start_px=10.5, lines=30)
     with pytest.raises(NotRecordedError, match=r"line \d+ of sweep fine was never captured"):
         passes_over(*gap).fine_pass([replace(FULL, name="fine", start_px=-25.5, lines=50)])

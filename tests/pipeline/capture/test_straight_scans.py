@@ -39,7 +39,8 @@ def test_fit_recovers_a_planned_sweep(swath: int, start: int, lines: int, shape:
 
 def test_noise_and_lost_lines_do_not_move_the_fitted_sweep() -> None:
     """With 0.7 px of noise and a tenth of the lines lost, the sweep is found to a fifth of a pixel."""
-    sweep, rng = Sweep("s", "fine", "x", 320.0, -400.0, 800), np.random.default_rng(2)
+    sweep = Sweep("s", "fine", "x", 320.0, -400.0, 800)
+    rng = np.random.default_rng(2)
     position = shifted_position(line_positions(sweep, CAMERA), rng.normal(0, 0.7, (800, 2)), CAMERA)
     valid = rng.random(800) > 0.1
     position[~valid] = 0.0
@@ -87,8 +88,7 @@ def test_too_few_lines_and_a_wrong_number_of_samples_are_refused() -> None:
 
 def test_the_covered_field_of_a_full_scan_is_the_field() -> None:
     """Sweeps planned for a field cover it along the scan to 4 px, and along the line at least to its ends."""
-    grid = SceneGrid(700, 1500, 64)
-    along, sweeps, _ = cheapest_full(grid, CAMERA, CostModel(), overlap_px=0.0)
+    along, sweeps, _ = cheapest_full(SceneGrid(700, 1500, 64), CAMERA, CostModel(), overlap_px=0.0)
     tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
     found = covered_field(sweeps, tangents, CAMERA)
     scan, line = (0, 1) if along == "x" else (1, 0)
@@ -105,8 +105,7 @@ def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
     found = covered_field([sweep], [tangents], CAMERA)
     assert found.shape == (100, 640)
     np.testing.assert_allclose(found.centre_px, (59.5, 0.0), atol=1e-6)
-    turned = covered_field([replace(sweep, along="y")], [tangents], CAMERA)
-    assert turned.shape == (640, 100)
+    assert covered_field([replace(sweep, along="y")], [tangents], CAMERA).shape == (640, 100)
     beside = replace(sweep, swath_px=0.4)  # the lines turn by too little to see
     tangents = direction_to_scene(position_to_direction(line_positions(beside, CAMERA)))
     found = covered_field([sweep, beside], [np.full((4, 2), np.nan), tangents], CAMERA)  # one without a position
@@ -128,7 +127,8 @@ def test_swaths_without_a_common_part_of_the_scan_are_refused() -> None:
 @pytest.mark.parametrize("extent_px", [100.0, 5000.0, 40000.0])
 def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None:
     """Every sample lies within 0.011 px of a parallel line, and the scan keeps its length."""
-    flat, scan = flat_camera(CAMERA, extent_px), np.linspace(-extent_px, extent_px, 9)
+    flat = flat_camera(CAMERA, extent_px)
+    scan = np.linspace(-extent_px, extent_px, 9)
     tangents = direction_to_scene(position_to_direction(flat_positions(scan, flat))) / flat.ifov_rad
     np.testing.assert_allclose(tangents, np.stack([np.zeros(9), scan], axis=-1), atol=1e-6)
     along, across = points_of_scan(0.0, flat, scan[:, None], flat.pixel_slopes())

@@ -11,16 +11,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.geometry import mirror
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
-    REST_TANGENT,
-    Floats,
-    _one_minus_z,
-    _units,
-    direction_to_normal,
-    normal_to_device,
-    scene_to_direction,
-)
 from pipeline.geometry.scan import points_of_scan
 
 LineModel = Literal["L0", "L1", "L2", "L3", "L4"]
@@ -28,7 +20,7 @@ LINE_MODELS: tuple[LineModel, ...] = get_args(LineModel)
 _SMALL_SLOPE = 1e-6
 
 
-def line_rotation(direction: ArrayLike) -> Floats:
+def line_rotation(direction: ArrayLike) -> mirror.Floats:
     """Return the rotation of the slit's image in the scene tangent plane, for unit directions (..., 3) [rad].
 
     It depends on the pose and not on the path (erratum E8). For a slit along y it is psi = atan2(o_y, 1 - o_z),
@@ -38,15 +30,15 @@ def line_rotation(direction: ArrayLike) -> Floats:
 
     Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
     """
-    o = _units(direction, "view direction")
-    return np.arctan2(o[..., 1], _one_minus_z(o))
+    o = mirror._units(direction, "view direction")
+    return np.arctan2(o[..., 1], mirror._one_minus_z(o))
 
 
-def unlimited_position(normal: ArrayLike) -> Floats:
+def unlimited_position(normal: ArrayLike) -> mirror.Floats:
     """Return the exact position of normals, also beyond the rim, because the paper's formulas continue there."""
-    device = normal_to_device(normal)
+    device = mirror.normal_to_device(normal)
     c2 = 2 * device[..., 2:] ** 2 - 1
-    return 2 * device[..., 2:] * device[..., :2] / (c2 * REST_TANGENT)
+    return 2 * device[..., 2:] * device[..., :2] / (c2 * mirror.REST_TANGENT)
 
 
 def straight_slope_rotation(swath_px: ArrayLike, scan_px: ArrayLike, camera: LineCamera) -> NDArray[np.float64]:
@@ -55,10 +47,8 @@ def straight_slope_rotation(swath_px: ArrayLike, scan_px: ArrayLike, camera: Lin
     Line centres [px] broadcast; the derivative is a central difference over 2e-6 of tangent.
     """
     xi, eta = (np.asarray(value, np.float64) * camera.ifov_rad for value in (swath_px, scan_px))
-    ends = [
-        unlimited_position(direction_to_normal(scene_to_direction(np.stack(np.broadcast_arrays(xi, e), axis=-1))))
-        for e in (eta - _SMALL_SLOPE, eta + _SMALL_SLOPE)
-    ]
+    tangents = (np.stack(np.broadcast_arrays(xi, eta + way), axis=-1) for way in (-_SMALL_SLOPE, _SMALL_SLOPE))
+    ends = [unlimited_position(mirror.direction_to_normal(mirror.scene_to_direction(one))) for one in tangents]
     step = ends[1] - ends[0]
     angle: NDArray[np.float64] = -np.arctan(step[..., 1] / step[..., 0])
     return angle
@@ -85,7 +75,7 @@ def line_points(
     elif model == "L1":
         angle = straight_slope_rotation(swath_px, scan_px, camera)
     else:
-        angle = line_rotation(scene_to_direction(tangents))
+        angle = line_rotation(mirror.scene_to_direction(tangents))
     length = slopes / camera.ifov_rad * (_local_scale(swath_px, scan_px, camera) if model == "L3" else 1.0)
     return swath_px + length * np.cos(angle)[:, None], scan_px[:, None] + length * np.sin(angle)[:, None]
 

@@ -41,7 +41,8 @@ def test_frame_period_respects_the_highest_rate(exposure: float, readout: float,
 @pytest.mark.parametrize("binning", [1, 2, 3, 4, 7])
 def test_a_binned_ray_is_the_mean_of_its_samples(binning: int):
     """A binned sample looks along the mean slope of its samples. Unbinned rays are symmetric about the axis."""
-    fine, count = CAMERA.pixel_slopes(), CAMERA.samples // binning
+    fine = CAMERA.pixel_slopes()
+    count = CAMERA.samples // binning
     expected = fine[: count * binning].reshape(count, binning).mean(axis=1)
     assert CAMERA.pixel_slopes(binning) == pytest.approx(expected, abs=1e-16)
     assert fine.sum() == pytest.approx(0, abs=1e-12)
@@ -102,8 +103,7 @@ def test_sums_beyond_16_bits_are_refused():
 @pytest.mark.parametrize("step", [1, 2, 4, 8])
 def test_coarse_pass_of_an_even_scene_lowers_noise_by_the_root_of_the_step(step: float):
     """The coarse pass averages ``step`` samples of one exposure, so noise falls by sqrt(step), not by step."""
-    electrons = np.full((256, 256, 2), 5000.0)
-    seen = scan_pass(electrons, CAMERA, step=step, rng=np.random.default_rng(2))
+    seen = scan_pass(np.full((256, 256, 2), 5000.0), CAMERA, step=step, rng=np.random.default_rng(2))
     assert seen.shape == (256 // step, 256 // step, 2)
     spread = np.sqrt(5000 + 400 + 25 / 12)
     assert seen.mean() == pytest.approx(5000, abs=5 * spread / np.sqrt(seen.size * step))
@@ -115,5 +115,4 @@ def test_a_coarse_pixel_is_the_mean_of_its_fine_pixels():
     electrons = np.random.default_rng(0).uniform(100, 15_000, (16, 24, 3))
     camera = replace(CAMERA, bits=14, electrons_per_dn=1.0)
     fine, coarse = scan_pass(electrons, camera, step=1), scan_pass(electrons, camera, step=4)
-    blocks = fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3))
-    assert coarse == pytest.approx(blocks, abs=1.0)
+    assert coarse == pytest.approx(fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3)), abs=1.0)

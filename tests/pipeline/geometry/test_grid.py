@@ -16,8 +16,7 @@ sizes = st.integers(1, 200)
 @given(sizes, sizes, st.integers(1, 40))
 def test_padded_grid_is_the_smallest_whole_number_of_patches(height: int, width: int, patch: int):
     """The padded size is a multiple of the patch and less than one patch larger than the scene."""
-    padded = SceneGrid(height, width, patch).padded_shape
-    for size, scene in zip(padded, (height, width), strict=True):
+    for size, scene in zip(SceneGrid(height, width, patch).padded_shape, (height, width), strict=True):
         assert size % patch == 0
         assert 0 <= size - scene < patch
 
@@ -41,9 +40,8 @@ def test_patches_are_numbered_by_rows():
 @pytest.mark.parametrize("field", ["height", "width", "patch"])
 def test_sizes_below_one_are_refused(field: str):
     """The message names the size and its value."""
-    sizes = {"height": 4, "width": 4, "patch": 2, field: 0}
     with pytest.raises(ShapeError, match=f"{field} .* at least 1, got 0"):
-        SceneGrid(**sizes)
+        SceneGrid(**{"height": 4, "width": 4, "patch": 2, field: 0})
 
 
 @given(st.integers(2, 9), st.integers(0, 40))
@@ -57,8 +55,7 @@ def test_reflection_padding_repeats_periodically(size: int, more: int):
 @pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2)])
 def test_block_means_ignore_nan(shape: tuple[int, int]) -> None:
     """Each mean is over the finite pixels of its block, also of smaller blocks at the border; NaN without any."""
-    rng = np.random.default_rng(4)
-    values = rng.normal(size=(*shape, 2)).astype(np.float32)
+    values = np.random.default_rng(4).normal(size=(*shape, 2)).astype(np.float32)
     values[0, 0], values[: min(4, shape[0]), : min(4, shape[1]), 1] = np.nan, np.nan
     means = block_means(values, 4)
     for y in range(means.shape[0]):
@@ -76,6 +73,5 @@ def test_block_means_do_not_depend_on_holes_in_other_blocks() -> None:
     whole = block_means(values, 4)
     values[0, 0, 1], values[7, 11] = np.nan, np.inf
     torn = block_means(values, 4)
-    apart = torn != whole
-    assert set(zip(*np.nonzero(apart), strict=True)) == {(0, 0, 1), (1, 2, 0), (1, 2, 1), (1, 2, 2)}
+    assert set(zip(*np.nonzero(torn != whole), strict=True)) == {(0, 0, 1), (1, 2, 0), (1, 2, 1), (1, 2, 2)}
     assert np.isfinite(torn).all()

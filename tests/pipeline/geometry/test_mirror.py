@@ -53,13 +53,13 @@ def test_position_and_direction_are_inverse_over_the_disk(precision: type, most_
     back = direction_to_position(direction)
     assert direction.dtype == back.dtype == precision
     there, here = (position_to_direction(one.astype(np.float64) * 0.999) for one in (back, position))
-    away = there - here
-    assert np.linalg.norm(away, axis=-1).max() < most_rad
+    assert np.linalg.norm(there - here, axis=-1).max() < most_rad
 
 
 def exact_direction(position: np.ndarray) -> list[mpmath.mpf]:
     """Return one reflected ray, computed with 50 digits from the definition of the device's coordinates."""
-    half, tangent = mpmath.sqrt(mpmath.mpf(1) / 2), mpmath.tan(50 * mpmath.pi / 180)
+    half = mpmath.sqrt(mpmath.mpf(1) / 2)
+    tangent = mpmath.tan(50 * mpmath.pi / 180)
     axes = mpmath.matrix([[-half, 0, -half], [0, 1, 0], [half, 0, -half]])
     ray = mpmath.matrix([[float(position[0]) * tangent, float(position[1]) * tangent, mpmath.mpf(1)]])
     normal = (ray / mpmath.norm(ray) + mpmath.matrix([[0, 0, 1]])) * axes
@@ -81,7 +81,8 @@ def test_directions_agree_with_fifty_digits(precision: type, most: float):
 def test_single_precision_is_kept_and_mixed_precision_becomes_double():
     """Functions return float32 for float32 arrays and Python numbers, and float64 if any array is float64."""
     f = np.float32
-    position, tangent = disk(5).astype(f) / 2, np.array([0.1, 0.2], f)
+    position = disk(5).astype(f) / 2
+    tangent = np.array([0.1, 0.2], f)
     direction = position_to_direction(position)
     ones = [position_to_normal(position), direction, direction_to_position(direction), line_rotation(direction)]
     ones += [scene_to_direction(tangent), direction_to_scene(direction), mirror_throughput(position)]
@@ -123,7 +124,8 @@ def test_throughput_depends_on_the_tilt():
     """The throughput is 0.72 to 1.21 over 10240 x 10240 px, 0.48 to 1.33 over the disk, and exactly 1 at rest."""
     side = np.linspace(-5120, 5120, 201) * 105.714e-6
     normals = direction_to_normal(scene_to_direction(np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)))
-    field, turn = -normals[:, 2] * np.sqrt(2), np.linspace(0, 2 * np.pi, 721)
+    field = -normals[:, 2] * np.sqrt(2)
+    turn = np.linspace(0, 2 * np.pi, 721)
     rim = mirror_throughput(np.stack([np.cos(turn), np.sin(turn)], axis=-1))
     assert (field.min(), field.max()) == pytest.approx((0.72, 1.21), abs=0.006)
     assert (rim.min(), rim.max()) == pytest.approx((0.48, 1.33), abs=0.005)
@@ -150,8 +152,7 @@ def test_to_model_inverts_to_device(axes: str, clocking: float, offset: float, r
 def test_mounting_swaps_axes_as_set():
     """With "y,-x" X is Y and Y is -X, as in published code. The default changes no bit, not even the sign of 0."""
     many = np.array([[0.3, 0.1], [-0.2, 0.5], [-0.0, 0.0]])
-    swapped = np.array([[0.1, -0.3], [0.5, 0.2], [0.0, 0.0]])
-    assert Mounting(axes="y,-x").to_device(many) == pytest.approx(swapped)
+    assert Mounting(axes="y,-x").to_device(many) == pytest.approx(np.array([[0.1, -0.3], [0.5, 0.2], [0.0, 0.0]]))
     assert Mounting().to_device(many).tobytes() == Mounting().to_model(many).tobytes() == many.tobytes()
 
 

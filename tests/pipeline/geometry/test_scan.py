@@ -39,7 +39,8 @@ def sweep(**changes: object) -> Sweep:
 @pytest.mark.parametrize(("swath", "start"), [(0.0, -1200.0), (2500.0, -4000.0), (-4500.0, 3500.0)])
 def test_sample_points_equal_rays_reflected_by_the_mirror(swath: float, start: float):
     """The formula of a line's points agrees with position, normal and reflection to 1e-9 px."""
-    path, slopes = sweep(swath_px=swath, start_px=start, lines=40), CAMERA.pixel_slopes()
+    path = sweep(swath_px=swath, start_px=start, lines=40)
+    slopes = CAMERA.pixel_slopes()
     rays = np.stack([np.zeros_like(slopes), slopes, np.ones_like(slopes)], axis=-1)
     normals = position_to_normal(line_positions(path, CAMERA))
     seen = direction_to_scene(reflect(rays[None], normals[:, None])) / CAMERA.ifov_rad
@@ -84,7 +85,8 @@ def test_sweeps_beyond_the_rim_are_refused():
 
 def test_survey_seconds_count_lines_setups_and_reloads():
     """Two sweeps of 1000 coarse lines hold 8000 positions, which need six reloads."""
-    cost, path = CostModel(), sweep(lines=1000, step=4)
+    cost = CostModel()
+    path = sweep(lines=1000, step=4)
     assert cost.setup_seconds(LineCamera(readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
     assert cost.seconds([path, path], CAMERA) == pytest.approx(200 + 2 * 0.45 + 6 * 1.6)
     assert cost.seconds([], CAMERA) == 0
@@ -92,7 +94,8 @@ def test_survey_seconds_count_lines_setups_and_reloads():
 
 def test_sweeps_of_other_exposures_cost_their_own_frames():
     """Lines and settling count by each sweep's exposure, or else by the camera's. Reloads count once for all sweeps."""
-    cost, slow, fast = CostModel(), sweep(lines=100), replace(sweep(lines=400), exposure_ms=10.0)
+    cost = CostModel()
+    slow, fast = sweep(lines=100), replace(sweep(lines=400), exposure_ms=10.0)
     assert exposing(CAMERA, slow) is CAMERA
     assert exposing(CAMERA, fast) == replace(CAMERA, exposure_ms=10.0)
     assert cost.seconds([slow, fast], CAMERA) == pytest.approx(10 + 0.45 + 4 + 0.27 + 1.6)
@@ -129,8 +132,7 @@ def test_loads_hold_every_line_once_in_order(given_sweeps: list[Sweep], capacity
 @given(sweeps, st.integers(9, 60))
 def test_loads_are_full(given_sweeps: list[Sweep], capacity: int):
     """No load but the last has room for the next line."""
-    loads = memory_loads(given_sweeps, capacity)
-    for load, after in pairwise(loads):
+    for load, after in pairwise(memory_loads(given_sweeps, capacity)):
         assert load.pairs + given_sweeps[after.parts[0].sweep].step > capacity
 
 

@@ -49,8 +49,7 @@ def test_areas_of_a_georeferenced_image_are_on_the_ellipsoid() -> None:
 def test_numbers_out_of_range_are_left_out_and_an_unknown_scale_gives_none() -> None:
     """Numbers below 0 and from the count on are ignored. Without a pixel size the result is None."""
     numbers = np.array([[-1, 0, 0], [1, 2, 7]])
-    found = areas_by_number(NoPlace((2, 3), pixel_m=0.5), numbers, 2)
-    assert found.tolist() == [0.5, 0.25]
+    assert areas_by_number(NoPlace((2, 3), pixel_m=0.5), numbers, 2).tolist() == [0.5, 0.25]
     assert areas_by_number(NoPlace((2, 3)), numbers, 2) is None
 
 
@@ -82,7 +81,8 @@ def test_range_is_the_length_of_the_oblique_ray():
 @given(tilt=st.floats(15, 90), heading=st.floats(-360, 360), roll=st.floats(-20, 20))
 def test_footprint_area_is_the_sum_of_the_pixel_areas(tilt: float, heading: float, roll: float):
     """The sum of pixel areas and the area within the corners agree for any tilt, heading and roll."""
-    view, shape = looking(tilt, heading_deg=heading, roll_deg=roll), (60, 90)
+    view = looking(tilt, heading_deg=heading, roll_deg=roll)
+    shape = (60, 90)
     places = np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)
     found = footprint_of(view, shape)
     assert found.area_m2 == pytest.approx(float(view.area_m2(places).sum()), rel=1e-4)

@@ -39,8 +39,7 @@ def test_areas_are_on_the_ellipsoid(epsg: int, step: float) -> None:
     a, b, c, d, e, f = geobox.affine[:6]
     to_degrees = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True)
     places = to_degrees.transform(a * column + b * row + c, d * column + e * row + f)
-    ellipsoid = pyproj.CRS.from_epsg(epsg).get_geod()
-    outline = abs(ellipsoid.polygon_area_perimeter(*places)[0])
+    outline = abs(pyproj.CRS.from_epsg(epsg).get_geod().polygon_area_perimeter(*places)[0])
     assert np.sum(list(pixel_rows_m2(geobox))) == pytest.approx(outline, rel=1e-5)
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
 
@@ -72,8 +71,7 @@ def test_patches_contain_every_pixel_once(height: int, width: int, patch: int, s
     image = np.random.default_rng(seed).random((height, width)) < 0.5
     patch_index = patch_pixels(grid, image)
     assert patch_index.sum() == image.sum()
-    numbers = np.arange(len(patch_index))
-    for (y, x), patch_number in zip(grid.patch_origin(numbers), patch_index, strict=True):
+    for (y, x), patch_number in zip(grid.patch_origin(np.arange(len(patch_index))), patch_index, strict=True):
         part = image[y : y + patch, x : x + patch]
         np.testing.assert_array_equal(patch_number[: part.shape[0], : part.shape[1]], part)
 

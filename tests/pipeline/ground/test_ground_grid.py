@@ -42,9 +42,9 @@ def test_map_covers_every_pixel_of_the_field(pose: dict[str, float]):
 @pytest.mark.parametrize("pose", [{}, {"tilt_deg": 90.0}, {"slope_deg": 10.0, "aspect_deg": 120.0}, {"lat_deg": 85.0}])
 def test_mapped_area_is_the_sum_of_pixel_footprints(pose: dict[str, float]):
     """The map pixels of the field, times the ground area of each, equal the sum of exact areas to 0.2 %."""
-    shape = (300, 260)
-    grid = map_grid.ground_grid(view(**pose), shape)
-    rig, areal_scale = grid.frame.view.pose, Proj(grid.frame.crs).get_factors
+    grid = map_grid.ground_grid(view(**pose), (300, 260))
+    rig = grid.frame.view.pose
+    areal_scale = Proj(grid.frame.crs).get_factors
     pixel_m2 = grid.geobox.resolution.x**2 / areal_scale(rig.lon_deg, rig.lat_deg).areal_scale
     exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))
     assert np.isfinite(whole(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=2e-3)
@@ -69,16 +69,14 @@ def test_places_interpolated_between_tie_points_are_exact(pose: dict[str, float]
     x, y = (np.arange(part.start, part.stop) + 0.5 for part in (columns, rows))
     affine = grid.geobox.affine
     exact = grid.frame.map_to_ground(np.stack(np.meshgrid(affine.c + affine.a * x, affine.f + affine.e * y), axis=-1))
-    worst = np.abs(grid.ground_m(rows, columns) - exact).max() / step
-    assert worst < bound
+    assert np.abs(grid.ground_m(rows, columns) - exact).max() / step < bound
 
 
 def test_resolution_is_the_rounded_median_footprint():
     """The default differs from the median footprint by a ratio below 1.16. A given resolution is kept."""
     rig = view()
-    median = map_grid.median_footprint_m(rig, (200, 200))
     step = map_grid.ground_grid(rig, (200, 200)).geobox.resolution.x
-    assert abs(np.log(step / median)) < np.log(1.16)
+    assert abs(np.log(step / map_grid.median_footprint_m(rig, (200, 200)))) < np.log(1.16)
     assert step == map_grid.round_step(step) == float(f"{step:.1e}")
     assert map_grid.ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
 
@@ -135,8 +133,7 @@ def test_images_are_interpolated_between_pixels():
     """A ramp is read exactly; beyond the outer centres the outer pixels count. NaN does not change its neighbours."""
     y, x = (np.arange(size) for size in (5, 6))
     ramp = (y[:, None] * 2 + x).astype(np.float32)[..., None]
-    places = np.array([[[0.75, 1.5], [4.4, 2.0], [np.nan, np.nan]]])
-    found = map_grid.image_at(ramp, places)[0, :, 0]
+    found = map_grid.image_at(ramp, np.array([[[0.75, 1.5], [4.4, 2.0], [np.nan, np.nan]]]))[0, :, 0]
     assert found[:2] == pytest.approx([3.0, 10.0], abs=1e-5)
     assert np.isnan(found[2])
     ramp[0, 0] = np.nan

@@ -75,8 +75,10 @@ def test_a_polygon_below_a_pixel_is_touched_but_not_inside() -> None:
 @pytest.mark.parametrize("crs", [32632, 4326, 3857, 3035, 31466])
 def test_polygons_return_from_the_map_unchanged(crs: int) -> None:
     """A polygon in pixels, projected to the ground and to another CRS, returns to its pixels."""
-    place, drawn = posed(), shapely.segmentize(shapely.Polygon([(5, 5), (70, 8), (60, 50), (9, 44)]), 1)
-    frame, middle = place.grid.frame, np.array([SHAPE[1], SHAPE[0]]) / 2
+    place = posed()
+    drawn = shapely.segmentize(shapely.Polygon([(5, 5), (70, 8), (60, 50), (9, 44)]), 1)
+    frame = place.grid.frame
+    middle = np.array([SHAPE[1], SHAPE[0]]) / 2
     on_map = shapely.transform(
         drawn, lambda at: frame.ground_to_map(place.view.scene_to_ground((at - middle)[:, ::-1]))
     )
@@ -94,8 +96,7 @@ def test_a_polygon_across_the_antimeridian_stays_whole(lon_deg: float) -> None:
     parts = shapely.union(shapely.box(179.99, -17.01, 180, -16.99), shapely.box(-180, -17.01, -179.99, -16.99))
     for shape in (whole, parts):
         assert pixels_inside([on_field(shape, pyproj.CRS.from_epsg(4326), place)], SHAPE).all()
-    elsewhere = shapely.box(-179.9, -17.01, -179.8, -16.99)
-    assert on_field(elsewhere, pyproj.CRS.from_epsg(4326), place).is_empty
+    assert on_field(shapely.box(-179.9, -17.01, -179.8, -16.99), pyproj.CRS.from_epsg(4326), place).is_empty
 
 
 def test_ground_behind_the_rig_has_no_pixels() -> None:
@@ -107,16 +108,14 @@ def test_ground_behind_the_rig_has_no_pixels() -> None:
     assert 0.1 < found.mean() < 0.9
     assert found[-1].all()
     assert not found[0].any()
-    behind = shapely.Point(foot - [0, 60]).buffer(20)
-    assert on_field(behind, place.crs, place).is_empty
+    assert on_field(shapely.Point(foot - [0, 60]).buffer(20), place.crs, place).is_empty
 
 
 @pytest.mark.parametrize("turn", [0.0, 30.0])
 def test_a_georeferenced_image_maps_polygons_by_its_transform(turn: float) -> None:
     """Rows and columns follow the GeoBox, also if it is turned. Pixel areas are the product of its sides."""
-    place = PlacedPicture(
-        GeoBox(SHAPE, Affine.translation(4e5, 5.7e6) @ Affine.rotation(turn) @ Affine.scale(0.5, -0.5), 32632)
-    )
+    affine = Affine.translation(4e5, 5.7e6) @ Affine.rotation(turn) @ Affine.scale(0.5, -0.5)
+    place = PlacedPicture(GeoBox(SHAPE, affine, 32632))
     field = shapely.Polygon([place.geobox.affine @ at for at in ((10, 20), (30, 20), (30, 50), (10, 50))])
     found = pixels_inside([on_field(field, place.crs, place)], SHAPE)
     assert found[20:50, 10:30].all()
@@ -137,11 +136,13 @@ def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
 @given(polygons, polygons)
 def test_patches_in_a_no_go_zone_count_nothing(area: Any, no_go: Any) -> None:
     """A touched patch counts 0, any other by its pixels inside of the area."""
-    grid, barred = SceneGrid(*SHAPE, 8), pixels_inside([no_go], SHAPE, touched=True)
+    grid = SceneGrid(*SHAPE, 8)
+    barred = pixels_inside([no_go], SHAPE, touched=True)
     found = field_zones(pixels_inside([area], SHAPE), barred)
     if found is None:
         return
-    fractions, shown = found.patch_fractions(grid), found.shown_patches(grid)
+    fractions = found.patch_fractions(grid)
+    shown = found.shown_patches(grid)
     for patch_number in grid.every_patch():
         y, x = grid.patch_origin(patch_number)
         kept, stopped = (mask[y : y + 8, x : x + 8] for mask in (found.kept, barred))
@@ -160,12 +161,11 @@ def test_zones_that_exclude_nothing_are_none() -> None:
 
 def test_plot_confidence_is_the_mean_of_known_pixels() -> None:
     """Pixels of 0.5, 0.7 and 0.9 and an unknown one have the mean of the three. Without a known pixel it is None."""
-    classes, confidence = np.array([[0, 0], [0, 1]], np.uint8), np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
-    plots = {"all": shapely.box(0, 0, 2, 2), "unknown": shapely.box(1, 1, 2, 2)}
-    whole, unknown = (
-        figures_of_plot(name, shape, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
-        for name, shape in plots.items()
-    )
+    classes = np.array([[0, 0], [0, 1]], np.uint8)
+    confidence = np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
+    values = (NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
+    whole = figures_of_plot("all", shapely.box(0, 0, 2, 2), *values)
+    unknown = figures_of_plot("unknown", shapely.box(1, 1, 2, 2), *values)
     assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
     assert (whole.fractions["unknown"], unknown.fractions["unknown"], unknown.confidence) == (0.25, 1.0, None)
 

@@ -18,7 +18,8 @@ from pipeline.geometry.mirror import direction_to_scene, position_to_normal, ref
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
 from pipeline.planning.coverage import cheapest_full, full_sweeps, on_scene, reach_px, uniform_sweeps, with_margin
 
-CAMERA, COST = LineCamera(), CostModel()
+CAMERA = LineCamera()
+COST = CostModel()
 
 
 def unseen(sweeps: list[Sweep], grid: SceneGrid) -> int:
@@ -47,8 +48,7 @@ def test_full_scan_sees_every_pixel(height: int, width: int, along: str):
 @pytest.mark.parametrize(("size", "swaths"), [(1, 1), (640, 1), (641, 2), (1280, 2), (1281, 3), (1920, 3)])
 def test_swaths_are_the_fewest_that_cover_the_field(size: int, swaths: int):
     """A line of 640 samples covers 640 px, and slightly more away from the axis. Swaths lie symmetrically."""
-    grid = SceneGrid(200, size, 16)
-    sweeps = full_sweeps(grid, CAMERA, "x")
+    sweeps = full_sweeps(SceneGrid(200, size, 16), CAMERA, "x")
     assert len(sweeps) == swaths
     assert [sweep.swath_px for sweep in sweeps] == pytest.approx([-sweep.swath_px for sweep in sweeps[::-1]], abs=1e-6)
 
@@ -73,9 +73,8 @@ def test_known_fields_need_their_known_lines():
 
 def test_fields_beyond_the_mirror_range_are_refused():
     """The error names the sweep, the mirror's range and the remedy."""
-    grid = SceneGrid(23_000, 640, 32)
     with pytest.raises(PoseError, match=r"sweep full-0 .* beyond the mirror's range.*smaller scene"):
-        full_sweeps(grid, CAMERA, "x")
+        full_sweeps(SceneGrid(23_000, 640, 32), CAMERA, "x")
     with pytest.raises(PoseError, match="beyond the mirror's range"):
         cheapest_full(SceneGrid(24_000, 24_000, 32), CAMERA, COST)
     for shape in ((1024, 1280), (4000, 64)):  # neither several swaths nor a single line of such a lens reach them

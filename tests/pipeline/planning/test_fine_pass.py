@@ -16,7 +16,9 @@ from pipeline.planning.coverage import full_sweeps, patches_shown
 from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance
 
-CAMERA, COST, GRID = LineCamera(samples=320), CostModel(), SceneGrid(256, 600, 16)
+CAMERA = LineCamera(samples=320)
+COST = CostModel()
+GRID = SceneGrid(256, 600, 16)
 FULL = full_sweeps(GRID, CAMERA, "x")
 FULL_S = COST.seconds(FULL, CAMERA)
 RECORD = ScanPerformance((1, 2, 4), (5.0, 100.0), {MIOU: np.array([[0.9, 0.95], [0.85, 0.92], [0.7, 0.8]])}, 3)
@@ -46,7 +48,8 @@ def test_a_plan_ends_in_time_and_captures_its_patches(
     fraction: float, seed: int, step: int, margin_px: float, exposure_ms: float | None
 ) -> None:
     """Its seconds are those of the cost model, its gain is that of the captured patches, and names are unique."""
-    gain, planner = drawn(seed), second_pass(fraction * FULL_S, margin_px=margin_px)
+    gain = drawn(seed)
+    planner = second_pass(fraction * FULL_S, margin_px=margin_px)
     plan = planner.plan(gain, step=step, exposure_ms=exposure_ms)
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA) <= fraction * FULL_S
     assert plan.expected_gain == pytest.approx(gain[plan.patch_index].sum())
@@ -70,16 +73,16 @@ def test_no_line_is_captured_twice(fraction: float, seed: int) -> None:
         patches = np.flatnonzero(rows.row == number * rows.first.shape[1] + place)
         if np.isin(patches, plan.patch_index).all():
             swath = planner.swaths[number]
-            found = {at for swath_px, at in lines if swath_px == swath.swath_px}
             wanted = swath.start_px + np.arange(rows.first[number, place], rows.stop[number, place])
-            assert set(wanted.tolist()) <= found
+            assert set(wanted.tolist()) <= {at for swath_px, at in lines if swath_px == swath.swath_px}
 
 
 def test_distant_rows_of_a_swath_become_separate_runs() -> None:
     """Two distant rows of one swath become two runs, because the lines between them take longer than a set-up."""
-    planner, gain = second_pass(0.5 * FULL_S), np.zeros(int(np.prod(GRID.patch_shape)))
-    rows, count = planner.rows.row, planner.rows.first.shape[1]
-    gain[np.isin(rows, [1, count - 2])] = 1.0
+    planner = second_pass(0.5 * FULL_S)
+    gain = np.zeros(int(np.prod(GRID.patch_shape)))
+    count = planner.rows.first.shape[1]
+    gain[np.isin(planner.rows.row, [1, count - 2])] = 1.0
     plan = planner.plan(gain)
     assert np.flatnonzero(gain).tolist() == plan.patch_index.tolist()
     assert len({sweep.name.rpartition("-")[0] for sweep in plan.sweeps}) == 2
@@ -115,8 +118,7 @@ def test_a_pointing_margin_extends_a_run_at_both_ends() -> None:
 
 def test_a_recording_limits_the_sweeps_of_a_plan() -> None:
     """The plan's seconds are those of the recorded lines."""
-    planner = replace(second_pass(FULL_S), recorded=lambda sweeps: sweeps[:1])
-    plan = planner.plan(drawn(1))
+    plan = replace(second_pass(FULL_S), recorded=lambda sweeps: sweeps[:1]).plan(drawn(1))
     assert len(plan.sweeps) == 1
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA)
 

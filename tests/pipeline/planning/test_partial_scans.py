@@ -23,7 +23,9 @@ from pipeline.planning.partial_scans import (
     sweeps_of_runs,
 )
 
-GRID, CAMERA, COST = SceneGrid(320, 416, 16), LineCamera(samples=160), CostModel()
+GRID = SceneGrid(320, 416, 16)
+CAMERA = LineCamera(samples=160)
+COST = CostModel()
 WIDER = LineCamera(samples=240)
 EXPOSURE_MS = 5.0
 
@@ -46,16 +48,10 @@ def _patchy(rng: np.random.Generator) -> np.ndarray:
     return np.asarray(expected_gain.ravel())
 
 
-def partial_scan(
-    expected_gain: np.ndarray,
-    seconds: float,
-    rows: PatchRows = ROWS,
-    camera: LineCamera = CAMERA,
-    cost: CostModel = COST,
-) -> PartialScan | None:
+def partial_scan(expected_gain: np.ndarray, seconds: float) -> PartialScan | None:
     """Return the runs of a partial scan in a number of seconds, at most one for each sweep."""
-    times = RunTimes.of_scan(rows.sweeps, camera, cost, EXPOSURE_MS)
-    return choose_runs(rows, expected_gain, times, seconds=seconds)
+    times = RunTimes.of_scan(ROWS.sweeps, CAMERA, COST, EXPOSURE_MS)
+    return choose_runs(ROWS, expected_gain, times, seconds=seconds)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
@@ -73,7 +69,8 @@ def test_the_lines_of_a_row_show_its_patches(along: Axis, step: int) -> None:
 @given(worths, st.floats(0.02, 1.2))
 def test_chosen_runs_have_the_highest_gain_of_their_length(expected_gain: np.ndarray, fraction: float) -> None:
     """No run of the same sweep with at most as many lines has a higher gain."""
-    scan_pass, sums = partial_scan(expected_gain, fraction * WHOLE_S), ROWS.sums(expected_gain)
+    scan_pass = partial_scan(expected_gain, fraction * WHOLE_S)
+    sums = ROWS.sums(expected_gain)
     for number, first, stop in () if scan_pass is None else scan_pass.runs:
         firsts, stops, values = ROWS.first[number], ROWS.stop[number], sums[number]
         taken = values[(firsts >= first) & (stops <= stop)].sum()
@@ -104,11 +101,13 @@ def test_runs_of_two_swaths_reach_98_percent_of_the_best_gain(seed: int, fractio
     rows = PatchRows.of(uniform_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
     assert len(rows.sweeps) == 2
     given_s = fraction * cost.seconds(list(rows.sweeps), WIDER)
-    scan_pass = partial_scan(expected_gain, given_s, rows, WIDER, cost)
+    times = RunTimes.of_scan(rows.sweeps, WIDER, cost, EXPOSURE_MS)
+    scan_pass = choose_runs(rows, expected_gain, times, seconds=given_s)
     assert scan_pass is not None
-    sums, setup_s = rows.sums(expected_gain), cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
-    line_s, options = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3, []
-    for values, first, stop in zip(sums, rows.first, rows.stop, strict=True):
+    setup_s = cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
+    line_s = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3
+    options = []
+    for values, first, stop in zip(rows.sums(expected_gain), rows.first, rows.stop, strict=True):
         pairs = [(begin, end - 1) for begin, end in combinations(range(len(values) + 1), 2)]
         runs = [(setup_s + line_s * (stop[end] - first[begin]), values[begin : end + 1].sum()) for begin, end in pairs]
         options.append(np.array([(0.0, 0.0), *runs]))
@@ -119,25 +118,23 @@ def test_runs_of_two_swaths_reach_98_percent_of_the_best_gain(seed: int, fractio
 
 def test_a_swath_whose_gain_does_not_justify_its_set_up_is_left_out() -> None:
     """With time for two rows of two swaths, exactly these rows are captured."""
-    expected_gain, count = np.full(int(np.prod(GRID.patch_shape)), 1e-6), ROWS.first.shape[1]
+    expected_gain = np.full(int(np.prod(GRID.patch_shape)), 1e-6)
     for number in (0, 2):
-        expected_gain[ROWS.row == number * count + 5] = 1.0
+        expected_gain[ROWS.row == number * ROWS.first.shape[1] + 5] = 1.0
     wanted = tuple((number, int(ROWS.first[number, 5]), int(ROWS.stop[number, 5])) for number in (0, 2))
     seconds = COST.seconds(sweeps_of_runs(ROWS.sweeps, wanted), CAMERA) + 0.01
-    found = partial_scan(expected_gain, seconds)
-    assert found.runs == wanted
+    assert partial_scan(expected_gain, seconds).runs == wanted
 
 
 def test_lines_shared_by_two_rows_are_paid_once() -> None:
     """Neighbours of two chosen rows cost fewer lines than a distant row of higher gain."""
-    expected_gain, count = np.zeros(int(np.prod(GRID.patch_shape))), ROWS.first.shape[1]
+    expected_gain = np.zeros(int(np.prod(GRID.patch_shape)))
     for place, gain in ((2, 1.0), (3, 0.5), (9, 0.6), (15, 1.0), (16, 0.5)):
         expected_gain[np.flatnonzero(place == ROWS.row)[0]] = gain
-    assert count > 16
+    assert ROWS.first.shape[1] > 16
     wanted = tuple((0, int(ROWS.first[0, one]), int(ROWS.stop[0, one + 1])) for one in (2, 15))
     times = RunTimes(1.0, 0.0, lambda runs: float(sum(stop - first for _, first, stop in runs)))
-    found = choose_runs(ROWS, expected_gain, times, seconds=times.seconds(wanted), several=True)
-    assert found.runs == wanted
+    assert choose_runs(ROWS, expected_gain, times, seconds=times.seconds(wanted), several=True).runs == wanted
 
 
 def test_rows_of_equal_gain_are_captured_until_time_ends() -> None:
@@ -154,7 +151,8 @@ def test_rows_of_equal_gain_are_captured_until_time_ends() -> None:
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_a_patch_in_two_swaths_belongs_to_the_nearer_one(along: Axis) -> None:
     """The distance is that from the patch's centre to the middle of the lines."""
-    rows, patch_index = rows_of(along), GRID.every_patch()
+    rows = rows_of(along)
+    patch_index = GRID.every_patch()
     middle = GRID.patch_origin(patch_index) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2
     across = middle[:, "yx".index(along)]
     off = np.abs(across[:, None] - np.array([sweep.swath_px for sweep in rows.sweeps]))
@@ -188,8 +186,7 @@ def test_partial_scans_end_in_time_and_gain_only_shown_patches(expected_gain: np
 @given(worths)
 def test_more_seconds_never_reduce_the_gain(expected_gain: np.ndarray) -> None:
     """The seconds of the whole scan reach the whole gain."""
-    fractions = (0.3, 0.5, 0.7, 0.9, 1.0)
-    scan_passes = [partial_scan(expected_gain, one * WHOLE_S) for one in fractions]
+    scan_passes = [partial_scan(expected_gain, one * WHOLE_S) for one in (0.3, 0.5, 0.7, 0.9, 1.0)]
     found = [0.0 if scan_pass is None else scan_pass.expected_gain for scan_pass in scan_passes]
     assert found == sorted(found)
     assert found[-1] == pytest.approx(ROWS.sums(expected_gain).sum())

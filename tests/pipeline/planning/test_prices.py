@@ -11,7 +11,8 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning import coverage
 
-CAMERA, COST = LineCamera(), CostModel()
+CAMERA = LineCamera()
+COST = CostModel()
 
 
 def test_saving_entries_have_a_ratio_unless_full_is_zero():

@@ -27,7 +27,9 @@ from pipeline.planning.uniform_scans import (
     uniform_scans,
 )
 
-CAMERA, COST, GRID = LineCamera(), CostModel(), SceneGrid(256, 320, 16)
+CAMERA = LineCamera()
+COST = CostModel()
+GRID = SceneGrid(256, 320, 16)
 SWEEPS = {step: uniform_sweeps(GRID, CAMERA, "x", step=step) for step in (1, 2, 4)}
 CONTENT = {
     "scenes": 3,
@@ -47,8 +49,7 @@ def test_lines_of_a_uniform_scan_are_unbinned_and_cover_the_field() -> None:
     assert [replace(one, name="", kind="fine") for one in SWEEPS[1]] == [replace(one, name="") for one in full]
     for step, sweeps in SWEEPS.items():
         assert {(one.binning, one.step, one.kind) for one in sweeps} == {(1, step, "coarse")}
-        seen = sum(int(on_scene((256, 320), CAMERA, one).sum()) for one in sweeps)
-        assert seen == 256 * 320 / step
+        assert sum(int(on_scene((256, 320), CAMERA, one).sum()) for one in sweeps) == 256 * 320 / step
 
 
 def test_a_record_interpolates_scores_by_the_logarithm_of_exposure() -> None:
@@ -82,8 +83,7 @@ def test_a_scan_has_the_longest_exposure_that_ends_in_time(seconds: float) -> No
     for step in (1, 2, 4):
         within = [scan.exposure_ms for scan in offered if scan.step == step and scan.seconds <= seconds]
         if within and max(within) < 100:
-            longer = priced_scan(RECORD, SWEEPS[step], CAMERA, COST, 270, max(within) + 0.1)
-            assert longer.seconds > seconds
+            assert priced_scan(RECORD, SWEEPS[step], CAMERA, COST, 270, max(within) + 0.1).seconds > seconds
     if seconds < CHEAPEST:
         with pytest.raises(BudgetError, match=r"--seconds .*the least is \S+ s") as refused:
             choose_scan(offered, seconds)
@@ -116,8 +116,7 @@ def test_camera_limits_exposures_and_frame_rate() -> None:
     assert uniform_scans(RECORD, SWEEPS, replace(CAMERA, exposure_ms=5.0), COST, 270) == []
     slow = replace(CAMERA, max_rate_hz=20.0)  # frames of 50 ms at least
     scans = uniform_scans(RECORD, SWEEPS, slow, COST, 270)
-    fastest = min(scan.seconds for scan in scans if scan.step == 1)
-    assert choose_scan(scans, fastest).exposure_ms > 45
+    assert choose_scan(scans, min(scan.seconds for scan in scans if scan.step == 1)).exposure_ms > 45
 
 
 @pytest.mark.parametrize("goals", [{MIOU: 0.85}, {"weed": 0.55}, {MIOU: 0.9, "weed": 0.7}])

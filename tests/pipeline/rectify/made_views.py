@@ -38,7 +38,8 @@ def row_views(seed: int, shape: tuple[int, int], shift: Floats, snr: float, gaps
             stop = start + int(rng.integers(5, 40))
             row[start:stop] = rng.random() >= gaps
             start = stop
-    stand, first = gaussian_filter1d(stand, 1.2, axis=1), rng.uniform(0, ROW_PX)
+    stand = gaussian_filter1d(stand, 1.2, axis=1)
+    first = rng.uniform(0, ROW_PX)
 
     def view(dy: float, dx: float) -> Floats:
         along, across = np.arange(shape[0]) + dy + 60, np.arange(shape[1]) + dx + 60 - first

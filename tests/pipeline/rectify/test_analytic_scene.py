@@ -59,7 +59,8 @@ class Waves:
 def waves(shape: tuple[int, int], period_px: tuple[float, float], slope: float, count: int = 12) -> Waves:
     """Return waves of evenly spread periods and heights of period ** slope (1 is the spectrum of natural scenes)."""
     rng = np.random.default_rng(7)
-    period, angle = np.linspace(*period_px, count), rng.uniform(0, np.pi, count)
+    period = np.linspace(*period_px, count)
+    angle = rng.uniform(0, np.pi, count)
     frequency = np.stack([np.sin(angle), np.cos(angle)], axis=1) / period[:, None]
     height = period**slope / (period**slope).sum() * 0.4
     return Waves(shape, frequency, rng.uniform(0, 2 * np.pi, count), height)

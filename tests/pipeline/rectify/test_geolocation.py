@@ -54,9 +54,8 @@ def test_points_outside_of_the_sweep_are_nan() -> None:
 def test_geolocated_points_lie_on_their_rays(swath: float, seed: int) -> None:
     """In a field wider than the mirror's disk, the ray of every found line and sample passes its point."""
     scan = np.linspace(-5000, 4500, 300)
-    position = aim(swath, scan)
     points = np.random.default_rng(seed).uniform(-20_000, 20_000, (20_000, 2))
-    found = geolocation(position, CAMERA, points, along="x")
+    found = geolocation(aim(swath, scan), CAMERA, points, along="x")
     hit = np.isfinite(found[:, 0])
     centre = np.interp(found[hit, 0], np.arange(300), scan)
     inner = (found[hit, 0] >= 0) & (found[hit, 0] <= 299)
@@ -148,8 +147,7 @@ def test_lost_lines_are_nan_in_the_geolocation_grid() -> None:
     scan_path = scan_path_of(2600.0, LINES[(LINES < 40) | (LINES > 44)])
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
     assert table.spacing == 16
-    differs = np.isnan(table.coordinates(*EVERYTHING)) != np.isnan(exact(scan_path))
-    assert differs.mean() < 1e-4
+    assert (np.isnan(table.coordinates(*EVERYTHING)) != np.isnan(exact(scan_path))).mean() < 1e-4
 
 
 def test_a_scan_path_smaller_than_a_cell_is_found() -> None:

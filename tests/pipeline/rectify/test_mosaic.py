@@ -66,7 +66,8 @@ def test_a_band_missing_in_one_sweep_is_taken_from_the_other() -> None:
     """If one sweep lacks a band (a dead pixel), the other alone counts in it. If both do, it stays NaN."""
     one, other = np.ones((1, 3), np.float32), np.full((1, 3), 3, np.float32)
     one[0, 1:], other[0, 2] = np.nan, np.nan
-    full, edge = np.ones(1, np.float32), np.array([20.0])
+    full = np.ones(1, np.float32)
+    edge = np.array([20.0])
     values, coverage = mosaic([MosaicPart(one, full, edge), MosaicPart(other, full, edge)])
     np.testing.assert_array_equal(values[0], [2, 3, np.nan])
     assert coverage.tolist() == [2]
@@ -74,7 +75,8 @@ def test_a_band_missing_in_one_sweep_is_taken_from_the_other() -> None:
 
 def test_a_single_point_is_blended_as_among_many() -> None:
     """One point of one band in 12 sweeps, some without a value, has the same bits as in a block of 40 points."""
-    rng, full = np.random.default_rng(5), np.ones(40, np.float32)
+    rng = np.random.default_rng(5)
+    full = np.ones(40, np.float32)
     parts = [
         MosaicPart(
             np.where(rng.random((40, 1)) < 0.3, np.nan, rng.random((40, 1))).astype(np.float32),
@@ -83,12 +85,11 @@ def test_a_single_point_is_blended_as_among_many() -> None:
         )
         for _ in range(12)
     ]
-    whole = mosaic(parts)[0]
     alone = [
         mosaic([MosaicPart(one.values[[at]], one.weight[[at]], one.edge_px[[at]]) for one in parts])[0]
         for at in range(40)
     ]
-    np.testing.assert_array_equal(np.concatenate(alone), whole)
+    np.testing.assert_array_equal(np.concatenate(alone), mosaic(parts)[0])
 
 
 def test_a_point_on_the_edge_counts_if_it_is_alone() -> None:
@@ -117,7 +118,8 @@ class Numbered:
     raw = np.arange(LINES * SAMPLES * BANDS, dtype=np.uint32).astype(np.uint16).reshape(LINES, SAMPLES, BANDS)
 
     def __init__(self, delay_s: float = 0.0) -> None:
-        self.delay_s, self.asked = delay_s, list[tuple[int, int]]()
+        self.delay_s = delay_s
+        self.asked: list[tuple[int, int]] = []
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Return whole lines."""
@@ -147,7 +149,8 @@ def test_a_block_that_is_being_read_stays_in_the_cache() -> None:
                 go.wait(10)
             return super().read(start, stop)
 
-    lines, cache = Held(), LineCache(0)
+    lines = Held()
+    cache = LineCache(0)
     got: list[np.ndarray] = []
     slow = threading.Thread(target=lambda: got.append(cache.window(lines, slice(0, 4), slice(0, 4))))  # type: ignore[arg-type]
     slow.start()
@@ -163,7 +166,8 @@ def test_a_block_that_is_being_read_stays_in_the_cache() -> None:
 
 def test_threads_share_one_read() -> None:
     """Eight threads that request the same block at once cause one read, and all get the lines."""
-    lines, cache = Numbered(delay_s=0.05), LineCache(2**20)
+    lines = Numbered(delay_s=0.05)
+    cache = LineCache(2**20)
     got: list[np.ndarray] = []
     threads = [
         threading.Thread(target=lambda: got.append(cache.window(lines, slice(70, 80), slice(0, 9))))  # type: ignore[arg-type]
@@ -180,8 +184,10 @@ def test_threads_share_one_read() -> None:
 
 def test_a_failed_read_is_retried() -> None:
     """The error reaches the caller and is not cached, so the next request reads again."""
-    lines, cache = Numbered(), LineCache(2**20)
-    whole, lines.raw = lines.raw, None  # type: ignore[assignment]
+    lines = Numbered()
+    cache = LineCache(2**20)
+    whole = lines.raw
+    lines.raw = None  # type: ignore[assignment]
     try:
         cache.window(lines, slice(0, 4), slice(0, 4))  # type: ignore[arg-type]
     except TypeError:

@@ -62,8 +62,7 @@ def test_a_pass_is_registered_to_a_fifth_of_a_pixel(along: Axis):
     assert (found.untied, found.narrow) == ((), ())
     held = pointing.offset(found.reference or "")
     for sweep in sweeps:
-        left = found.of(sweep.name).offset - (pointing.offset(sweep.name) - held)
-        assert np.abs(left).max() < 0.2
+        assert np.abs(found.of(sweep.name).offset - (pointing.offset(sweep.name) - held)).max() < 0.2
     assert np.nanmax(np.abs([window.residual_px for window in found.windows])) < 0.2
 
 
@@ -81,7 +80,8 @@ def test_a_coarse_pass_is_registered_in_scene_pixels():
     """Lines 2 px apart of binned samples give corrections in px of the scene, like fine lines."""
     pointing = PointingErrors(offset_px=6, seed=5)
     scan = uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)
-    sweeps, source = [replace(sweep, binning=2) for sweep in scan], source_of(pointing)
+    sweeps = [replace(sweep, binning=2) for sweep in scan]
+    source = source_of(pointing)
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     found = register_sweeps(broad, CAMERA, prior_px=8, window_px=300)
     held = pointing.offset(found.reference or "")
@@ -94,7 +94,8 @@ def test_a_coarse_pass_is_registered_in_scene_pixels():
 
 def test_windows_lie_inside_of_both_sweeps():
     """Both sweeps see every window, except for 2 px at its borders."""
-    sweeps, source = full_sweeps(GRID, CAMERA, "x", overlap_px=84), source_of()
+    sweeps = full_sweeps(GRID, CAMERA, "x", overlap_px=84)
+    source = source_of()
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     images = place_images(broad, no_shifts([sweep.name for sweep in sweeps]), CAMERA)
     windows = overlap_windows(images, window_px=100)
@@ -111,7 +112,8 @@ def test_a_broad_band_image_is_the_mean_of_the_bands():
     """Without noise it is the scene's mean over bands. Lost and unusable lines are NaN."""
     source = replace(source_of(bands=5), chosen=effects_on("rotation"))
     sweep = full_sweeps(GRID, CAMERA, "x")[0]
-    lines, kept = SimulatedSweep(source, sweep), np.arange(sweep.lines) != 7
+    lines = SimulatedSweep(source, sweep)
+    kept = np.arange(sweep.lines) != 7
     position = np.where(kept[:, None], lines.position, np.nan)
     holed = SimpleNamespace(
         sweep=sweep, references=lines.references, valid_line=kept, position=position, read=lines.read
@@ -135,9 +137,8 @@ def test_saturated_samples_are_left_out(factor: int):
     scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.array([600.0]))
     bright = replace(scene, light=Once.of(SceneRadiance(scene.electrons * 2.4, scene.white_reference_electrons)))
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
-    broad = BroadSweep.read(
-        SimulatedSweep(SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation")), sweep), CAMERA
-    )
+    source = SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation"))
+    broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
     middle = broad.image.shape[0] // 2, broad.image.shape[1] // 2
     assert np.isnan(broad.image[middle])
     assert np.isfinite(broad.image[0]).all()
@@ -155,15 +156,12 @@ def test_bands_with_too_few_lit_samples_are_left_out():
 
 def test_turn_is_the_derivative_of_places_by_the_swath():
     """Far off the axis it predicts the view of a sample whose swath lies 1 px further along."""
-    sweep = Sweep("s", "fine", "x", 1500.0, -900.0, 3)
-    broad = BroadSweep.read(SimulatedSweep(source_of(), sweep), CAMERA)
-    image, slope = PlacedImage(broad, CAMERA, np.zeros((3, 2))), CAMERA.pixel_slopes()[140]
-    (here,), (there,) = (
-        np.stack(points_of_scan(1500.0 + step, CAMERA, np.array([-899.0]), np.array([slope])), axis=-1)
-        for step in (-0.5, 0.5)
-    )
-    found = image.line_and_turn(*(here + there) / 2)
-    line, turn = found
+    broad = BroadSweep.read(SimulatedSweep(source_of(), Sweep("s", "fine", "x", 1500.0, -900.0, 3)), CAMERA)
+    image = PlacedImage(broad, CAMERA, np.zeros((3, 2)))
+    slope = CAMERA.pixel_slopes()[140:141]
+    (here,) = np.stack(points_of_scan(1499.5, CAMERA, np.array([-899.0]), slope), axis=-1)
+    (there,) = np.stack(points_of_scan(1500.5, CAMERA, np.array([-899.0]), slope), axis=-1)
+    line, turn = image.line_and_turn(*(here + there) / 2)
     assert line == 1
     np.testing.assert_allclose(turn[:, 0], there - here, atol=1e-5)
     assert np.abs(turn - np.eye(2)).max() > 1e-3

@@ -64,8 +64,7 @@ def test_crop_rows_with_gaps_are_registered_to_the_right_row():
 def test_crop_rows_without_gaps_are_undecidable(turned: bool):
     """Purely periodic rows have no shift, for either direction and any noise."""
     for seed, snr in enumerate((50, 50, 5, 1)):
-        shift = np.random.default_rng(seed).uniform(-25, 25, 2)
-        views = row_views(seed, (256, 64), shift, snr, 0)
+        views = row_views(seed, (256, 64), np.random.default_rng(seed).uniform(-25, 25, 2), snr, 0)
         found = pair_shift(*(view.T if turned else view for view in views), prior_px=26)
         assert found.status == "undecidable"
         assert np.isnan(found.shift).all()
@@ -73,7 +72,8 @@ def test_crop_rows_without_gaps_are_undecidable(turned: bool):
 
 def test_stated_error_is_the_scatter_of_the_shift():
     """Over noisy views of one overlap both agree to a third. The peak is the correlation of the views."""
-    shift, drawn = np.array([2.3, -1.4]), np.random.default_rng(9)
+    shift = np.array([2.3, -1.4])
+    drawn = np.random.default_rng(9)
     clean = wave_views(3, (96, 96), shift, np.inf, (8, 60))
     found = [pair_shift(*(view + drawn.normal(0, 0.5, view.shape) for view in clean), prior_px=5) for _ in range(40)]
     scatter = np.sqrt(np.mean([(each.shift - shift) ** 2 for each in found], axis=0))
@@ -148,11 +148,10 @@ def test_one_wrong_window_hardly_moves_the_sweeps():
 
 def test_the_turn_of_the_line_is_part_of_the_model():
     """A window at a line's end gives the offset of the line's centre, not of the end."""
-    turn, shift = np.array([[1.0, 0.0], [0.034, 1.0]]), np.array([50.0, -20.0])
-    windows = [
-        WindowShift(0, 1, (line, line), np.stack([np.eye(2), turn]), turn @ shift, np.full(2, 0.05))
-        for line in (100.0, 900.0)
-    ]
+    turn = np.array([[1.0, 0.0], [0.034, 1.0]])
+    shift = np.array([50.0, -20.0])
+    turns = np.stack([np.eye(2), turn])
+    windows = [WindowShift(0, 1, (line, line), turns, turn @ shift, np.full(2, 0.05)) for line in (100.0, 900.0)]
     found = solve_sweeps(windows, ("a", "b"), (1000, 1000), reference=0)
     np.testing.assert_allclose(found.shifts[1].offset, shift, atol=1e-3)
 
@@ -179,8 +178,7 @@ def test_one_window_gives_an_offset_without_drift():
 
 def textured(seed: int, shape: tuple[int, int] = (180, 210)) -> NDArray[np.float64]:
     """Return a field with structure over some pixels, larger than the compared part."""
-    rng = np.random.default_rng(seed)
-    field: NDArray[np.float64] = gaussian_filter(rng.normal(size=shape), 2.0)
+    field: NDArray[np.float64] = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
     return field
 
 
@@ -211,10 +209,10 @@ def test_field_shift_finds_a_rotated_field(seed: int, degrees: float) -> None:
 @pytest.mark.parametrize("seed", [3, 4])
 def test_local_changes_do_not_move_the_field(seed: int) -> None:
     """A third of the field is replaced by another one, and there is noise everywhere."""
-    field, rng = textured(seed), np.random.default_rng(seed)
+    field = textured(seed)
     now = cut(field).copy()
     now[:, :50] = cut(textured(seed + 50))[:, :50]
-    now += rng.normal(0, 0.1 * now.std(), now.shape)
+    now += np.random.default_rng(seed).normal(0, 0.1 * now.std(), now.shape)
     found = field_shift(now, cut(field), reach_px=REACH)
     assert max(np.hypot(*found.shift) / 0.3, found.edge_px(SIZE) / 0.5) < 1
 

@@ -17,7 +17,8 @@ KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kernel) -> tuple[np.ndarray, np.ndarray]:
     """Return weighted sums in float64, point by point and band by band, and the valid weight of each band."""
     usable = np.broadcast_to(valid if valid.ndim == 3 else valid[..., None], values.shape)
-    out, weight_of = np.full((len(at), values.shape[2]), np.nan), np.zeros((len(at), values.shape[2]))
+    out = np.full((len(at), values.shape[2]), np.nan)
+    weight_of = np.zeros((len(at), values.shape[2]))
     for point, place in enumerate(at):
         lines, samples = (kernel_taps(place[[axis]], kernel) for axis in (0, 1))
         total, weight = np.zeros(values.shape[2]), np.zeros(values.shape[2])
@@ -28,7 +29,8 @@ def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kerne
                     weight[here] += down * across
                     total[here] += down * across * values[line, sample, here]
         held = weight >= 0.5
-        out[point, held], weight_of[point] = total[held] / weight[held], weight
+        out[point, held] = total[held] / weight[held]
+        weight_of[point] = weight
     return out, weight_of
 
 
@@ -37,7 +39,8 @@ def by_hand(values: np.ndarray, valid: np.ndarray, at: np.ndarray, kernel: Kerne
 def test_resampling_equals_explicit_sums(kernel: Kernel, by_element: bool) -> None:
     """Masks by sample and by element give the explicit sums, band by band, also at the borders."""
     rng = np.random.default_rng(11)
-    values, valid = rng.random((9, 8, 5), np.float32), rng.random((9, 8)) > 0.1
+    values = rng.random((9, 8, 5), np.float32)
+    valid = rng.random((9, 8)) > 0.1
     if by_element:
         valid = valid[..., None] & (rng.random((9, 8, 5)) > 0.1)
     values[~valid] = np.nan
@@ -63,9 +66,8 @@ def test_a_constant_stays_constant_under_any_mask(valid: np.ndarray, line: float
 def test_catmull_rom_reproduces_parabolas() -> None:
     """The kernel has third-order accuracy, so a parabola inside of the sweep is exact."""
     y, x = np.mgrid[:12, :12].astype(np.float32)
-    values = (y * y - 2 * x * y + 3 * x)[..., None]
     at = np.random.default_rng(2).uniform(2, 9, (50, 2))
-    out, _ = resample(values, np.ones((12, 12), bool), at)
+    out, _ = resample((y * y - 2 * x * y + 3 * x)[..., None], np.ones((12, 12), bool), at)
     np.testing.assert_allclose(out[:, 0], at[:, 0] ** 2 - 2 * at[:, 1] * at[:, 0] + 3 * at[:, 1], atol=2e-4)
 
 
@@ -74,7 +76,8 @@ def test_catmull_rom_reproduces_parabolas() -> None:
 def test_resampling_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
     """All points together, single points and any order give the same bits, with masks and at borders."""
     rng = np.random.default_rng(13)
-    values, valid = rng.random((14, 15, bands), np.float32), rng.random((14, 15, bands)) > 0.01
+    values = rng.random((14, 15, bands), np.float32)
+    valid = rng.random((14, 15, bands)) > 0.01
     at = rng.uniform(-1, 15, (BLOCK_PX + 300, 2))
     out, fraction = resample(values, valid, at, kernel)
     order = rng.permutation(len(at))
@@ -87,7 +90,8 @@ def test_resampling_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) ->
 
 def test_lines_of_one_dwell_are_averaged() -> None:
     """The mean of each sample is over its valid lines. A line alone keeps its bits."""
-    values, valid = np.random.default_rng(18).random((6, 3, 2), np.float32), np.ones((6, 3), bool)
+    values = np.random.default_rng(18).random((6, 3, 2), np.float32)
+    valid = np.ones((6, 3), bool)
     values[2, 1], valid[2, 1] = np.nan, False
     valid[4:, 0] = False
     merged, known = merge_lines(values, valid, np.array([0, 1, 4]))
@@ -103,10 +107,11 @@ def test_lines_of_one_dwell_are_averaged() -> None:
 def test_values_of_invalid_elements_do_not_matter(kernel: Kernel, kind: type[np.generic]) -> None:
     """Zero and any other number at invalid elements give the same result, and the input stays unchanged."""
     rng = np.random.default_rng(19)
-    values, valid = rng.integers(1, 60_000, (9, 9, 3)).astype(kind), rng.random((9, 9, 3)) > 0.1
-    kept, at = values.copy(), rng.uniform(-0.4, 8.4, (100, 2))
-    for one, other in zip(
-        resample(values, valid, at, kernel), resample(values * valid, valid, at, kernel), strict=True
-    ):
+    values = rng.integers(1, 60_000, (9, 9, 3)).astype(kind)
+    valid = rng.random((9, 9, 3)) > 0.1
+    kept = values.copy()
+    at = rng.uniform(-0.4, 8.4, (100, 2))
+    results = (resample(given, valid, at, kernel) for given in (values, values * valid))
+    for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(values, kept)

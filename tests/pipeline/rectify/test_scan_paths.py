@@ -67,9 +67,8 @@ def test_lost_and_unusable_lines_keep_a_scan_path_even() -> None:
 
 def test_corrections_move_the_line_centres() -> None:
     """A shift in scene px is added along the line and along the scan."""
-    position = aim(100.0, np.arange(5.0))
     shift = np.stack([np.full(5, 7.0), 0.5 * np.arange(5)], axis=-1)
-    (scan_path,) = make_scan_paths(position, CAMERA, shift_px=shift)
+    (scan_path,) = make_scan_paths(aim(100.0, np.arange(5.0)), CAMERA, shift_px=shift)
     np.testing.assert_allclose(scan_path.across / CAMERA.ifov_rad, 107.0, atol=1e-9)
     np.testing.assert_allclose(scan_path.scan / CAMERA.ifov_rad, 1.5 * np.arange(5), atol=1e-9)
 
@@ -133,10 +132,9 @@ def test_a_line_out_of_reach_is_named() -> None:
     position[4] = np.nan
     with pytest.raises(PoseError, match="line 4 is at mirror position"):
         make_scan_paths(position, CAMERA)
-    usable = np.arange(6) != 4
     position[5] = 0.8, 0.8
     with pytest.raises(PoseError, match=r"line 5 is at mirror position \(0.8, 0.8\)"):
-        make_scan_paths(position, CAMERA, usable=usable)
+        make_scan_paths(position, CAMERA, usable=np.arange(6) != 4)
     (scan_path,) = make_scan_paths(position, CAMERA, usable=np.arange(6) < 4)
     assert len(scan_path) == 4
 
@@ -156,7 +154,8 @@ def test_line_numbers_count_lost_frames(lines: list[int], pace: float, seed: int
 @given(st.integers(0, 99), st.integers(3, 40))
 def test_repeated_frames_and_wild_stamps_change_no_other_line(seed: int, lines: int) -> None:
     """A repeated frame and one wild time stamp are marked. The other lines keep their numbers."""
-    rng, time = np.random.default_rng(seed), np.arange(float(lines))
+    rng = np.random.default_rng(seed)
+    time = np.arange(float(lines))
     again = rng.integers(0, lines)
     sent = np.insert(time, again + 1, time[again])
     sent = np.insert(sent, rng.integers(1, lines - 1), rng.choice([-50.0, 1e6]))

@@ -117,15 +117,15 @@ def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch
     grid = PixelGrid(CORNER, 1, (40, 140))
     whole = in_tiles(two_turned(None), grid, grid.shape)
     monkeypatch.setattr("pipeline.rectify.mosaic.RUN_ELEMENTS", 0)
-    cut = in_tiles(two_turned(None), grid, grid.shape)
-    for one, other in zip(whole, cut, strict=True):
+    for one, other in zip(whole, in_tiles(two_turned(None), grid, grid.shape), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("kind", [Taken, Cropped])
 def test_a_block_of_lines_is_read_once_in_a_column_of_tiles(kind: type[Taken]) -> None:
     """In the order of the tiles, with a cache of the projected size, no block of a column is read twice."""
-    grid, lines = PixelGrid((3010.0, -4770.0), 1, (160, 120)), taken(TURNED, kind=kind)
+    grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
+    lines = taken(TURNED, kind=kind)
     placed = [place(lines, CAMERA)]
     for tiles in (plan_tiles(placed, CAMERA, grid, (32, 120)), plan_tiles(placed, CAMERA, grid, (32, 60))[:5]):
         lines.asked.clear()
@@ -141,7 +141,8 @@ def test_projected_cache_size_covers_the_raw_lines(kind: type[Taken]) -> None:
     """A tile holds at most the projected bytes: whole lines, or whole chunks of samples if the sweep reads these."""
     grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
     placed = [place(taken(TURNED, kind=kind), CAMERA)]
-    tiles, whole = plan_tiles(placed, CAMERA, grid, (32, 20)), LineCache(2**30)
+    tiles = plan_tiles(placed, CAMERA, grid, (32, 20))
+    whole = LineCache(2**30)
     for tile in tiles:
         alone = LineCache(2**30)
         for cache in (alone, whole):
@@ -154,7 +155,8 @@ def test_projected_cache_size_covers_the_raw_lines(kind: type[Taken]) -> None:
 @settings(max_examples=25, deadline=None)
 def test_reach_contains_all_knots_and_samples_of_a_tile(row: int, column: int, height: int, width: int) -> None:
     """The predicted knots and samples contain those of every pixel, with a margin for taps."""
-    grid, placed = PixelGrid(CORNER, 1, (400, 400)), place(taken(TURNED, bands=1), CAMERA)
+    grid = PixelGrid(CORNER, 1, (400, 400))
+    placed = place(taken(TURNED, bands=1), CAMERA)
     rows, columns = slice(row, row + height), slice(column, column + width)
     scan_path = placed.scan_paths[0][0]
     at = placed.coordinates(0, CAMERA, grid, rows, columns).reshape(-1, 2)
@@ -195,8 +197,7 @@ def test_pixels_without_any_line_are_nan(beside: bool) -> None:
 @pytest.mark.parametrize("placed_by_it", [False, True])
 def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
     """The values of a dead line reach no pixel, even if its position is usable. Only the nearest pixels are lost."""
-    sweep = Sweep("straight", "fine", "x", 0.0, -30.0, 60)
-    lines = taken(sweep)
+    lines = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60))
     whole, _ = in_tiles([place(lines, CAMERA)], grid := PixelGrid((-20.0, -60.0), 1, (40, 120)), (64, 640))
     lines.valid_line[30] = False
     lines.raw[30] = 4000
@@ -210,7 +211,8 @@ def test_a_dead_line_leaves_its_own_row_empty(placed_by_it: bool) -> None:
 
 def test_missing_lines_have_no_weight() -> None:
     """A point next to a lost line is computed from the kernel's other lines; the substitute line has no weight."""
-    whole, came = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60)), np.arange(60) != 30
+    whole = taken(Sweep("straight", "fine", "x", 0.0, -30.0, 60))
+    came = np.arange(60) != 30
     rows = {name: getattr(whole, name)[came] for name in ("raw", "position", "valid_line")}
     lines = replace(whole, sweep=replace(whole.sweep, lines=59), **rows)
     seen, coverage = in_tiles([place(lines, CAMERA)], PixelGrid((-0.7, -59.5), 1, (1, 120)), (64, 640))
@@ -223,10 +225,11 @@ def test_missing_lines_have_no_weight() -> None:
 
 def test_binned_samples_saturate_at_the_sum_of_full_scales() -> None:
     """A sum of two samples above the full scale of one is valid; a sum of two saturated samples is not."""
-    sweep = Sweep("binned", "coarse", "x", 0.0, -30.0, 40, step=2, binning=2)
-    half = taken(sweep)
-    raw, references = half.raw[:, ::2].copy(), half.references
-    raw[...], raw[20:] = 5000, 2 * CAMERA.full_scale_dn
+    half = taken(Sweep("binned", "coarse", "x", 0.0, -30.0, 40, step=2, binning=2))
+    raw = half.raw[:, ::2].copy()
+    references = half.references
+    raw[...] = 5000
+    raw[20:] = 2 * CAMERA.full_scale_dn
     frames = replace(references, dark=references.dark[::2], white=references.white[::2])
     placed = [place(replace(half, raw=raw, references=frames), CAMERA)]
     seen, _ = in_tiles(placed, PixelGrid((-30.0, -60.0), 2, (40, 60)), (64, 640))
@@ -239,8 +242,7 @@ def test_a_sweep_that_turns_back_counts_as_two_sweeps() -> None:
     there = taken(Sweep("there", "fine", "x", 0.0, -30.0, 60))
     path = np.concatenate([there.position, there.position[::-1]])
     longer = taken(replace(there.sweep, start_px=0.0, lines=120))
-    both = replace(longer, position=path, sweep=replace(there.sweep, lines=120))
-    placed = place(both, CAMERA)
+    placed = place(replace(longer, position=path, sweep=replace(there.sweep, lines=120)), CAMERA)
     each = [replace(placed, scan_paths=(scan_path,)) for scan_path in placed.scan_paths]
     grid = PixelGrid((-20.0, -60.0), 1, (40, 120))
     expected = in_tiles(each, grid, (64, 640))

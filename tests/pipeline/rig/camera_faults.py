@@ -101,7 +101,8 @@ class FaultyCamera(CameraDevice):
     def _in_pieces(self, data: bytes) -> list[Chunk]:
         if not self.faults.strikes(CameraFault.SPLIT):
             return [Chunk(0.0, data)]
-        rng, most = self.faults.rng, max(len(data) - 1, 0)
+        rng = self.faults.rng
+        most = max(len(data) - 1, 0)
         ends = sorted(int(end) + 1 for end in rng.permutation(most)[: int(rng.integers(1, 7))])
         return [Chunk(0.002, data[start:stop]) for start, stop in pairwise([0, *ends, len(data)])]
 
@@ -127,7 +128,8 @@ class _HalfOf:
 
     def __init__(self, producer: Any, transfer: Any) -> None:
         rest = producer.file.read()
-        self._data, self._transfer = rest[: len(rest) // 2], transfer
+        self._data = rest[: len(rest) // 2]
+        self._transfer = transfer
 
     def more(self) -> bytes:
         data: bytes = self._data[:65536]

@@ -200,8 +200,7 @@ class InProcessRig(Closing):
 
     def devices(self, rig: SurveyRig, vector_pairs: int = 1500) -> RigDevices:
         """Connect drivers to both devices."""
-        mirror = self.mirror(rig, vector_pairs)
-        return RigDevices(mirror, self.camera(), self.clock)
+        return RigDevices(self.mirror(rig, vector_pairs), self.camera(), self.clock)
 
     def close(self) -> None:
         """Close the port for files."""

@@ -178,7 +178,8 @@ def split(device: MirrorDevice, chunks: list[Chunk], random: Random) -> list[Chu
         while data:
             size = random.randint(1, 3)
             pieces.append(Chunk(delay_s, data[:size]))
-            data, delay_s = data[size:], delay_s + 1e-3
+            data = data[size:]
+            delay_s += 1e-3
     return pieces
 
 
@@ -299,10 +300,12 @@ class CellLost(Fault):
         if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
             return None
         register, offset, length, _ = read_vector(request.frame.payload)
-        memory, cells = device.state.memory, slice(offset // CELL, (offset + length) // CELL)
+        memory = device.state.memory
+        cells = slice(offset // CELL, (offset + length) // CELL)
         if register != VECTOR_MEMORY or not self.chance.comes():
             return None
-        before, reply = memory[cells].copy(), device.carry_out(request)
+        before = memory[cells].copy()
+        reply = device.carry_out(request)
         differing = np.flatnonzero(memory[cells] != before)
         if differing.size:
             place = self.chance.random.choice(differing.tolist())
@@ -377,9 +380,6 @@ class Echo(Fault):
         return [Chunk(TURNAROUND_S, data)]
 
 
-_SETTING = frozenset({Command.SET_VALUES})
-_VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
-_UPLOAD = frozenset({Command.SET_VECTOR})
 _BYTES = 1024  # bytes to the controller within which it strikes
 HARMLESS = ("split-replies", "stale-bytes", "pro-at-connect")  # the driver copes with these
 
@@ -410,14 +410,14 @@ KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
     "mute": _reply(lost, lasting=True),
     "slow-bytes": _reply(slow, lasting=True),
     "answers-no": (AnswersNo, 6),
-    "error-range": _code(ErrorCode.OUT_OF_RANGE, _SETTING, 4),
-    "error-vector-index": _code(ErrorCode.VECTOR_INDEX, _VECTORS),
+    "error-range": _code(ErrorCode.OUT_OF_RANGE, frozenset({Command.SET_VALUES}), 4),
+    "error-vector-index": _code(ErrorCode.VECTOR_INDEX, frozenset({Command.SET_VECTOR, Command.GET_VECTOR})),
     "error-unknown": _code(0xBEEF),
     "wrong-firmware": (OtherFirmware, 64),
     "cell-lost": (CellLost, 16),
     "pro-at-connect": (ProAtConnect, 64),
     "silent-reset": (partial(SilentReset, boot_s=0.0), 64),
-    "reset-in-upload": (partial(SilentReset, boot_s=1.0, commands=_UPLOAD), 16),
+    "reset-in-upload": (partial(SilentReset, boot_s=1.0, commands=frozenset({Command.SET_VECTOR})), 16),
     "never-stable": _bit(Status.NOT_STABLE),
     "trimmed": _bit(Status.TRIMMED),
     "mirror-warm": _bit(Status.MIRROR_WARM),

@@ -35,10 +35,8 @@ FINE = Sweep("fine-3", "fine", "x", 3.25, -7.5, 17)
 
 def small_source(**changed: Any) -> SimulatedSource:
     """Return a simulated source of 40 x 48 px and 3 bands, with usual effects."""
-    rng = np.random.default_rng(11)
-    scene = raster_from_values(
-        rng.uniform(20, 200, (40, 48, 3)), CAMERA, name="small", wavelength_nm=np.array([460.0, 550.0, 640.0])
-    )
+    values = np.random.default_rng(11).uniform(20, 200, (40, 48, 3))
+    scene = raster_from_values(values, CAMERA, name="small", wavelength_nm=np.array([460.0, 550.0, 640.0]))
     return replace(SimulatedSource(scene, Rig(CAMERA), 5, effects_on(*NAMES)), **changed)
 
 
@@ -110,13 +108,10 @@ def small_rig(
     """
     told = {"pulses": "position", "with_crc": True, **settings}
     viewed = small_source() if source is None else source
+    clock = ManualClock(50.0)
+    camera_faults = CameraFaults(dict(faults or {}), 0, passes)
     rig = FaultyRig(
-        viewed,
-        ManualClock(50.0),
-        mirror_faults=mirror_faults,
-        wired=told["pulses"],
-        camera_faults=CameraFaults(dict(faults or {}), 0, passes),
-        mounting=mounting,
+        viewed, clock, mirror_faults=mirror_faults, wired=told["pulses"], camera_faults=camera_faults, mounting=mounting
     )
     with InProcessRig(rig) as line:
         yield SmallRig(line, SurveyRig(**told), vector_pairs, viewed.wavelength_nm)

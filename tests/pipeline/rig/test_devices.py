@@ -28,9 +28,9 @@ def ends() -> Iterator[tuple[FileIO, str]]:
     os.close(driver)
 
 
-def soon(seconds: float = 5.0) -> float:
+def soon() -> float:
     """Return a deadline that a working line never reaches."""
-    return SYSTEM_CLOCK.now() + seconds
+    return SYSTEM_CLOCK.now() + 5.0
 
 
 @pytest.mark.parametrize("baud", [115200, 256000])

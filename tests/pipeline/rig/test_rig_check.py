@@ -138,9 +138,8 @@ def test_camera_faults_fail_the_check() -> None:
     with rig() as line:
         gone = HeadwallCamera(line.camera_line, FileServer("127.0.0.1", 1), clock=line.clock)
         assert told(check_camera(lambda: gone), "fail") == ["log in to its files, port 1"]
-        other = replace(line.files, password="other")
         with pytest.raises(DeviceRefused, match="password"):
-            log_in(other)
+            log_in(replace(line.files, password="other"))
         assert log_in(line.files) == "emulated camera"
 
 

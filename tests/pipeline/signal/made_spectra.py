@@ -16,7 +16,8 @@ from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import References
 
 CAMERA = LineCamera(samples=64)
-DARK, GAIN = 64, 1e-3  # DN, and the scene value of one DN
+DARK = 64  # DN
+GAIN = 1e-3  # the scene value of one DN
 
 Values = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -36,7 +37,8 @@ def field_of(
     seed: int, shape: tuple[int, int] = (96, 96), bands: int = 40, materials: int = 3, signal: float = 30.0
 ) -> Field:
     """Return materials that vary over some px, each by ``signal`` sigma of a band's noise, around a value of 1."""
-    rng, noise = np.random.default_rng(seed), np.linspace(4, 10, bands) * GAIN
+    rng = np.random.default_rng(seed)
+    noise = np.linspace(4, 10, bands) * GAIN
     clean = np.ones((*shape, bands))
     for _ in range(materials):
         amount, spectrum = gaussian_filter(rng.normal(size=shape), 4), gaussian_filter(rng.normal(size=bands), 2)
@@ -49,14 +51,12 @@ def with_noise(clean: Floats, noise: Floats, seed: int) -> Values:
     return (clean + noise * np.random.default_rng([seed, 1]).normal(size=clean.shape)).astype(np.float32)
 
 
-def statistics_of(
-    values: Values, valid: Bools | None = None, *, lines: int = 64, expected: int | None = None
-) -> SignalStatistics:
-    """Return statistics of a field that is added some lines at a time."""
+def statistics_of(values: Values, valid: Bools | None = None, *, expected: int | None = None) -> SignalStatistics:
+    """Return statistics of a field that is added 64 lines at a time."""
     known = np.ones(values.shape[:2], np.bool_) if valid is None else valid
     found = SignalStatistics(values.shape[2], expected or values.shape[0] * values.shape[1])
-    for first in range(0, len(values), lines):
-        found.add(values[first : first + lines], known[first : first + lines])
+    for first in range(0, len(values), 64):
+        found.add(values[first : first + 64], known[first : first + 64])
     return found
 
 
@@ -69,7 +69,8 @@ def marked(
     values: Values, found: SignalStatistics, components: Components, valid: Bools | None = None, alarms: float = 1.0
 ) -> Bools:
     """Return a mask of rare spectra (line, sample), by the residual law of the statistics' own spectra."""
-    law, seen = ResidualLaw.learned(found.spectra, components), scored(values, components, valid)
+    law = ResidualLaw.learned(found.spectra, components)
+    seen = scored(values, components, valid)
     return find_rare(seen.residual / law.expected(seen.scores), law, alarms)
 
 

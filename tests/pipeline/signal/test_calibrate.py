@@ -67,7 +67,8 @@ def test_sums_and_fractions_of_numbers_are_calibrated() -> None:
 )
 def test_an_invalid_element_invalidates_only_itself(unlit: list, bad: list, hot: list, out: list) -> None:
     """Saturated, unlit and wrongly filled elements are invalid; a sample is invalid if all its lit bands are."""
-    references, raw = replace(frames(), bad=np.zeros((4, 3), np.bool_)), np.full((2, 4, 3), 500, np.uint16)
+    references = replace(frames(), bad=np.zeros((4, 3), np.bool_))
+    raw = np.full((2, 4, 3), 500, np.uint16)
     for place in unlit:
         references.white[place] = 60
     for place in bad:
@@ -129,18 +130,19 @@ def test_bad_elements_change_no_good_element(bad: NDArray[np.bool_], seed: int) 
 
 def test_flat_field_and_mirror_throughput_divide_the_values() -> None:
     """The flat field divides its sample and the throughput its line, so that the scene is the same at any position."""
-    raw, flat = np.full((2, 4, 3), 560, np.uint16), np.ones((4, 3), np.float32)
+    flat = np.ones((4, 3), np.float32)
     flat[2] = 0.5
     position = np.array([[0.0, 0.0], [0.3, -0.2]])
     references = replace(frames(), flat=flat, by_mirror=True)
-    values = reflectance(raw, references, position=position)
+    values = reflectance(np.full((2, 4, 3), 560, np.uint16), references, position=position)
     np.testing.assert_allclose(values[0, :, 0], [1, 1, 2, 1], rtol=1e-6)
     np.testing.assert_allclose(values[1] * mirror_throughput(position[1]), values[0], rtol=1e-6)
 
 
 def test_lines_without_a_position_are_invalid() -> None:
     """With references by the mirror, a line without a position is NaN. Calibration without positions is an error."""
-    raw, references = np.full((2, 4, 3), 560, np.uint16), replace(frames(), by_mirror=True)
+    raw = np.full((2, 4, 3), 560, np.uint16)
+    references = replace(frames(), by_mirror=True)
     values, valid = calibrate(raw, references, saturated_dn=4095, position=[[0.0, 0.0], [np.nan, 0.0]])
     assert np.isnan(values[1]).all()
     assert valid.tolist() == [[True] * 4, [False] * 4]

@@ -15,7 +15,9 @@ SEEDS = st.integers(0, 2**32 - 1)
 def law_of(seed: int, bands: int = 12, count: int = 4, dead: tuple[int, ...] = ()) -> Components:
     """Return random components of some bands; ``dead`` bands have no value."""
     rng = np.random.default_rng(seed)
-    mean, noise, axes = rng.uniform(0.1, 2, bands), rng.uniform(0.01, 0.1, bands), np.zeros((count, bands))
+    mean = rng.uniform(0.1, 2, bands)
+    noise = rng.uniform(0.01, 0.1, bands)
+    axes = np.zeros((count, bands))
     lit = np.setdiff1d(np.arange(bands), dead)
     axes[:, lit] = np.linalg.qr(rng.normal(size=(len(lit), count)))[0].T
     mean[list(dead)] = noise[list(dead)] = np.nan
@@ -33,35 +35,37 @@ def test_restoring_scores_is_a_projection(seed: int, dead: tuple[int, ...]) -> N
     law = law_of(seed, dead=dead)
     axes = law.axes.T.astype(np.float32)
     once = law.restore(law.white(spectra_of(seed)) @ axes)
-    twice = law.restore(law.white(np.nan_to_num(once)) @ axes)
-    np.testing.assert_allclose(twice, once, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(law.restore(law.white(np.nan_to_num(once)) @ axes), once, rtol=1e-4, atol=1e-4)
 
 
 @given(seed=SEEDS)
 def test_the_residual_is_orthogonal_to_the_axes(seed: int) -> None:
     """A spectrum minus its restored one has scores of 0."""
-    law, spectra = law_of(seed), spectra_of(seed)
-    axes = law.axes.T.astype(np.float32)
-    left = spectra - law.restore(law.white(spectra) @ axes)
+    law = law_of(seed)
+    spectra = spectra_of(seed)
+    left = spectra - law.restore(law.white(spectra) @ law.axes.T.astype(np.float32))
     np.testing.assert_allclose(left / law.noise @ law.axes.T, 0, atol=2e-4)
 
 
 @given(seed=SEEDS, dead=st.sampled_from([(), (2, 11)]))
 def test_a_matrix_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...]) -> None:
     """Weights and offset of `onto` give from scores the matrix product of restored spectra, with 0 in dead bands."""
-    law, rng = law_of(seed, dead=dead), np.random.default_rng(seed)
-    scores, matrix = rng.normal(0, 20, (2, 3, 4)).astype(np.float32), rng.normal(size=(12, 5))
+    law = law_of(seed, dead=dead)
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(0, 20, (2, 3, 4)).astype(np.float32)
+    matrix = rng.normal(size=(12, 5))
     weights, offset = law.onto(matrix)
-    np.testing.assert_allclose(
-        scores @ weights + offset, np.nan_to_num(law.restore(scores)) @ matrix, rtol=1e-3, atol=1e-3
-    )
+    wanted = np.nan_to_num(law.restore(scores)) @ matrix
+    np.testing.assert_allclose(scores @ weights + offset, wanted, rtol=1e-3, atol=1e-3)
 
 
 @given(seed=SEEDS, dead=st.sampled_from([(), (5,)]))
 def test_a_gain_acts_on_scores_as_on_spectra(seed: int, dead: tuple[int, ...]) -> None:
     """Scores of spectra times a gain per band are a matrix times their scores, plus a shift."""
-    law, rng = law_of(seed, dead=dead), np.random.default_rng(seed)
-    scores, gain = rng.normal(0, 20, (2, 3, 4)).astype(np.float32), rng.uniform(0.5, 2, 12)
+    law = law_of(seed, dead=dead)
+    rng = np.random.default_rng(seed)
+    scores = rng.normal(0, 20, (2, 3, 4)).astype(np.float32)
+    gain = rng.uniform(0.5, 2, 12)
     matrix, shift = law.scaled(gain)
     wanted = law.white(np.nan_to_num(law.restore(scores)) * gain) @ law.axes.T
     np.testing.assert_allclose(scores @ matrix + shift, wanted, rtol=1e-3, atol=1e-2)
@@ -87,7 +91,8 @@ def test_some_bands_are_restored_as_with_all(seed: int, bands: list[int]) -> Non
 @given(seed=SEEDS)
 def test_no_score_exceeds_the_stated_largest(seed: int) -> None:
     """`largest` bounds the scores of all spectra within a distance of the mean."""
-    law, rng = law_of(seed, dead=(1,)), np.random.default_rng(seed)
+    law = law_of(seed, dead=(1,))
+    rng = np.random.default_rng(seed)
     reach = rng.uniform(0, 3, 12)
     spectra = (np.nan_to_num(law.mean) + reach * rng.choice([-1, 1], (50, 12))).astype(np.float32)
     assert np.abs(law.white(spectra) @ law.axes.T).max() <= law.largest(reach) * (1 + 1e-4)
@@ -96,7 +101,8 @@ def test_no_score_exceeds_the_stated_largest(seed: int) -> None:
 @pytest.mark.parametrize("value", [np.nan, 0.0, 5.0])
 def test_a_band_without_a_value_is_ignored(value: float) -> None:
     """Any value in it becomes 0 in whitened spectra, and only this band is restored as NaN."""
-    law, spectra = law_of(1, dead=(6,)), spectra_of(1)
+    law = law_of(1, dead=(6,))
+    spectra = spectra_of(1)
     spectra[..., 6] = value
     white = law.white(spectra)
     assert (white[..., 6] == 0).all()

@@ -97,14 +97,14 @@ def test_nan_counts_as_a_missing_band(condensed: tuple) -> None:
     values[1, 1, 20:25] = np.nan
     seen = scored(values, law)
     assert seen.quality.tolist() == [[WHOLE, WHOLE], [WHOLE, PARTIAL]]
-    off = (restored(seen, law)[1, 1] - made.clean[1, 1]) / made.noise
-    assert np.abs(off).max() < 3
+    assert np.abs((restored(seen, law)[1, 1] - made.clean[1, 1]) / made.noise).max() < 3
 
 
 def test_saturated_bands_are_restored_from_the_others(condensed: tuple) -> None:
     """With a third of the bands saturated in an area, their median error is below twice that of the other bands."""
     made, found, law = condensed
-    values, valid = made.values.copy(), np.ones(made.values.shape, np.bool_)
+    values = made.values.copy()
+    valid = np.ones(made.values.shape, np.bool_)
     values[30:40, 30:50, ::3], valid[30:40, 30:50, ::3] = 9.0, False
     seen = score_lines(values, valid, law)
     assert (seen.quality == PARTIAL).sum() == 200
@@ -117,9 +117,9 @@ def test_many_components_and_few_valid_bands_mark_nothing() -> None:
     """Half of the bands are saturated and there are half as many components: few degrees of freedom cause no alarm."""
     made = field_of(6, bands=30, materials=9)
     found = statistics_of(made.values)
-    law, valid = find_components(found), np.ones(made.values.shape, np.bool_)
+    valid = np.ones(made.values.shape, np.bool_)
     valid[40:60, :, 1::2] = False
-    assert not marked(made.values, found, law, valid).any()
+    assert not marked(made.values, found, find_components(found), valid).any()
 
 
 def test_lines_without_light_are_unusable() -> None:
@@ -132,7 +132,8 @@ def test_lines_without_light_are_unusable() -> None:
 def test_one_of_two_bands_suffices() -> None:
     """The valid band is restored, and the other one by their correlation in the field."""
     made = field_of(1, bands=2, materials=1)
-    law, valid = find_components(statistics_of(made.values)), np.ones((1, 2, 2), np.bool_)
+    law = find_components(statistics_of(made.values))
+    valid = np.ones((1, 2, 2), np.bool_)
     valid[0, 1, 0] = False
     seen = score_lines(made.values[:1, :2], valid, law)
     back = law.restore(seen.scores)[0, 1]
@@ -149,7 +150,8 @@ def test_a_run_of_missing_bands_is_restored_within_noise(missing: int) -> None:
     found = statistics_of(made.values)
     law = components_of_field(found, np.linspace(400, 1000, 60), false_alarm=0.01, least=4)
     assert len(law) > 20
-    run, valid = np.s_[20 : 20 + missing], np.ones(made.values.shape, np.bool_)
+    run = np.s_[20 : 20 + missing]
+    valid = np.ones(made.values.shape, np.bool_)
     valid[..., run] = False
     off = (law.restore(score_lines(made.values, valid, law).scores) - made.clean)[..., run] / law.noise[run]
     assert np.sqrt(np.mean(off**2)) < 1
@@ -163,8 +165,9 @@ def test_the_residual_law_follows_shot_noise() -> None:
     values = (made.clean + (made.values - made.clean) * level).astype(np.float32)
     found = statistics_of(values)
     components = find_components(found)
-    law, seen = ResidualLaw.learned(found.spectra, components), scored(values, components)
-    ratio, bright = seen.residual / law.expected(seen.scores), level[..., 0] > np.median(level)
+    seen = scored(values, components)
+    ratio = seen.residual / ResidualLaw.learned(found.spectra, components).expected(seen.scores)
+    bright = level[..., 0] > np.median(level)
     assert seen.residual[bright].mean() > 1.05 * seen.residual[~bright].mean()
     assert ratio[bright].mean() == pytest.approx(ratio[~bright].mean(), rel=0.02)
 
@@ -185,7 +188,8 @@ def test_noise_alone_marks_at_most_the_stated_number(shape: tuple[int, int], ala
 
     Windows mark up to 8 spectra at once, so that there are 8 times fewer independent events.
     """
-    law, total = ResidualLaw(1.0, np.zeros(0), 50.0), 0
+    law = ResidualLaw(1.0, np.zeros(0), 50.0)
+    total = 0
     for seed in range(60):
         noise = np.random.default_rng(seed).chisquare(50, shape) / 50
         total += int(find_rare(noise.astype(np.float32), law, alarms).sum())
@@ -211,7 +215,8 @@ def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], si
     """
     made, found, law = condensed
     rng = np.random.default_rng(8)
-    values, there = made.values.copy(), np.zeros(made.values.shape[:2], np.bool_)
+    values = made.values.copy()
+    there = np.zeros(made.values.shape[:2], np.bool_)
     for number in range(30):
         line, sample = 3 + 15 * (number // 6), 2 + 15 * (number % 6)
         place = np.s_[line : line + shape[0], sample : sample + shape[1]]
@@ -224,9 +229,11 @@ def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], si
 def test_neighbours_are_found_together_below_the_threshold_of_one(condensed: tuple) -> None:
     """At 0.7 sigma per band few single pixels are rare, but most blocks and lines of 8 are."""
     made, found, law = condensed
-    rng, kept = np.random.default_rng(9), {}
+    rng = np.random.default_rng(9)
+    kept = {}
     for name, shape in SHAPES.items():
-        values, there = made.values.copy(), np.zeros(made.values.shape[:2], np.bool_)
+        values = made.values.copy()
+        there = np.zeros(made.values.shape[:2], np.bool_)
         for line, sample in np.ndindex(6, 6):
             place = np.s_[4 + 15 * line : 4 + 15 * line + shape[0], 4 + 15 * sample : 4 + 15 * sample + shape[1]]
             values[place] += (0.7 * rng.choice([-1, 1], 60) * made.noise).astype(np.float32)
@@ -253,8 +260,7 @@ def test_windows_mark_all_of_their_own_spectra() -> None:
         ratio = np.ones((20, 30), np.float32)
         freedom = 200 * ratio[place].size
         ratio[place] = 1.001 * chi2.isf(1e-3 / 4 / 600 / ratio[place].size, freedom) / freedom  # a part is not enough
-        wanted = ratio > 1
-        np.testing.assert_array_equal(find_rare(ratio, law, 1e-3), wanted)
+        np.testing.assert_array_equal(find_rare(ratio, law, 1e-3), ratio > 1)
 
 
 def test_unusable_spectra_are_never_rare() -> None:
@@ -269,17 +275,16 @@ def test_rare_spectra_are_stored_within_a_residual_step(condensed: tuple, sigma:
     """Rounded scores plus residual steps restore a spectrum to half a step, at any distance from the others."""
     made, _, law = condensed
     values = made.values[7, :20] + (sigma * np.random.default_rng(1).normal(size=(20, 60)) * made.noise).astype("f4")
-    seen = scored(values[None], law)
-    rounded = np.rint(seen.scores[0])
-    steps = residual_steps(values, rounded, law)
-    back = law.restore(rounded) + steps * RESIDUAL_STEP * law.noise
+    rounded = np.rint(scored(values[None], law).scores[0])
+    back = law.restore(rounded) + residual_steps(values, rounded, law) * RESIDUAL_STEP * law.noise
     assert np.abs((back - values) / law.noise).max() <= RESIDUAL_STEP / 2 + 1e-6 * sigma + 1e-3
 
 
 def test_missing_bands_have_no_residual(condensed: tuple) -> None:
     """Missing bands add nothing to the values restored from scores."""
     made, _, law = condensed
-    values, valid = made.values[:1, :4].reshape(4, 60) + 1, np.ones((4, 60), np.bool_)
+    values = made.values[:1, :4].reshape(4, 60) + 1
+    valid = np.ones((4, 60), np.bool_)
     valid[1, 5:9] = False
     values[2, 30] = np.nan
     steps = residual_steps(values, np.zeros((4, len(law)), np.float32), law, valid)
@@ -302,8 +307,7 @@ def test_coarse_steps_keep_the_means_of_blocks(seed: int, step: float, shape: tu
 
 def test_a_signal_below_a_coarse_step_stays_in_the_means() -> None:
     """Half of a field is 0.25 sigma higher: rounding each score alone loses most of this difference, steps keep it."""
-    rng = np.random.default_rng(5)
-    scores = rng.normal(0, 0.5, (64, 64, 1)).astype(np.float32)
+    scores = np.random.default_rng(5).normal(0, 0.5, (64, 64, 1)).astype(np.float32)
     scores[:, 32:] += 0.25
     seen = [half.mean() for half in np.split(scores, 2, axis=1)]
     kept = [half.mean() * 4 for half in np.split(whole_steps(scores, 4), 2, axis=1)]
@@ -317,7 +321,8 @@ def test_blocks_with_a_non_finite_score_are_rounded_one_by_one() -> None:
     scores = np.random.default_rng(2).normal(0, 4, (32, 32, 2)).astype(np.float32)
     scores[1::4, 2::4, 0] = np.nan
     scores[2, 2, 0] = np.inf
-    kept, alone = whole_steps(scores, 3), np.rint(scores / np.float32(3))
+    kept = whole_steps(scores, 3)
+    alone = np.rint(scores / np.float32(3))
     np.testing.assert_array_equal(kept[..., 0], alone[..., 0])
     assert (kept[..., 1] != alone[..., 1]).any()
 

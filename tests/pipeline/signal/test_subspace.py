@@ -23,7 +23,8 @@ from pipeline.signal.subspace import (
 )
 from tests.pipeline.signal.made_spectra import field_of, marked, restored, scored, statistics_of, with_noise
 
-FALSE_ALARM, TRIALS = 0.1, 60
+FALSE_ALARM = 0.1
+TRIALS = 60
 
 
 @settings(max_examples=12)
@@ -108,7 +109,8 @@ def test_a_bright_field_has_no_additional_components(signal: float) -> None:
 
 def test_a_weak_component_shared_by_neighbours_is_found() -> None:
     """A component with 3 % of a pixel's noise variance, varying over some px, shows only in means of 4 x 4 spectra."""
-    made, rng = field_of(5, (192, 192)), np.random.default_rng(6)
+    made = field_of(5, (192, 192))
+    rng = np.random.default_rng(6)
     direction = rng.normal(size=40)
     direction /= np.linalg.norm(direction)
     amount = gaussian_filter(rng.normal(size=(192, 192)), 5)
@@ -122,9 +124,9 @@ def test_a_weak_component_shared_by_neighbours_is_found() -> None:
 @pytest.mark.parametrize("bands", [12, 32])
 def test_noise_alone_gives_components_at_most_at_the_stated_rate(bands: int) -> None:
     """The count in 60 fields of noise is at most the 99.9 % quantile for a false-alarm rate of 10 %."""
-    noise, alarms = np.linspace(1, 3, bands), 0
+    alarms = 0
     for seed in range(TRIALS):
-        values = with_noise(np.full((48, 48, bands), 100.0), noise, seed)
+        values = with_noise(np.full((48, 48, bands), 100.0), np.linspace(1, 3, bands), seed)
         alarms += len(find_components(statistics_of(values), least=0, false_alarm=FALSE_ALARM)) > 0
     assert alarms <= binom.ppf(0.999, TRIALS, FALSE_ALARM)
 
@@ -141,14 +143,16 @@ def test_noise_is_estimated_in_every_band(seed: int, bands: int, materials: int,
 
 def test_noise_is_estimated_in_bands_of_different_units() -> None:
     """One band's unit is a ten-millionth of the others'."""
-    made, scale = field_of(8, (128, 128), 20, 3), np.where(np.arange(20) == 4, 1e7, 1.0)
+    made = field_of(8, (128, 128), 20, 3)
+    scale = np.where(np.arange(20) == 4, 1e7, 1.0)
     noise = find_components(statistics_of((made.values * scale).astype(np.float32))).noise
     np.testing.assert_allclose(noise / scale, made.noise, rtol=0.05)
 
 
 def test_pixels_without_data_do_not_change_the_noise_of_few_bands() -> None:
     """With more than half of the field missing, the noise of four bands is that of the rest, to 8 %."""
-    made, valid = field_of(0, (128, 128), 4, 1), np.broadcast_to(np.arange(128) >= 72, (128, 128))
+    made = field_of(0, (128, 128), 4, 1)
+    valid = np.broadcast_to(np.arange(128) >= 72, (128, 128))
     np.testing.assert_allclose(find_components(statistics_of(made.values, valid)).noise, made.noise, rtol=0.08)
 
 
@@ -178,10 +182,10 @@ def test_few_bands_are_stored_in_steps_of_the_camera() -> None:
 
 def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
     """A hundredth of the spectra differs by a third of a sigma. No test detects it, but a small field keeps it."""
-    rng, bands = np.random.default_rng(3), 120
+    bands = 120
     wavelength = np.linspace(400, 1000, bands)
     smooth = np.exp(-0.5 * ((wavelength - 700) / 40) ** 2)
-    values = 10 + rng.normal(size=(64, 100, bands)).astype(np.float32)
+    values = 10 + np.random.default_rng(3).normal(size=(64, 100, bands)).astype(np.float32)
     values[:8, :8] += (0.35 * smooth / np.linalg.norm(smooth)).astype(np.float32)
     found = statistics_of(values)
     few = find_components(found, least=4)
@@ -199,8 +203,10 @@ def test_small_fields_keep_a_weak_difference_of_a_small_part() -> None:
 
 def test_large_fields_keep_only_significant_components() -> None:
     """From half a million spectra on, the statistical test alone selects the components."""
-    found, wavelength = statistics_of(field_of(2, bands=60).values), np.linspace(400, 900, 60)
-    proved, counts = len(find_components(found, least=4)), []
+    found = statistics_of(field_of(2, bands=60).values)
+    wavelength = np.linspace(400, 900, 60)
+    proved = len(find_components(found, least=4))
+    counts = []
     for found.expected in (SMALL_FIELD - 1, SMALL_FIELD):
         counts.append(len(components_of_field(found, wavelength, false_alarm=0.01, least=4)))
     assert counts[0] > counts[1] == proved
@@ -330,8 +336,7 @@ def test_full_scale_integers_keep_the_number_of_components() -> None:
 
 def test_a_direction_shared_by_rare_spectra_becomes_a_component() -> None:
     """Residuals of 200 rare spectra along one direction add it as the last axis, orthonormal to the others."""
-    made = field_of(3)
-    components = find_components(statistics_of(made.values), least=1)
+    components = find_components(statistics_of(field_of(3).values), least=1)
     rng = np.random.default_rng(2)
     shared = rng.normal(size=40)
     shared -= components.axes.T @ (components.axes @ shared)
@@ -346,8 +351,7 @@ def test_a_direction_shared_by_rare_spectra_becomes_a_component() -> None:
 
 def test_residuals_of_noise_add_no_component() -> None:
     """The residuals of these rare spectra have no common direction."""
-    made = field_of(3)
-    components = find_components(statistics_of(made.values), least=1)
+    components = find_components(statistics_of(field_of(3).values), least=1)
     residuals = np.random.default_rng(4).normal(0, 3, (400, 40)).astype(np.float32)
     assert len(with_shared(components, residuals, 0.001)) == 3
     assert len(with_shared(replace(components, axes=np.eye(40)), residuals, 0.001)) == 40  # no direction is left

@@ -25,7 +25,8 @@ from pipeline.signal.subspace import SignalStatistics, find_components
 from pipeline.source import Line
 from tests.pipeline.signal.made_spectra import CAMERA, MadeLines, field_of, raw_of
 
-SHAPE, BANDS = (150, 40), 24
+SHAPE = (150, 40)
+BANDS = 24
 
 
 @dataclass
@@ -71,19 +72,19 @@ def statistics_of_lines(lines: MadeLines) -> SignalStatistics:
     return found
 
 
-def condense(lines: MadeLines, step: float = 1.0, alarms: float = 0.01) -> tuple[Stored, CondensedSweep]:
+def condense(lines: MadeLines, step: float = 1.0) -> tuple[Stored, CondensedSweep]:
     """Store all lines of a sweep."""
     found = statistics_of_lines(lines)
     components = find_components(found)
-    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, alarms, step)
+    condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 0.01, step)
     shape = lines.raw.shape[:2]
     stored = Stored(components, step, np.zeros((*shape, len(components)), np.int32), np.zeros(shape, np.uint8))
     return stored, condenser.sweep(lines, stored.write)
 
 
-def made_lines(seed: int = 3, **how: float) -> MadeLines:
+def made_lines(**how: float) -> MadeLines:
     """Return lines of 3 materials; the third block is not full."""
-    return MadeLines.of(raw_of(field_of(seed, SHAPE, BANDS, **how).values))
+    return MadeLines.of(raw_of(field_of(3, SHAPE, BANDS, **how).values))
 
 
 def values_of(lines: MadeLines) -> NDArray[np.float32]:
@@ -95,7 +96,8 @@ def test_statistics_of_arriving_lines_equal_those_of_their_values() -> None:
     """Blocks of 64 lines and the remainder, calibrated, count the same as all values at once."""
     lines = made_lines()
     values = values_of(lines)
-    found, whole = statistics_of_lines(lines), SignalStatistics(BANDS, values[..., 0].size)
+    found = statistics_of_lines(lines)
+    whole = SignalStatistics(BANDS, values[..., 0].size)
     whole.add(values, np.ones(SHAPE, np.bool_))
     assert (found.count, found.means) == (whole.count, 10 * (16 + 16 + 5))
     np.testing.assert_allclose(find_components(found).noise, find_components(whole).noise, rtol=0.01)
@@ -129,7 +131,8 @@ def test_scores_are_stored_in_steps(step: float) -> None:
     """Restored values differ from raw ones by the noise and the rounding to a step, and none is rare."""
     lines = made_lines()
     stored, done = condense(lines, step)
-    off, count = (stored.restored(done) - values_of(lines)) / stored.components.noise, len(stored.components)
+    off = (stored.restored(done) - values_of(lines)) / stored.components.noise
+    count = len(stored.components)
     assert np.mean(off**2) == pytest.approx((BANDS - count * (1 - step**2 / 12)) / BANDS, rel=0.05)
     assert (len(done.rare), done.known) == (0, 150 * 40)
     assert differing_lines(lines, stored, CAMERA) == []
@@ -148,7 +151,8 @@ def test_changed_and_lost_lines_are_found() -> None:
 def test_saturated_spectra_are_restored_or_unusable() -> None:
     """With some bands at full scale quality is 1, with all of them 2. Neither changes components or noise."""
     lines = made_lines()
-    before, values = find_components(statistics_of_lines(lines)), values_of(lines)
+    before = find_components(statistics_of_lines(lines))
+    values = values_of(lines)
     lines.raw[20, 10:14, ::3] = CAMERA.full_scale_dn
     lines.raw[80, 5] = CAMERA.full_scale_dn
     stored, done = condense(lines)
@@ -156,8 +160,7 @@ def test_saturated_spectra_are_restored_or_unusable() -> None:
     assert np.argwhere(stored.quality == UNUSABLE).tolist() == [[80, 5]]
     assert len(stored.components) == len(before)
     np.testing.assert_allclose(stored.components.noise, before.noise, rtol=0.02)
-    off = (stored.restored(done) - values)[20, 10:14] / before.noise
-    assert np.abs(off).max() < 5
+    assert np.abs((stored.restored(done) - values)[20, 10:14] / before.noise).max() < 5
     assert len(done.rare) == 0
     assert done.saturated == 5
 
@@ -201,7 +204,8 @@ def test_a_dark_frame_that_drifts_per_element_makes_many_spectra_rare() -> None:
 
 def test_progress_ends_at_one() -> None:
     """Every block reports the completed fraction."""
-    lines, told = made_lines(), []
+    lines = made_lines()
+    told = []
     found = statistics_of_lines(lines)
     components = find_components(found)
     condenser = Condenser(components, ResidualLaw.learned(found.spectra, components), CAMERA, 1.0)

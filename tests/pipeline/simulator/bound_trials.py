@@ -97,8 +97,10 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: Collection[str] = (
             light = [expected_light(case.scene, block, shown) for block in blocks]
             fraction = misplaced_fraction(exact, shown)
             for one in stored:
-                bound = _error(one.menus, menu.name, variant) / SAFETY
-                yield Trial(menu.name, variant, one.binning, bound, *one.change(light, full, fraction), one.rounding)
+                own = next(each for each in one.menus if each.name == menu.name)
+                error = next(option.error for option in (own.off, *own.variants) if option.variant == variant)
+                changes = one.change(light, full, fraction)
+                yield Trial(menu.name, variant, one.binning, error / SAFETY, *changes, one.rounding)
 
 
 def _stored(full: list[Radiance], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
@@ -122,11 +124,6 @@ def _summed(values: Radiance, binning: int) -> Radiance:
     count = values.shape[1] // binning
     sums: Radiance = values[:, : count * binning].reshape(len(values), count, binning, -1).sum(axis=2)
     return sums
-
-
-def _error(menus: tuple[Menu, ...], name: str, variant: str) -> float:
-    menu = next(one for one in menus if one.name == name)
-    return next(option.error for option in (menu.off, *menu.variants) if option.variant == variant)
 
 
 def misplaced_fraction(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:

@@ -55,15 +55,18 @@ class Tile:
 def random_tile(number: int, focus_m: float | None = None) -> Tile:
     """Return the tile of a number, always the same; kinds alternate. ``focus_m``: for a scene at 40 m; None: sharp."""
     rng = np.random.default_rng([17, number])
-    kind, size = KINDS[number % len(KINDS)], TILE_PX + 2 * EDGE_PX
+    kind = KINDS[number % len(KINDS)]
+    size = TILE_PX + 2 * EDGE_PX
     values = np.full((size, size), rng.choice([0.0, 0.1, 0.5]))
     values[EDGE_PX:-EDGE_PX, EDGE_PX:-EDGE_PX] = _drawn(rng, kind, float(values[0, 0]))
-    nm, electrons = float(rng.uniform(450, 1000)), float(rng.uniform(5e3, 2e4))
+    nm = float(rng.uniform(450, 1000))
+    electrons = float(rng.uniform(5e3, 2e4))
     scene = made_scene(values[..., None], np.array([[electrons]]), [nm])
     air = Air() if focus_m is None else Air(distance_m=40.0)
     optics = Optics(aberration_px=float(rng.uniform(0, 0.4)), keystone_px=float(rng.uniform(0, 0.4)))
     rig = Rig(LineCamera(samples=64), optics if focus_m is None else replace(optics, focus_m=focus_m), air=air)
-    step, start = int(rng.choice([1, 1, 1, 2])), float(rng.uniform(-TILE_PX / 2, TILE_PX / 2))
+    step = int(rng.choice([1, 1, 1, 2]))
+    start = float(rng.uniform(-TILE_PX / 2, TILE_PX / 2))
     sweep = Sweep("tile", "fine" if step == 1 else "coarse", "x", float(rng.uniform(-20, 20)), start, 1, step)
     return Tile(kind, scene, rig, sweep, np.sort(rng.choice(64, SAMPLES, replace=False)))
 
@@ -96,7 +99,8 @@ def distances(tile: Tile) -> Floats:
 
 def _seen(tile: Tile, views: RayViews, normal: Floats) -> Floats:
     """Return the light of the samples with these views, (n,), as a sum over all waves that the pupil passes. [e-]"""
-    scene, rig = tile.scene, tile.rig
+    scene = tile.scene
+    rig = tile.rig
     values = scene.planes[..., 0].astype(np.float64) * float(scene.electrons[0, 0])
     ground = values[0, 0]
     waves = scene.wavelength_nm[0] * 1e-9 / (rig.optics.aperture_mm * 1e-3) / rig.camera.ifov_rad
@@ -106,7 +110,8 @@ def _seen(tile: Tile, views: RayViews, normal: Floats) -> Floats:
     x, y = column / PERIOD_PX, row[:, None] / PERIOD_PX
     passed *= (np.sinc(x) * np.sinc(y)) ** 2
     passed[:, 1:] *= 2  # and the waves of the other sign
-    ifov, middle = rig.camera.ifov_rad, (np.array(scene.shape) - 1) / 2
+    ifov = rig.camera.ifov_rad
+    middle = (np.array(scene.shape) - 1) / 2
     found = []
     for n in range(len(views.along)):
         run = views.along_run[n] * x + views.scan_run[n] * y
@@ -124,7 +129,8 @@ def _transfer(run: Floats, turn: Floats, rig: Rig, nm: Floats, normal: Floats, w
     steep = (n_y * run + n_x * turn) / n_z
     contrast = np.interp(waves * np.sqrt(run**2 + turn**2 + steep**2), *autocorrelation(), right=0.0)
     blur = np.exp(-2 * np.pi**2 * rig.optics.aberration_px**2 * (run**2 + turn**2))
-    shift, disc = np.exp(2j * np.pi * float(keystone_shift(rig, nm)[0]) * run), 1.0
+    shift = np.exp(2j * np.pi * float(keystone_shift(rig, nm)[0]) * run)
+    disc = 1.0
     if rig.air.distance_m is not None:
         apart = abs(1 / rig.air.distance_m - 1 / rig.optics.focus_m)
         wide = rig.optics.aperture_mm * 1e-3 * apart / rig.camera.ifov_rad

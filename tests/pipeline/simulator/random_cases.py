@@ -54,7 +54,8 @@ class Case:
 
     def blocks(self, probe: Probe) -> list[SweepBlock]:
         """Return the measured lines of every sweep: the first sweep starts the survey, the others end it."""
-        scene, rig = self.scene, self.rig
+        scene = self.scene
+        rig = self.rig
         white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
         ends = [0.0, *(probe.seconds - rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
         return [
@@ -76,10 +77,12 @@ class Case:
 def random_case(number: int) -> Case:
     """Return the case of a number, always the same."""
     rng = np.random.default_rng([6, number])
-    rig, upright = random_rig(rng), bool(rng.random() < 0.3)
+    rig = random_rig(rng)
+    upright = bool(rng.random() < 0.3)
     scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
     far = float(rng.choice([0.0, rng.uniform(-LONG_PX / 2 + 40, LONG_PX / 2 - 40)]))
-    step, count = int(rng.choice([1, 1, 1, 4])), int(rng.integers(LINES[0], LINES[1] + 1))
+    step = int(rng.choice([1, 1, 1, 4]))
+    count = int(rng.integers(LINES[0], LINES[1] + 1))
     axis = "y" if upright else "x"
     kind = "fine" if step == 1 else "coarse"
     sweeps = tuple(
@@ -122,7 +125,8 @@ def _plane(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:
     noise = gaussian_filter(rng.standard_normal(shape), float(rng.choice([0.0, 0.7, 2.0, 8.0])))
     noise = (noise - noise.min()) / np.ptp(noise)
     dots = (rng.random(shape) < 2e-3).astype(np.float64)
-    base, contrast = rng.uniform(0.0, 0.5), rng.choice([1.0, 0.3, 0.05])
+    base = rng.uniform(0.0, 0.5)
+    contrast = rng.choice([1.0, 0.3, 0.05])
     ramp = (way - way.min()) / np.ptp(way)
     found = {"edges": bars, "texture": noise, "points": dots, "gradient": ramp, "both": bars / 2 + noise / 2}
     plane: Floats = base + contrast * (1 - base) * found[kind]
@@ -146,7 +150,8 @@ def random_rig(rng: np.random.Generator) -> Rig:
         read_noise_e=float(rng.uniform(5, 40)),
     )
     air = _air(rng)
-    optics, mirror = _optics(rng, air.distance_m), _mirror(rng)
+    optics = _optics(rng, air.distance_m)
+    mirror = _mirror(rng)
     detector = Detector(prnu_std=_some(rng, 1e-3, 0.03), striping_std=_some(rng, 1e-3, 0.02))
     return Rig(camera, optics, mirror, detector, air, _sky(rng))
 
@@ -172,16 +177,11 @@ def _optics(rng: np.random.Generator, distance_m: float | None) -> Optics:
     )
 
 
-def _coating(rng: np.random.Generator) -> Coating:
-    """Return a metal, or ``ideal`` in half of the cases."""
+def _mirror(rng: np.random.Generator) -> MirrorMotion:
     metals: tuple[Coating, ...] = ("aluminium", "gold", "silver")
     metal = metals[int(rng.uniform(0, 3))]
-    return metal if rng.random() < 0.5 else "ideal"
-
-
-def _mirror(rng: np.random.Generator) -> MirrorMotion:
     return MirrorMotion(
-        coating=_coating(rng),
+        coating=metal if rng.random() < 0.5 else "ideal",
         natural_hz=float(rng.uniform(5, 100)),
         damping=float(rng.choice([0.3, 0.7, 1.0, 2.0])),
         settled_s=float(rng.uniform(0.05, 0.5)),

@@ -25,11 +25,10 @@ def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike
     """Return a scene of planes (y, x, component) and electrons (component, band); white is their maximum."""
     light = np.asarray(electrons, np.float32)
     white = light if light.ndim == 1 else light.max(axis=0)
+    radiance = Once.of(SceneRadiance(light, white))
     nm = np.asarray(wavelength_nm, np.float64)
     raster = SceneRaster.of(np.ascontiguousarray(planes, np.float32))
-    return RasterScene(
-        "made", "made", raster, Once.of(SceneRadiance(light, white)), np.ones(len(nm), np.float32), nm, **more
-    )
+    return RasterScene("made", "made", raster, radiance, np.ones(len(nm), np.float32), nm, **more)
 
 
 def image_scene(values: ArrayLike, camera: LineCamera, wavelength_nm: ArrayLike) -> RasterScene:

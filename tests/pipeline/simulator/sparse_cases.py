@@ -25,7 +25,8 @@ KINDS = (*IN_BANDS, "beside fields", "beside points", "bright line", "pixel")
 def sparse_case(number: int) -> Case:
     """Return the case of a number, always the same; the kinds alternate."""
     rng = np.random.default_rng([11, number])
-    kind, rig = KINDS[number % len(KINDS)], random_rig(rng)
+    kind = KINDS[number % len(KINDS)]
+    rig = random_rig(rng)
     samples = rig.camera.samples
     if kind in IN_BANDS:
         values = _cube(rng, kind)
@@ -36,9 +37,8 @@ def sparse_case(number: int) -> Case:
         lines = int(rng.integers(1, 6)) if kind != "bright line" else 120
         start = float(rng.uniform(-20, 20)) if kind != "bright line" else -60.0
         sweeps = (Sweep("lone", "fine", "x", float(rng.uniform(-10, 10)), start, lines),)
-        values = {"beside fields": _beside, "beside points": _beside, "bright line": _line, "pixel": _pixel}[kind](
-            rng, kind, sweeps[0]
-        )
+        made = {"beside fields": _beside, "beside points": _beside, "bright line": _line, "pixel": _pixel}[kind]
+        values = made(rng, kind, sweeps[0])
     return Case(_scene(rng, values, rig), rig, sweeps, None, number)
 
 
@@ -92,7 +92,8 @@ def _line(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
     """Return dark land with one bright stripe across it, which has a dark gap."""
     bands = int(rng.choice([1, 3, 12]))
     values = np.full((*SHAPE, bands), rng.uniform(0, 0.2))
-    row, high = int(rng.integers(20, 120)), int(rng.integers(3, 12))
+    row = int(rng.integers(20, 120))
+    high = int(rng.integers(3, 12))
     values[row : row + high] = 1.0
     column = int(rng.integers(40, 85))
     values[row : row + high, column : column + int(rng.integers(2, 12))] = 0.0

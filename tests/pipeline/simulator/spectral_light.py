@@ -31,14 +31,14 @@ def random_light(seed: int, bands: int = 90, samples: int = SAMPLES, lines: int 
     """Return uneven wavelengths [nm], and patches of a few spectra with edges and absorption lines [e-]."""
     rng = np.random.default_rng(seed)
     wavelength = 400 + np.cumsum(rng.uniform(1.5, 3.0, bands))
-    place, spectra = wavelength[None, :], np.full((4, bands), 300.0)
+    place = wavelength[None, :]
+    spectra = np.full((4, bands), 300.0)
     for _ in range(5):
         centre, width = rng.uniform(400, 620, (4, 1)), np.exp(rng.uniform(np.log(2), np.log(80), (4, 1)))
         spectra = spectra + rng.uniform(0, 3000, (4, 1)) / (1 + np.exp(-(place - centre) / width))
         spectra = spectra * (1 - rng.uniform(0, 0.3, (4, 1)) * np.exp(-(((place - centre) / width) ** 2)))
     which = rng.integers(0, 4, (lines, -(-samples // 8))).repeat(8, axis=1)[:, :samples]
-    light = spectra[which] * rng.uniform(0.6, 1.4, (lines, samples, 1))
-    return wavelength, light.astype(np.float32)
+    return wavelength, (spectra[which] * rng.uniform(0.6, 1.4, (lines, samples, 1))).astype(np.float32)
 
 
 def block_of(
@@ -58,8 +58,10 @@ def probe_of(
     light: Radiance, wavelength_nm: Floats, unit: Unit = "sigma", fwhm_nm: Floats | None = None, sweep: Sweep = SWEEP
 ) -> Probe:
     """Return the probe of all samples of some lines."""
-    signal, one = np.asarray(light, np.float64), units(light, unit)
-    most, none = tuple(range(light.ndim - 1)), np.zeros((2, len(wavelength_nm)))
+    signal = np.asarray(light, np.float64)
+    one = units(light, unit)
+    most = tuple(range(light.ndim - 1))
+    none = np.zeros((2, len(wavelength_nm)))
     return Probe(
         unit=unit,
         sweeps=(sweep,),

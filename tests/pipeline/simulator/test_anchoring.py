@@ -37,9 +37,8 @@ def brightness(scene: RasterScene) -> np.ndarray:
 def anchored(sweep: Sweep, offset: tuple[float, float], *, prior_px: float = 16) -> Anchor:
     """Return the anchor of a sweep whose mirror has an offset, on the mosaic of one without."""
     seen = textured()
-    source = SimulatedSource(
-        seen, Rig(CAMERA), 0, effects_on("rotation", "read-noise"), pointing=CommonOffset(way_px=offset)
-    )
+    effects = effects_on("rotation", "read-noise")
+    source = SimulatedSource(seen, Rig(CAMERA), 0, effects, pointing=CommonOffset(way_px=offset))
     broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
     return anchor_sweep(broad, CAMERA, GRID, brightness(seen), prior_px=prior_px)
 
@@ -66,12 +65,11 @@ def test_short_sweep_at_the_end_of_the_field_is_found(start: float) -> None:
     np.testing.assert_allclose(found.shift.offset, [-8.0, 2.5], atol=0.15)
 
 
-def test_sweep_without_overlap_with_its_planned_place_is_found() -> None:
-    """A sweep of 24 lines with an offset of 24 px, forward or backward, is found within the prior of 30 px."""
-    found = anchored(sweep_of(start=-10.0, lines=24), (-3.0, 24.0), prior_px=30)
-    np.testing.assert_allclose(found.shift.offset, [-3.0, 24.0], atol=0.2)
-    back = anchored(sweep_of(start=-10.0, lines=24), (3.0, -24.0), prior_px=30)
-    np.testing.assert_allclose(back.shift.offset, [3.0, -24.0], atol=0.2)
+@pytest.mark.parametrize("offset", [(-3.0, 24.0), (3.0, -24.0)], ids=["forward", "backward"])
+def test_sweep_without_overlap_with_its_planned_place_is_found(offset: tuple[float, float]) -> None:
+    """A sweep of 24 lines with an offset of 24 px is found within the prior of 30 px."""
+    found = anchored(sweep_of(start=-10.0, lines=24), offset, prior_px=30)
+    np.testing.assert_allclose(found.shift.offset, offset, atol=0.2)
 
 
 def test_sweep_with_an_offset_beyond_the_prior_is_not_moved() -> None:
@@ -85,7 +83,8 @@ def test_sweep_without_common_pixels_with_the_mosaic_is_empty() -> None:
     """Without a usable line, beside the field, or on a mosaic of NaN, there is nothing to compare."""
     source = SimulatedSource(textured(), Rig(CAMERA), 0, effects_on("rotation"))
     broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
-    blind, mosaic = replace(broad, usable=np.zeros(140, bool)), brightness(textured())
+    blind = replace(broad, usable=np.zeros(140, bool))
+    mosaic = brightness(textured())
     assert anchor_sweep(blind, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
     assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
     beside = BroadSweep.read(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)

@@ -105,7 +105,8 @@ def test_sweep_conserves_light(picture: str, chosen: dict[Any, str], swath: floa
 @pytest.mark.parametrize("level", [2, 4, 16, 64])
 def test_thinned_scenes_keep_their_light(level: int) -> None:
     """A spot anywhere between the remaining pixels, which the far tails use, keeps its light."""
-    rng, planes = np.random.default_rng(level), np.zeros((700, 600, 3), np.float32)
+    rng = np.random.default_rng(level)
+    planes = np.zeros((700, 600, 3), np.float32)
     planes[rng.integers(250, 400, 3), rng.integers(250, 350, 3), range(3)] = 1.0
     found = SceneRaster.of(planes).thinned(level)
     assert found.min() >= 0
@@ -116,8 +117,7 @@ def test_thinned_scenes_keep_their_light(level: int) -> None:
 def test_edge_of_the_scene_is_repeated_outside(pattern: str) -> None:
     """A scene has the same light as one padded with 320 px of its edge, also through the far tails."""
     y, x = np.mgrid[:41, :52]
-    noise = np.random.default_rng(3).random((41, 52))
-    plane = {"rows": y % 2, "columns": x // 3 % 2, "noise": noise}[pattern]
+    plane = {"rows": y % 2, "columns": x // 3 % 2, "noise": np.random.default_rng(3).random((41, 52))}[pattern]
     values = np.repeat(plane[..., None] + 0.0, len(NM), axis=2)
     wide = np.pad(values, ((320, 320), (320, 320), (0, 0)), mode="edge")
     sweep = Sweep("s", "fine", "x", 0.0, -24.0, 49)
@@ -133,7 +133,8 @@ def test_tails_of_diffraction_match_the_pupil() -> None:
     """
     rig = Rig(camera=LineCamera(samples=16))
     values = np.repeat((np.arange(801) > 400)[None, :, None] * np.ones((400, 1, 4)), 1, axis=2)
-    scene, px = image_scene(values, rig.camera, NM), np.array([10, 20, 35, 50])
+    scene = image_scene(values, rig.camera, NM)
+    px = np.array([10, 20, 35, 50])
     sweeps = [Sweep("s", "fine", "x", swath_px=-float(x), start_px=0.0, lines=1) for x in px]
     light = np.concatenate([seen(scene, sweep, {SLIT: "1x1", DIFFRACTION: "airy"}, rig)[:, 8] for sweep in sweeps])
     waves = NM * 1e-9 / 15e-3 / rig.camera.ifov_rad
@@ -145,12 +146,11 @@ FINE = Sweep("fine", "fine", "x", swath_px=900.0, start_px=-700.0, lines=20)
 PLAIN = {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"}
 
 
-def grainy(bands: int = 5, seed: int = 0) -> RasterScene:
-    """Return a raster of 3 components, different at every pixel, mixed to ``bands``."""
-    rng = np.random.default_rng(seed)
-    planes, wavelength = rng.uniform(0, 1, (90, 110, 3)).astype(np.float32), np.linspace(400, 1000, bands)
-    electrons = rng.uniform(1e3, 9e3, (3, bands)).astype(np.float32)
-    return made_scene(planes, electrons, wavelength)
+def grainy() -> RasterScene:
+    """Return a raster of 3 components, different at every pixel, mixed to 5 bands."""
+    rng = np.random.default_rng(0)
+    planes = rng.uniform(0, 1, (90, 110, 3)).astype(np.float32)
+    return made_scene(planes, rng.uniform(1e3, 9e3, (3, 5)).astype(np.float32), np.linspace(400, 1000, 5))
 
 
 def block_of(scene: RasterScene, sweep: Sweep, lines: range, **more: object) -> SweepBlock:
@@ -166,15 +166,15 @@ def test_line_without_effects_shows_pixel_values() -> None:
     scene = grainy()
     sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-20.5, lines=30)  # places are pixel centres
     light = expected_light(scene, block_of(scene, sweep, range(30)), {})[:, 300:340]
-    wanted = scene.planes[24:54, 35:75] @ scene.electrons
-    np.testing.assert_allclose(light, wanted, rtol=1e-5)
+    np.testing.assert_allclose(light, scene.planes[24:54, 35:75] @ scene.electrons, rtol=1e-5)
 
 
 def test_scene_with_a_plane_per_band_equals_its_diagonal_matrix() -> None:
     """The same planes with a full but diagonal matrix of electrons give the same light."""
     diagonal = image_scene(np.random.default_rng(1).uniform(0, 1, (60, 50, 4)), CAMERA, np.linspace(400, 1000, 4))
     light = SceneRadiance(np.diag(diagonal.electrons), diagonal.white_reference_electrons)
-    full, chosen = replace(diagonal, light=Once.of(light)), {**PLAIN, Widening(): "only"}
+    full = replace(diagonal, light=Once.of(light))
+    chosen = {**PLAIN, Widening(): "only"}
     one, other = (expected_light(s, block_of(s, NEAR, range(12, 16)), chosen) for s in (diagonal, full))
     np.testing.assert_allclose(one, other, rtol=1e-5, atol=0.05)
 
@@ -194,11 +194,9 @@ class Widening:
 
 def test_blurs_widen_and_shift_each_band_by_its_moments() -> None:
     """On a wave every band has the contrast of its Gaussian and is seen from the shifted place."""
-    x = np.arange(160)
-    wave = 1 + 0.5 * np.sin(2 * np.pi * x / 20)
+    wave = 1 + 0.5 * np.sin(2 * np.pi * np.arange(160) / 20)
     scene = image_scene(np.broadcast_to(wave[None, :, None], (40, 160, 6)), CAMERA, np.linspace(400, 1000, 6))
-    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=-0.5, lines=1)
-    block = block_of(scene, sweep, range(1))
+    block = block_of(scene, Sweep("s", "fine", "x", swath_px=0.0, start_px=-0.5, lines=1), range(1))
     light = expected_light(scene, block, {SLIT: "3x1", Widening(): "only"})[0, 280:360] / scene.electrons
     grown = np.arange(6) / 6
     passed = np.exp(-2 * np.pi**2 * 0.2 * grown / 400) * np.sinc(1 / 20) ** 3  # pixel, and linear interpolation
@@ -228,7 +226,8 @@ class Nudge:
 
 def test_aims_and_displacements_move_the_view() -> None:
     """Close to rest an aim and a displacement by whole px show the samples of neighbouring lines."""
-    scene, sweep = grainy(), replace(NEAR, swath_px=0.0, start_px=-20.0)
+    scene = grainy()
+    sweep = replace(NEAR, swath_px=0.0, start_px=-20.0)
     plain = expected_light(scene, block_of(scene, sweep, range(16)), {SLIT: "3x1"})[:, 310:330]
     for do in ("aim", "displaced"):
         moved = expected_light(scene, block_of(scene, sweep, range(2, 16)), {Nudge(do): "only", SLIT: "3x1"})
@@ -239,7 +238,8 @@ def test_gains_and_changes_are_applied_in_order() -> None:
     """Light that is added before a gain differs from light that is added after it."""
     scene = grainy()
     block = block_of(scene, NEAR, range(3))
-    plain, gain = expected_light(scene, block, {}), np.arange(1, 6, dtype=np.float32)
+    plain = expected_light(scene, block, {})
+    gain = np.arange(1, 6, dtype=np.float32)
     first = expected_light(scene, block, {Nudge("gain"): "only", Nudge("change"): "only"})
     last = expected_light(scene, block, {Nudge("change"): "only", Nudge("gain"): "only"})
     np.testing.assert_allclose(first, plain * gain + 7, rtol=1e-6)
@@ -259,11 +259,14 @@ def test_flat_scene_gives_flat_lines() -> None:
 @pytest.mark.parametrize("step", [1, 4])
 def test_undeflected_sweep_equals_the_operator_of_training(step: int) -> None:
     """Around the undeflected direction lines match the closed-form operator that training uses, with slit and smear."""
-    rng, (y, x), values = np.random.default_rng(0), np.mgrid[:40, :640], np.ones((40, 640, 1))
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:40, :640]
+    values = np.ones((40, 640, 1))
     for _ in range(12):  # waves of 6 to 60 px
         fy, fx = rng.normal(size=2) / rng.uniform(6, 60)
         values += 0.03 * np.cos(2 * np.pi * (fy * y + fx * x) + rng.uniform(0, 6))[..., None]
-    scene, sweep = image_scene(values, CAMERA, [400.0]), replace(SWEEP, lines=40 // step, step=step)
+    scene = image_scene(values, CAMERA, [400.0])
+    sweep = replace(SWEEP, lines=40 // step, step=step)
     lines = expected_light(scene, sweep_block(scene, Rig(CAMERA), sweep, range(sweep.lines)), OPTICS)
     exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
     viewed = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)

@@ -35,9 +35,9 @@ def source_of(values: np.ndarray, camera: LineCamera = CAMERA, **options: object
     return SimulatedSource(scene, Rig(camera), **options)
 
 
-def raw_of(source: Source, sweep: Sweep = SWEEP, first: int = 0) -> np.ndarray:
+def raw_of(source: Source, sweep: Sweep = SWEEP) -> np.ndarray:
     """Return all lines of a sweep, (line, sample, band)."""
-    return np.stack([line.data for line in source.lines(sweep, first)])
+    return np.stack([line.data for line in source.lines(sweep)])
 
 
 def test_lines_do_not_depend_on_the_first_line_read() -> None:
@@ -123,9 +123,8 @@ def sweeps_of(*sizes: int, step: int = 1) -> list[Sweep]:
 
 def test_start_times_of_sweeps_match_hand_calculation() -> None:
     """Set-ups take .45 s, one load of up to 1500 positions 1.6 s, and a line 100 ms."""
-    assert sweep_starts(sweeps_of(10, 20, 5), CAMERA, COST) == pytest.approx(
-        {"sweep 0": 2.05, "sweep 1": 3.5, "sweep 2": 5.95}
-    )
+    starts = sweep_starts(sweeps_of(10, 20, 5), CAMERA, COST)
+    assert starts == pytest.approx({"sweep 0": 2.05, "sweep 1": 3.5, "sweep 2": 5.95})
     starts = sweep_starts(sweeps_of(1000, 1000, 5), CAMERA, COST)  # the second begins in the first load
     assert starts == pytest.approx({"sweep 0": 2.05, "sweep 1": 102.5, "sweep 2": 204.55})
 
@@ -151,8 +150,8 @@ def test_light_follows_the_clock() -> None:
     """A sweep that starts an hour later in the morning is brighter; references are those of the survey's start."""
     scene = image_scene(np.full((8, 8, 3), 0.1), CAMERA, [500.0, 600.0, 700.0])
     rig = Rig(CAMERA, sky=Sky(started=datetime(2025, 6, 21, 5, tzinfo=UTC)))
-    chosen, sweep = effects_on("rotation", "drift"), Sweep("a", "fine", "x", 0.0, 0.0, 2)
-    now = SimulatedSource(scene, rig, chosen=chosen)
+    sweep = Sweep("a", "fine", "x", 0.0, 0.0, 2)
+    now = SimulatedSource(scene, rig, chosen=effects_on("rotation", "drift"))
     later = replace(now, clock={"a": 3600.0, "b": 0.0})
     assert (later.started_s(sweep), later.started_s(replace(sweep, name="c")), now.started_s(sweep)) == (3600, 0, 0)
     brighter = later.render(sweep, range(2)).astype(int) - 64
@@ -168,11 +167,11 @@ WHITE_REFERENCE_SWEEP = Sweep("s", "fine", "x", swath_px=900.0, start_px=-1500.0
 BANDS = 12
 
 
-def even_scene(fwhm_nm: float = 2.0) -> RasterScene:
+def even_scene() -> RasterScene:
     """Return an even scene under light with a deep absorption, 40 % of the white reference; values are reflectances."""
     nm = np.linspace(740, 784, BANDS)
     white_reference_electrons = (30_000 * (1 - 0.6 * np.exp(-(((nm - 762) / 5) ** 2)))).astype(np.float32)
-    return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, fwhm_nm))
+    return made_scene(np.full((20, 20, 1), 0.4), white_reference_electrons[None], nm, fwhm_nm=np.full(BANDS, 2.0))
 
 
 def white_reference_source_of(*names: str, rig: Rig = RIG) -> SimulatedSource:
@@ -189,12 +188,13 @@ def test_calibration_removes_effects_that_the_frames_show(names: tuple[str, ...]
 
     The raw numbers differ from those without the effects: there was something to remove.
     """
-    source, sweep = white_reference_source_of(*names), WHITE_REFERENCE_SWEEP
-    raw, position = source.render(sweep, range(sweep.lines)), line_positions(sweep, WHITE_REFERENCE_CAMERA)
-    values, _ = calibrate(raw, source.references(sweep), saturated_dn=65535 * sweep.binning, position=position)
+    source = white_reference_source_of(*names)
+    raw = source.render(WHITE_REFERENCE_SWEEP, range(6))
+    position = line_positions(WHITE_REFERENCE_SWEEP, WHITE_REFERENCE_CAMERA)
+    values, _ = calibrate(raw, source.references(WHITE_REFERENCE_SWEEP), saturated_dn=65535, position=position)
     np.testing.assert_allclose(values, 0.4, atol=2e-4)
-    plain = white_reference_source_of().render(sweep, range(6)).astype(int)
-    assert np.abs(raw[:6].astype(int) - plain).max() > 20
+    plain = white_reference_source_of().render(WHITE_REFERENCE_SWEEP, range(6)).astype(int)
+    assert np.abs(raw.astype(int) - plain).max() > 20
 
 
 def test_binned_frames_are_sums() -> None:
@@ -236,10 +236,8 @@ def test_band_response_smooths_the_white_reference() -> None:
     scene = even_scene()
     detailed = 1 - 0.5 * np.exp(-(((scene.wavelength_nm - 762) / 4) ** 2))
     scene = replace(scene, white_reference=detailed.astype(np.float32))
-    plain, wide = (
-        SimulatedSource(scene, RIG, chosen=effects_on(*names)).references(WHITE_REFERENCE_SWEEP).white_reference
-        for names in ((), ("response",))
-    )
+    sources = [SimulatedSource(scene, RIG, chosen=effects_on(*names)) for names in ((), ("response",))]
+    plain, wide = (source.references(WHITE_REFERENCE_SWEEP).white_reference for source in sources)
     np.testing.assert_array_equal(plain, scene.white_reference)
     assert wide.min() > plain.min() + 0.05
     np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)

@@ -24,7 +24,7 @@ class LinesOf:
 
     def __call__(self, times: NDArray[np.float64]) -> NDArray[np.uint16]:
         """Return lines (line, sample, band) uint16 for their times."""
-        seed, cell = np.rint(times * 1e4).astype(np.int64) * 7919, np.arange(24).reshape(6, 4) * 31
-        lines = ((seed[:, None, None] + cell) % 4096).astype(np.uint16)
+        seed = np.rint(times * 1e4).astype(np.int64) * 7919
+        lines = ((seed[:, None, None] + 31 * np.arange(24).reshape(6, 4)) % 4096).astype(np.uint16)
         self.given.append(lines)
         return lines

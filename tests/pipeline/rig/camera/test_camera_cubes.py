@@ -130,8 +130,7 @@ def test_references_are_found_in_a_folder() -> None:
 
 def frames(level: float, count: int = 40, shape: tuple[int, int] = (40, 10)) -> np.ndarray:
     """Return noisy frames (frame, sample, band) around a level."""
-    rng = np.random.default_rng(3)
-    return np.clip(np.rint(rng.normal(level, 4, (count, *shape))), 0, 4095).astype(np.uint16)
+    return np.clip(np.rint(np.random.default_rng(3).normal(level, 4, (count, *shape))), 0, 4095).astype(np.uint16)
 
 
 def test_mean_frame_is_exact() -> None:
@@ -161,8 +160,7 @@ def test_references_that_do_not_fit_are_refused() -> None:
         as_references(dark, mean_frame(frames(3000, shape=(40, 9))))
     with pytest.raises(ShapeError, match="at least one frame"):
         mean_frame(np.zeros((0, 2, 3), np.uint16))
-    one = mean_frame(frames(64, 1))
-    assert not one.stuck.any()
+    assert not mean_frame(frames(64, 1)).stuck.any()
 
 
 def test_stuck_elements_need_eight_frames() -> None:

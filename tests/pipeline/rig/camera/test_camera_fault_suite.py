@@ -128,10 +128,12 @@ def assert_right(lines: list[Line], undisturbed: list[Line]) -> None:
 
 def session(scan_passes: Polls, undisturbed: list[Line], camera: CameraFaults, mirror: tuple[Fault, ...] = ()) -> None:
     """Capture a sweep with a fault and its rest without: every line is captured once and right."""
-    kept, lines = KeptInMemory(), list[Line]()
+    kept = KeptInMemory()
+    lines: list[Line] = []
     for noted in (scan_passes.asked_s, scan_passes.captured_s, scan_passes.errors):
         noted.clear()
-    began_s, captures = scan_passes.rig.line.clock.now(), scan_passes.rig.emulated.camera.captures
+    began_s = scan_passes.rig.line.clock.now()
+    captures = scan_passes.rig.emulated.camera.captures
     captures.clear()  # of the previous session
     scan_passes.strike(camera, mirror)
     scan_passes.go_on(kept, lines)
@@ -168,9 +170,8 @@ def test_no_camera_fault_loses_lines_or_hangs(fault: CameraFault, scan_passes: P
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
         often = 1 if seed % 2 == 0 else int(rng.integers(3, 7))
-        occasions = {CameraFault.FULL: 2, CameraFault.BUSY: 2, CameraFault.CUT_CUBE: 2}.get(
-            fault, TRANSFERS if fault in OF_FILES else COMMANDS
-        )
+        usual = TRANSFERS if fault in OF_FILES else COMMANDS
+        occasions = 2 if fault in (CameraFault.FULL, CameraFault.BUSY, CameraFault.CUT_CUBE) else usual
         faults = CameraFaults({fault: often}, seed, int(rng.integers(occasions)))
         session(scan_passes, undisturbed, faults)
         struck += faults.left[fault] < often

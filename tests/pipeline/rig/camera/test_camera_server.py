@@ -33,7 +33,8 @@ def camera(
     faults: dict[CameraFault, int] | None = None, **server: object
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
     """Yield the driver of a served camera, the camera with the same clock, and the lines that it sees."""
-    clock, lines = ManualClock(100.0), LinesOf()
+    clock = ManualClock(100.0)
+    lines = LinesOf()
     device = FaultyCamera(lines, clock, faults=CameraFaults(dict(faults or {})))
     with FaultyServer(device) as served:
         files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
@@ -73,8 +74,7 @@ def test_capture_and_fetch_return_the_cameras_lines() -> None:
 def test_an_interrupted_transfer_resumes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several interruptions lose no byte and repeat none."""
     monkeypatch.setattr(camera_files, "OVERLAP", 16)
-    faults = {CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}
-    with camera(faults, tries=3) as (driver, device, lines):
+    with camera({CameraFault.BREAKS_OFF: 4, CameraFault.REFUSES_FILES: 2}, tries=3) as (driver, device, lines):
         folder = driver.capture(100).folder
         wait_for(driver, 5.0)
         kept = KeptInMemory()
@@ -111,10 +111,10 @@ def test_transfer_of_other_length(more: int, kind: type[RigError], words: str, m
         driver.capture(10)
         wait_for(driver, 5.0)
         name = "/captured/000000/raw_0"
-        whole, kept = device.files()[name], KeptInMemory()
+        whole = device.files()[name]
         monkeypatch.setattr("pipeline.rig.emulator.camera_device._FilesInMemory.getsize", lambda *_: len(whole) + more)
         with pytest.raises(RigError, match=words) as caught:
-            fetch_files(driver.server, [RemoteFile(name, None, False)], kept)
+            fetch_files(driver.server, [RemoteFile(name, None, False)], KeptInMemory())
         assert type(caught.value) is kind
 
 
@@ -142,9 +142,8 @@ def test_refused_files_are_reported() -> None:
         with pytest.raises(DeviceRefused, match="whether the file is there"):
             fetch_files(driver.server, [RemoteFile("/captured/none", 3, False)], KeptInMemory())
         port = driver.server.port
-    away = FileServer("127.0.0.1", port, tries=2, pause_s=0.0)
     with pytest.raises(DeviceGone, match="is not there, fell silent"):
-        fetch_files(away, [index], KeptInMemory())
+        fetch_files(FileServer("127.0.0.1", port, tries=2, pause_s=0.0), [index], KeptInMemory())
 
 
 def test_files_of_a_running_capture_are_not_fetched() -> None:

@@ -38,7 +38,8 @@ def test_latest_capture_of_a_line_counts() -> None:
 def test_a_reused_folder_name_counts_as_the_latest_capture() -> None:
     """An emptied camera numbers its folders anew: the new capture counts, is not spent, and gets its own positions."""
     kept = KeptInMemory()
-    journal, again = CaptureJournal(kept), replace(ONE, run_s=(7.0, 7.1))
+    journal = CaptureJournal(kept)
+    again = replace(ONE, run_s=(7.0, 7.1))
     journal.record_capture(ONE)
     journal.record_positions(ONE, tied(1.0), ())
     journal.record_spent(ONE, "gone")
@@ -59,7 +60,8 @@ def tied(residual_px: float) -> LinePositions:
 
 def test_the_mirror_log_is_restored_from_the_journal() -> None:
     """Another process reads the measured positions bit for bit."""
-    kept, position = KeptInMemory(), np.array([(0.1, -0.2), (0.3, 0.4)], np.float32)
+    kept = KeptInMemory()
+    position = np.array([(0.1, -0.2), (0.3, 0.4)], np.float32)
     journal = CaptureJournal(kept)
     journal.record_capture(ONE)
     journal.record_end(replace(ONE, log=MotionLog(position, 1000.0, 0.06, 0.04)))

@@ -74,7 +74,8 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
 )
 def test_rows_are_assigned_to_lines_by_frame_number(seen: CapturedLines, row: list[int]):
     """Numbers count from the capture's first frame. Lines that the cube lacks are left out."""
-    located, there = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA), np.array(row) >= 0
+    located = capture_paths.locate_lines(seen, PATH, TAKEN, CAMERA)
+    there = np.array(row) >= 0
     assert located.row.tolist() == row
     assert [located.is_valid(line) for line in range(len(row))] == there.tolist()
     np.testing.assert_array_equal(located.positions.position, PATH.middle[: len(row)][there].astype(np.float64))
@@ -82,8 +83,7 @@ def test_rows_are_assigned_to_lines_by_frame_number(seen: CapturedLines, row: li
 
 def test_a_complete_capture_without_an_index_is_in_order():
     """As many rows as lines are unambiguous; fewer rows are refused."""
-    unnumbered = frames([-1] * 6)
-    assert capture_paths.locate_lines(unnumbered, PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
+    assert capture_paths.locate_lines(frames([-1] * 6), PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
     with pytest.raises(capture_paths.UnusableCaptureError, match="fetch frameIndex"):
         capture_paths.locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA)
     with pytest.raises(capture_paths.UnusableCaptureError, match="has no number of the 6 frames"):
@@ -95,9 +95,7 @@ def test_captures_with_a_wrong_number_of_steps_are_refused(sweep: Sweep, last: i
     """With one edge too few or too many the wrong lines are unknown, also within the four cells of a coarse line."""
     path = capture_paths.next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
     count = last // sweep.step
-    taken = capture_paths.CaptureRecord(
-        sweep, 2, 2 + count, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last
-    )
+    taken = capture_paths.CaptureRecord(sweep, 2, 2 + count, "/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last)
     seen = frames(list(range(count)))
     assert capture_paths.locate_lines(seen, path, taken, CAMERA).row.tolist() == list(range(count))
     for index in (0, last - 3, last - 2, last - 1, last + 1):

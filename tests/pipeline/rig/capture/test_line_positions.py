@@ -20,7 +20,9 @@ from pipeline.rig.capture_paths import (
 )
 
 CAMERA = LineCamera(exposure_ms=8.0)
-LINES, PERIOD_S, DRIFT = 400, 0.01, 1e-5
+LINES = 400
+PERIOD_S = 0.01
+DRIFT = 1e-5
 START_S = 0.7371  # of the first frame on the mirror's clock
 BEGAN_S, CAPTURE_S = (10.0, 10.002), (10.736, 10.738)
 HELD = np.arange(6000) / 1000  # times at which the positions of a path are held
@@ -78,7 +80,8 @@ def test_a_played_position_is_held_for_its_period() -> None:
 
 def test_dropped_frames_do_not_move_other_lines() -> None:
     """Other lines keep their positions, whether frame numbers show the gap or only time stamps do."""
-    whole, kept = frames(), np.concatenate([np.arange(50), np.arange(53, LINES)])
+    whole = frames()
+    kept = np.concatenate([np.arange(50), np.arange(53, LINES)])
     numbered = replace(whole, number=whole.number[kept], stamp_us=whole.stamp_us[kept])
     found = by_log(numbered, scan_path())
     check_truth(found, kept)
@@ -119,7 +122,8 @@ def test_missing_time_stamps_make_lines_invalid() -> None:
 
 def test_dropped_first_frames_do_not_move_the_lines() -> None:
     """Lines that begin with frame 50 lie half a second after the capture's start, by log and by commands."""
-    whole, lines = frames(), np.arange(50, LINES)
+    whole = frames()
+    lines = np.arange(50, LINES)
     late = replace(whole, number=whole.number[50:], stamp_us=whole.stamp_us[50:])
     check_truth(by_log(late, scan_path()), lines)
     played = lines_by_time(late, CAMERA, played_scan_path(sweep(HELD), 1000.0), BEGAN_S, CAPTURE_S, "command")
@@ -134,7 +138,8 @@ def test_command_times_count_from_the_start_of_the_log() -> None:
 
 def test_positions_by_trigger_follow_the_frame_numbers() -> None:
     """Each frame number has one position. Frames without a number or beyond the path are invalid."""
-    path, told = sweep(np.arange(8) / 10), replace(frames(6), number=np.array([0, 1, -1, 3, 6, 99]))
+    path = sweep(np.arange(8) / 10)
+    told = replace(frames(6), number=np.array([0, 1, -1, 3, 6, 99]))
     found = lines_by_trigger(told, path, counted=True)
     np.testing.assert_array_equal(found.position[found.valid], path[[0, 1, 3, 6]])
     assert found.valid.tolist() == [True, True, False, True, True, False]

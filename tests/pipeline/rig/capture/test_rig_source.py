@@ -40,7 +40,8 @@ def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
 
 def test_each_sweep_is_captured_with_its_own_exposure():
     """Lines and references have the sweep's exposure, and another process finds the references in the journal."""
-    own, kept = replace(COARSE, exposure_ms=25.0), KeptInMemory()
+    own = replace(COARSE, exposure_ms=25.0)
+    kept = KeptInMemory()
     with small_rig() as rig:
         source = rig.source(kept)
         with source.session():  # one visit: the camera is configured anew between sweeps
@@ -66,8 +67,7 @@ def test_rig_lines_equal_those_of_the_simulated_source(sweep: Sweep, first: int)
     """Coarse lines, with four held positions and binned by four, and lines from number 9 on are equal as well."""
     with small_rig() as rig:
         source = rig.source()
-        found = list(source.lines(sweep, first))
-        assert_same(found, sweep, first)
+        assert_same(list(source.lines(sweep, first)), sweep, first)
         assert list(source.lines(sweep, sweep.lines)) == []
         assert len(rig.captures) == 1
 
@@ -140,13 +140,12 @@ def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
         kept = KeptInMemory()
         source = rig.source(kept)
         source.references(FINE)
-        once, opened = log_in.call_count, rig.opened
+        once = log_in.call_count
+        opened = rig.opened
         assert once > 0
-        again = source.saying(lambda words: None)
-        for sharing in (source, again):
-            np.testing.assert_allclose(
-                sharing.references(COARSE).dark, small_source().references(COARSE).dark, atol=0.1
-            )
+        dark = small_source().references(COARSE).dark
+        for sharing in (source, source.saying(lambda words: None)):
+            np.testing.assert_allclose(sharing.references(COARSE).dark, dark, atol=0.1)
         assert (log_in.call_count, rig.opened) == (once, opened)
         elsewhere = KeptInMemory()
         CaptureJournal(elsewhere).record_references(CaptureJournal(kept).references[None])

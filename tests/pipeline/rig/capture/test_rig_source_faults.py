@@ -67,12 +67,11 @@ def test_an_interrupted_transfer_resumes_in_the_next_process():
     """The camera disconnects within a file: the received bytes are kept, and nothing is captured again."""
     with small_rig() as rig:
         faults = rig.emulated.camera.faults
-        kept = KeptUntil(
-            acts={
-                b"raw_0.hdr": lambda: setattr(faults, "left", {CameraFault.BREAKS_OFF: 1}),
-                b"raw_0": lambda: faults.left.update({CameraFault.REFUSES_FILES: 9}),
-            }
-        )
+        acts = {
+            b"raw_0.hdr": lambda: setattr(faults, "left", {CameraFault.BREAKS_OFF: 1}),
+            b"raw_0": lambda: faults.left.update({CameraFault.REFUSES_FILES: 9}),
+        }
+        kept = KeptUntil(acts=acts)
         with pytest.raises(DeviceGone, match=r"bytes of \S+/raw_0 are kept, and a later fetch continues there"):
             list(rig.source(kept).lines(FINE))
         half = next(len(data) for name, data in kept.files.items() if name.endswith("/raw_0"))
@@ -99,7 +98,8 @@ def test_a_capture_is_used_after_the_process_is_killed(mark: bytes):
 def test_a_lost_edge_is_detected_and_its_lines_captured_again():
     """The mirror's index shows one step too few, so none of these lines is used."""
     with small_rig() as rig:
-        whole, left = rig.emulated.mirror.pulses, [1]
+        whole = rig.emulated.mirror.pulses
+        left = [1]
 
         def fewer(from_s: float, to_s: float) -> NDArray[np.float64]:
             found = whole(from_s, to_s)
@@ -136,7 +136,8 @@ class SlowEye:
 
     def __post_init__(self) -> None:
         camera = self.rig.emulated.camera
-        camera.aside, command = True, camera.command
+        camera.aside = True
+        command = camera.command
 
         def later(line: str) -> object:
             while self.rig.line.clock.now() > self.after_s and camera.keep_looking():
@@ -153,7 +154,8 @@ def test_a_camera_that_writes_slowly_is_waited_for():
         assert_same(list(rig.source().lines(FINE)))
         assert len(rig.captures) == 1
     with small_rig() as rig:
-        kept, eye = KeptInMemory(), SlowEye(rig, np.inf)
+        kept = KeptInMemory()
+        eye = SlowEye(rig, np.inf)
         with pytest.raises(RigError, match=r"still captures /captured/fine-3\S+, 120 s after it was stopped"):
             list(rig.source(kept).lines(FINE))
         eye.after_s = 0.0
@@ -186,7 +188,8 @@ def test_a_rig_of_unknown_state_gets_no_command():
     """A capture without a reply blocks the rig for every source of this process."""
     with small_rig(faults={CameraFault.SILENT: 1}) as rig:
         rig.emulated.camera.faults.passes = 1  # configure precedes the capture
-        source, kept = rig.source(), KeptInMemory()
+        source = rig.source()
+        kept = KeptInMemory()
         with pytest.raises(StateUnknown, match="not sent again"):
             list(source.keeping(kept).lines(FINE))
         said = len(rig.emulated.camera.commands)
@@ -257,8 +260,7 @@ def test_a_camera_that_was_emptied_captures_again(held: str):
         source = rig.source(kept)
         found = source.references(FINE)
         assert_same(list(source.lines(FINE)))
-    wanted = small_source().references(FINE)
-    assert abs(found.white - wanted.white).max() <= 1 / 64
+    assert abs(found.white - small_source().references(FINE).white).max() <= 1 / 64
     assert source.record["captures"][0]["spent"]
 
 

@@ -33,16 +33,17 @@ class Pair:
     """Drivers of both devices."""
 
     def __init__(self, mirror: MirrorController, camera: HeadwallCamera, clock: Clock) -> None:
-        self.mirror, self.camera, self.clock = mirror, camera, clock
+        self.mirror = mirror
+        self.camera = camera
+        self.clock = clock
         camera.configure(CAMERA.exposure_ms, CAMERA.frame_ms)
 
     def play(self, sweep: Sweep, first: int = 0, *, edges: bool = True, told: Sweep | None = None) -> str:
         """Play a sweep from a line on during a capture announced as ``told``, and return the folder of its files."""
         held = sweep_positions(sweep, CAMERA)[first:].reshape(-1, 2)
-        cells = np.concatenate([held[:1], held]) if edges else held
         self.mirror.goto(*held[0])
         self.mirror.settle(2.0)
-        self.mirror.load_path(cells)
+        self.mirror.load_path(np.concatenate([held[:1], held]) if edges else held)
         self.mirror.run(1000 * sweep.step / CAMERA.frame_ms, Trigger.RISING_EDGE if edges else Trigger.OFF)
         prefix = capture_prefix(sweep if told is None else told, first)
         folder = self.camera.capture(sweep.lines - first, prefix=prefix).folder
@@ -71,8 +72,7 @@ def planned(sweep: Sweep, lines: range, source: SimulatedSource | None = None) -
 def test_a_path_on_its_own_clock_gives_the_planned_lines(sweep: Sweep) -> None:
     """The path starts within half a held position of the first exposure."""
     with connected(wired="none") as (pair, _):
-        folder = pair.play(sweep, edges=False)
-        np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(sweep.lines)))
+        np.testing.assert_array_equal(pair.lines(pair.play(sweep, edges=False)), planned(sweep, range(sweep.lines)))
 
 
 @pytest.mark.parametrize(("wired", "cells"), [("position", 40), ("frame", 10), ("none", 0)])
@@ -88,7 +88,8 @@ def test_lines_show_the_mirrors_actual_position() -> None:
     with connected() as (pair, _):
         folder = pair.play(replace(FINE, start_px=FINE.start_px + 2, lines=FINE.lines - 2), told=FINE)
         np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(2, FINE.lines)))
-    source, beside = small_source(chosen=QUIET), replace(FINE, swath_px=FINE.swath_px + 0.5)
+    source = small_source(chosen=QUIET)
+    beside = replace(FINE, swath_px=FINE.swath_px + 0.5)
     with connected(source) as (pair, _):
         found = pair.lines(pair.play(beside, told=FINE)).astype(int)
     assert np.abs(found - planned(beside, range(FINE.lines), source)).max() <= 1
@@ -123,8 +124,7 @@ def test_the_source_clock_determines_the_start_of_a_sweep() -> None:
     source = small_source(clock={FINE.name: 12.0})
     with connected(source) as (pair, rig):
         pair.clock.sleep(100.0)
-        folder = pair.play(FINE)
-        np.testing.assert_array_equal(pair.lines(folder), planned(FINE, range(FINE.lines), source))
+        np.testing.assert_array_equal(pair.lines(pair.play(FINE)), planned(FINE, range(FINE.lines), source))
         assert rig.camera.view.source.started_s(FINE) == 12.0
 
 

@@ -61,7 +61,8 @@ class Session:
 
     def times(self) -> None:
         """Record the duration of each transaction: the wait before its first byte, and the rest."""
-        exchange, write = self.driver.wire.exchange, self.transport.write
+        exchange = self.driver.wire.exchange
+        write = self.transport.write
         first: list[float] = []
 
         def written(data: bytes, deadline: float) -> None:
@@ -93,14 +94,12 @@ class Session:
     def goes(self, x: float, y: float) -> None:
         """Go to a place, and assert the device's target if it is acknowledged."""
         self.driver.goto(x, y)
-        went = [axis.place[-1] for axis in self.device.state.axes]
-        assert went == [float(np.float32(x)), float(np.float32(y))]
+        assert [axis.place[-1] for axis in self.device.state.axes] == [float(np.float32(x)), float(np.float32(y))]
 
     def loads(self) -> None:
         """Load a path, and assert the device's memory if it is acknowledged."""
         self.driver.load_path(PATH)
-        held = self.device.state.memory[: PATH.size]
-        np.testing.assert_array_equal(held, PATH.T.ravel().astype(np.float32))
+        np.testing.assert_array_equal(self.device.state.memory[: PATH.size], PATH.T.ravel().astype(np.float32))
 
     def plays(self) -> None:
         """Play the path, and assert the final position if it is acknowledged."""

@@ -59,8 +59,10 @@ class Memory:
         self.clock = ManualClock()
         self.cells = bytearray(0x10000)
         self.frames: list[Frame] = []
-        self._wrong, self._deaf_after = wrong, deaf_after
-        self._reader, self._reply = FrameReader(), b""
+        self._wrong = wrong
+        self._deaf_after = deaf_after
+        self._reader = FrameReader()
+        self._reply = b""
         self.passed = 0  # bytes, in both directions
 
     def write(self, data: bytes, deadline: float) -> None:
@@ -113,7 +115,8 @@ def path(count: int) -> bytes:
 @settings(max_examples=30, deadline=None)
 def test_an_uploaded_path_is_stored(count: int, read_back: ReadBack):
     """Paths of any length arrive complete, ten cells per frame."""
-    memory, cells = Memory(), path(count)
+    memory = Memory()
+    cells = path(count)
     upload(link(memory), cells, read_back)
     assert memory.cells[: len(cells)] == cells
     assert not any(memory.cells[len(cells) :])

@@ -12,9 +12,7 @@ from pipeline.errors import ShapeError
 from pipeline.rig import pro_mode as pro
 from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
-nasty = st.one_of(
-    st.binary(max_size=50), st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)
-)
+nasty = st.binary(max_size=50) | st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)
 frames = st.builds(pro.Frame, st.integers(0, 255), nasty, st.integers(0, 255))
 
 

@@ -107,8 +107,8 @@ def test_a_late_acknowledgement_does_not_answer_the_next_read(caplog: pytest.Log
 
 def test_an_interrupted_motion_blocks_further_motions():
     """After Ctrl-C before the acknowledgement it is unknown whether the motion happened."""
-    transport = ScriptedTransport([(b"m\n", b"x")], ManualClock())
-    wire, stop = make(transport), Mock(side_effect=KeyboardInterrupt)
+    wire = make(ScriptedTransport([(b"m\n", b"x")], ManualClock()))
+    stop = Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         wire.exchange(b"m\n", "going", "motion", lambda: stop)
     with pytest.raises(StateUnknown, match="going was sent and not acknowledged"):

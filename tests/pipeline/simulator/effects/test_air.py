@@ -46,7 +46,9 @@ def test_turbulence_matches_the_structure_function():
     """
     kappa = np.geomspace(1e-4, 1e7, 40_000)  # 1/m
     place = (np.arange(64) + 0.5) / 64
-    d, cn2, aperture = 120.0, 1e-14, 0.015 * np.sqrt(0.5)
+    d = 120.0
+    cn2 = 1e-14
+    aperture = 0.015 * np.sqrt(0.5)
     spectrum = 0.033 * cn2 * kappa ** (-8 / 3) * (1 - j0(kappa * aperture * place[:, None]))
     variance = 8 * np.pi**2 * d * np.trapezoid(spectrum, kappa, axis=1).mean() / aperture**2
     rig = rig_at(d, turbulence_cn2=cn2)
@@ -58,14 +60,12 @@ def test_turbulence_jitter_is_unbiased_and_uncorrelated():
     jitter = drawn(range(3000)) / turbulence_px(rig_at(300.0))
     assert jitter.mean(axis=0) == pytest.approx([0, 0], abs=0.06)
     assert jitter.std(axis=0) == pytest.approx([1, 1], abs=0.05)
-    both = np.column_stack([jitter[:-1], jitter[1:]])
-    assert np.abs(np.corrcoef(both.T) - np.eye(4)).max() < 0.06
+    assert np.abs(np.corrcoef(np.column_stack([jitter[:-1], jitter[1:]]).T) - np.eye(4)).max() < 0.06
 
 
 def test_one_survey_in_1000_exceeds_the_bound_of_turbulence():
     """Among 20,000 surveys of 50 lines, about 20 have a line beyond the displacement that the bound allows."""
-    rng = np.random.default_rng(3)
-    ways = np.hypot(*rng.standard_normal((2, 20_000, 50))).max(axis=1)
+    ways = np.hypot(*np.random.default_rng(3).standard_normal((2, 20_000, 50))).max(axis=1)
     ramp = steep_probe((0.0, 1.0), span=np.inf, lines=50)
     allowed = TURBULENCE.bound(ramp, rig_at(300.0)).value / turbulence_px(rig_at(300.0))
     assert 8 <= np.count_nonzero(ways > allowed) <= 34
@@ -148,10 +148,9 @@ def test_all_sweeps_see_the_same_sway():
     """Sweeps of other names and either axis see the same crop at the same place and time; another seed does not."""
     point = np.array([[40.0]]), np.array([[-25.0]])
     line = replace(SWEEP, lines=1)
-    seen = WIND.displaced(SweepBlock(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640)), *point, "exact")
-    across = replace(line, name="other", along="y")
-    turned = WIND.displaced(
-        SweepBlock(Rig(air=BREEZE), across, range(1), np.ones(1), (201, 640)), *point[::-1], "exact"
-    )
+    block = SweepBlock(Rig(air=BREEZE), line, range(1), np.ones(1), (201, 640))
+    seen = WIND.displaced(block, *point, "exact")
+    across = replace(block, sweep=replace(line, name="other", along="y"))
+    turned = WIND.displaced(across, *point[::-1], "exact")
     np.testing.assert_allclose(turned[::-1], seen)
     assert not np.allclose(wind_shown(seed=3), wind_shown())

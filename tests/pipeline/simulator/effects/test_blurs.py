@@ -25,7 +25,8 @@ from tests.pipeline.simulator.small_scenes import made_scene
 
 def test_blur_bounds_are_reached_on_a_ridge():
     """At the top of a ridge a blur takes slope times mean displacement of the light: no bound may be smaller."""
-    ridge, x = steep_probe((3.0, 0.0), curvature=(1e9, 0.0)), np.linspace(-1, 1, 200_001)
+    ridge = steep_probe((3.0, 0.0), curvature=(1e9, 0.0))
+    x = np.linspace(-1, 1, 200_001)
     gauss, half_disc = np.exp(-((8 * x) ** 2) / 2), np.sqrt(1 - x**2)
     by_lens = 3.0 * 0.4 * np.average(np.abs(8 * x), weights=gauss)
     assert ABERRATION.bound(ridge, Rig(optics=Optics(aberration_px=0.4))).value == pytest.approx(by_lens, rel=1e-4)
@@ -60,9 +61,8 @@ def test_scene_far_out_of_focus_is_refused():
 def test_defocus_disc_narrows_at_grazing_incidence():
     """At 70 deg of incidence the disc is 0.34 as wide along the scan as along the line."""
     normal = np.array([np.sin(np.deg2rad(70)), 0, -np.cos(np.deg2rad(70))])
-    assert DEFOCUS.moments(rig_at(30.0), NM, "disc", normal).disc == pytest.approx(
-        [4.73, 4.73 * np.cos(np.deg2rad(70))], abs=0.005
-    )
+    disc = DEFOCUS.moments(rig_at(30.0), NM, "disc", normal).disc
+    assert disc == pytest.approx([4.73, 4.73 * np.cos(np.deg2rad(70))], abs=0.005)
 
 
 @pytest.mark.parametrize(("distance", "focus"), [(None, 30.0), (30.0, 30.0), (math.inf, math.inf)])
@@ -114,5 +114,4 @@ def test_rendered_contrast_matches_that_of_the_blur(blur: Any):
     passed = passed * disc_contrast(np.zeros(1), np.full(1, 1 / 16), moments.disc)
     if moments.waves is not None:
         passed = passed * pupil_contrast(moments.waves[1] / 16)
-    left = np.ptp(after, axis=(0, 1)) / np.ptp(before, axis=(0, 1))
-    assert left == pytest.approx(passed, abs=1.5e-3)
+    assert np.ptp(after, axis=(0, 1)) / np.ptp(before, axis=(0, 1)) == pytest.approx(passed, abs=1.5e-3)

@@ -45,13 +45,11 @@ def test_bright_scene_needs_shot_noise_but_no_read_noise() -> None:
 
 def test_dim_scene_at_1_s_needs_dark_current() -> None:
     """The current of 200 e- exceeds the noise of 24 e-; a cooled sensor at 100 ms does not need it."""
-    slow = replace(RIG, camera=LineCamera(exposure_ms=1000.0))
-    bound = counting.DARK_CURRENT.bound(probe(200, 400), slow)
+    bound = counting.DARK_CURRENT.bound(probe(200, 400), replace(RIG, camera=LineCamera(exposure_ms=1000.0)))
     assert bound.value > 8
     assert bound.why == "200 e- in 1000 ms at 25 deg C, beside 24.5 e- of noise"
-    assert (
-        counting.DARK_CURRENT.bound(probe(200, 400), Rig(detector=Detector(temperature_deg_c=-30.0))).value < TOLERANCE
-    )
+    cold = Rig(detector=Detector(temperature_deg_c=-30.0))
+    assert counting.DARK_CURRENT.bound(probe(200, 400), cold).value < TOLERANCE
 
 
 @pytest.mark.parametrize("unit", ["sigma", "dn"])
@@ -59,7 +57,8 @@ def test_dim_scene_at_1_s_needs_dark_current() -> None:
 def test_noise_bounds_are_the_total_variation(unit: Unit, darkest: float, brightest: float) -> None:
     """Distributions with and without a noise differ by the bound at the worst sample, and by at most it elsewhere."""
     rig = Rig(detector=Detector(dark_e_per_s=0.0))
-    levels, seen = np.linspace(darkest, brightest, 7), probe(darkest, brightest, unit)
+    levels = np.linspace(darkest, brightest, 7)
+    seen = probe(darkest, brightest, unit)
     for effect, without in ((counting.SHOT, np.full(7, 20.0)), (counting.READ_NOISE, np.sqrt(levels))):
         total = np.sqrt(levels + 400)
         scale = total / 5 if unit == "dn" else np.ones(7)
@@ -103,16 +102,14 @@ def test_bright_roof_saturates(unit: Unit) -> None:
     """Six standard deviations below full scale the bound is 0; above it the bound is the clipped light."""
     well = LineCamera().full_scale_e
     assert counting.SATURATION.bound(probe(100, well - 6.2 * np.sqrt(well + 400) - 20, unit), RIG).value == 0
-    bound, lost = counting.SATURATION.bound(probe(100, 30_000, unit), RIG), 30_000 + 20 - well
-    scale = 5.0 if unit == "dn" else np.sqrt(30_400)
-    assert lost / scale < bound.value
+    bound = counting.SATURATION.bound(probe(100, 30_000, unit), RIG)
+    lost = 30_000 + 20 - well
+    assert lost / (5.0 if unit == "dn" else np.sqrt(30_400)) < bound.value
     assert "above the limit of 2.02e+04 e-" in bound.why
     ideal = Rig(detector=Detector(noiseless=True))
-    assert counting.SATURATION.bound(
-        replace(probe(100, 30_000, unit), unit_least_dn=0.29), ideal
-    ).value == pytest.approx((lost - 20) / 5 / 0.29)
-    small = Rig(detector=Detector(full_well_e=5000))
-    assert counting.SATURATION.bound(probe(100, 6000), small).value > 0
+    seen = replace(probe(100, 30_000, unit), unit_least_dn=0.29)
+    assert counting.SATURATION.bound(seen, ideal).value == pytest.approx((lost - 20) / 5 / 0.29)
+    assert counting.SATURATION.bound(probe(100, 6000), Rig(detector=Detector(full_well_e=5000))).value > 0
     assert counting.SATURATION.bound(probe(100, 6000), RIG).value == 0
 
 
@@ -121,8 +118,7 @@ def test_quantisation_is_half_a_dn() -> None:
     assert counting.QUANTISATION.bound(probe(100, 1000, "dn"), RIG).value == 0.5
     assert counting.QUANTISATION.bound(probe(0, 1000), RIG).value == pytest.approx(0.5 / 4)
     light: NDArray[np.float32] = np.random.default_rng(0).uniform(0, 9000, (6, 640, 3)).astype(np.float32)
-    dn = light / 5 + 64
-    assert np.abs(read_out(light, block_of(RIG, NM), {}) - dn).max() <= 0.5
+    assert np.abs(read_out(light, block_of(RIG, NM), {}) - (light / 5 + 64)).max() <= 0.5
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,8 @@ def taken(
 @pytest.mark.parametrize("name", WITHOUT)
 def test_effect_that_the_rig_lacks_changes_nothing(name: str):
     """The effect's bound is 0 and the numbers are those without it; on a rig that has the effect they differ."""
-    effect, lacking = BY_NAME[name], rig_without(name)
+    effect = BY_NAME[name]
+    lacking = rig_without(name)
     assert effect.bound(probe(), lacking).value == 0
     for variant in effect.variants:
         for on, off in zip(taken({effect: variant}, lacking), taken({}, lacking), strict=True):
@@ -227,12 +228,10 @@ def test_manifest_lists_every_effect():
 
 def test_every_effect_of_every_module_is_registered_once():
     """The effects of a forgotten module would never be computed."""
-    modules = [
-        importlib.import_module(f"{package.__name__}.{one.name}") for one in pkgutil.iter_modules(package.__path__)
-    ]
+    names = [f"{package.__name__}.{one.name}" for one in pkgutil.iter_modules(package.__path__)]
     there = [
         one
-        for module in modules
+        for module in map(importlib.import_module, names)
         if module is not registry
         for name, one in vars(module).items()
         if not name.startswith("__") and type(one).__module__ == module.__name__

@@ -37,8 +37,7 @@ def test_hot_spot_is_a_cusp() -> None:
 def test_reflectance_is_never_negative() -> None:
     """The gain of the steepest slope ends at 0."""
     rig = rig_with(brdf_per_rad=5.0)
-    gain = BRDF.gain(block_of(rig, sweep=replace(SWEEP, swath_px=-3000.0)), "angles")
-    assert gain.min() == 0
+    assert BRDF.gain(block_of(rig, sweep=replace(SWEEP, swath_px=-3000.0)), "angles").min() == 0
 
 
 SIZE = 300.0
@@ -53,8 +52,7 @@ def test_cloud_shadow_matches_hand_calculation() -> None:
 @given(way=st.floats(-1e6, 1e6), size=st.floats(1, 1e5))
 def test_cloud_shadows_are_smooth_and_periodic(way: float, size: float) -> None:
     """Shadows lie between 0 and 1 and are even; their period is two sizes, their slope at most 1.5 over the edge."""
-    step = 1e-3 * size
-    here, there = shadow(np.array([way, way + step]), size)
+    here, there = shadow(np.array([way, way + 1e-3 * size]), size)
     assert 0 <= here <= 1
     assert abs(there - here) <= 1.5 / EDGE_FRACTION * 1e-3 + 1e-6
     assert shadow(np.array([-way]), size)[0] == pytest.approx(here, abs=1e-6)

@@ -33,10 +33,9 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
     block = SweepBlock(RIG, replace(SWEEP, start_px=-15.5), range(30), scene.wavelength_nm, scene.shape)
     light = expected_light(scene, block, {SLIT: variant})[..., 0] / scene.electrons[0]
     slit, pixel = footprint_kernel(RIG.camera.slit_px), footprint_kernel(1.0)
-    wanted = np.outer(slit, pixel)
     down, across = len(slit) // 2, len(pixel) // 2
     got = light[16 - down : 17 + down, 30 - across : 31 + across]
-    np.testing.assert_allclose(got, wanted, atol=3e-5)
+    np.testing.assert_allclose(got, np.outer(slit, pixel), atol=3e-5)
 
 
 def test_lines_with_one_position_have_no_smear() -> None:

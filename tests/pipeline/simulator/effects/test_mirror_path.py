@@ -47,21 +47,24 @@ def test_transient_matches_the_integrated_motion(damping: float, exposure_ms: fl
     """The motion from rest, minus that after a long run-in, is integrated step by step."""
     of_mirror = rig(exposure_ms, damping=damping, positions_per_line=positions, settled_s=50.0)
     sweep = replace(SWEEP, lines=20, step=step)
-    found = transient(of_mirror, sweep, np.arange(20))
     truth = driven(of_mirror, sweep, run_in=0) - driven(of_mirror, sweep, run_in=400)
-    np.testing.assert_allclose(found, truth, atol=2e-6)
+    np.testing.assert_allclose(transient(of_mirror, sweep, np.arange(20)), truth, atol=2e-6)
 
 
 def driven(of_mirror: Rig, sweep: Sweep, run_in: int) -> np.ndarray:
     """Return means over held px of the path of a mirror driven step by step, with a run-in of so many lines."""
-    camera, mirror = of_mirror.camera, of_mirror.mirror
-    pace, count = 2e-3 * np.pi * mirror.natural_hz, round(mirror.positions_per_line * sweep.step)
+    camera = of_mirror.camera
+    mirror = of_mirror.mirror
+    pace = 2e-3 * np.pi * mirror.natural_hz
+    count = round(mirror.positions_per_line * sweep.step)
     moves = np.array([[0.0, 1.0], [-1.0, -2 * mirror.damping]])
     tick = camera.exposure_ms / (sweep.step * count) * pace  # divides both held px and positions
     advance = expm(moves * tick)
     mean = np.linalg.solve(moves, advance - np.eye(2)) / tick
     rest = expm(moves * pace * (camera.frame_ms - camera.exposure_ms))
-    height, state, means = sweep.step / count, np.zeros(2), []
+    height = sweep.step / count
+    state = np.zeros(2)
+    means = []
     for line in range(-run_in, sweep.lines):
         seen = []
         for number in range(sweep.step * count):
@@ -75,8 +78,7 @@ def driven(of_mirror: Rig, sweep: Sweep, run_in: int) -> np.ndarray:
 
 def test_settling_removes_the_initial_transient():
     """Without settling a sweep begins over 10 px off, where the mirror comes from; the default leaves under 1e-4 px."""
-    slow = rig(100.0, settled_s=0.0)
-    assert transient(slow, SWEEP, np.arange(1))[0, 0] > 10
+    assert transient(rig(100.0, settled_s=0.0), SWEEP, np.arange(1))[0, 0] > 10
     assert abs(transient(rig(100.0), SWEEP, np.arange(1))[0, 0]) < 1e-4
 
 
@@ -84,9 +86,11 @@ def test_settling_removes_the_initial_transient():
 @given(st.floats(0.01, 10.0), st.floats(0.5, 1000.0), st.floats(0.1, 500.0), st.floats(0.0, 1.0), st.integers(1, 5))
 def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz: float, settled: float, step: int):
     """Stiff and slow mirrors give no NaN, and the change of a wave stays below the bound."""
-    of_mirror, sweep = rig(ms, damping=damping, natural_hz=hz, settled_s=settled), replace(SWEEP, lines=30, step=step)
-    numbers, places = np.arange(30), np.linspace(0, 2 * np.pi, 25)[:, None]
-    shift, held = transient(of_mirror, sweep, numbers), np.arange(step)
+    of_mirror = rig(ms, damping=damping, natural_hz=hz, settled_s=settled)
+    sweep = replace(SWEEP, lines=30, step=step)
+    places = np.linspace(0, 2 * np.pi, 25)[:, None]
+    shift = transient(of_mirror, sweep, np.arange(30))
+    held = np.arange(step)
     assert np.isfinite(shift).all()
     exact, off = (np.sin(places[..., None] + held + one).mean(axis=2) for one in (shift, np.zeros_like(shift)))
     assert np.abs(exact - off).max() <= LAG.bound(steep_probe(sweeps=(sweep,), span=2.0), of_mirror).value + 1e-9
@@ -96,7 +100,8 @@ def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz
 @given(st.floats(0.05, 40.0), st.integers(1, 5), st.integers(1, 4))
 def test_staircase_parts_are_means_of_held_positions(positions: float, step: int, parts: int):
     """Each part is compared with the mean of the held position over 4000 moments."""
-    found, moment = beside_plan(positions, step, np.arange(7), parts), (np.arange(4000) + 0.5) / 4000
+    found = beside_plan(positions, step, np.arange(7), parts)
+    moment = (np.arange(4000) + 0.5) / 4000
     for line in (0, 6):
         time = line * step + (np.arange(step * parts)[:, None] + moment) / parts
         held = np.floor(positions * time) / positions + 0.5 / positions - 0.5

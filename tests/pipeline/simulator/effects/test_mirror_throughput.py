@@ -51,35 +51,32 @@ def test_bare_aluminium_matches_fresnel_by_hand():
 def test_factor_follows_the_angle_of_incidence():
     """The cosine of the angle of incidence is -n_z, at any place of the field."""
     block = SweepBlock(RIG, sweep_at(-2300, 1700, 50), range(50), NM, (640, 640))
-    incidence, at_rest = np.arccos(-block.normals[:, 2]), reflectance("aluminium", NM, np.radians([45.0]))
+    incidence = np.arccos(-block.normals[:, 2])
+    at_rest = reflectance("aluminium", NM, np.radians([45.0]))
     np.testing.assert_allclose(factors(block.sweep), reflectance("aluminium", NM, incidence) / at_rest, rtol=1e-6)
 
 
-VIGNETTING_RIG, VIGNETTING_NM = Rig(), np.array([700.0])
-VIGNETTING_FLAT = np.full((2, 8, 1), 10_000, np.float32)
-
-
-def vignetting_factors(sweep, variant="held"):
-    """Return the factor of every line, (line,)."""
-    return factors(sweep, VIGNETTING, variant, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
+VIGNETTING_RIG = Rig()
+VIGNETTING_NM = np.array([700.0])
 
 
 @pytest.mark.parametrize(("variant", "at"), [("held", "positions"), ("middle", "middle")])
 def test_vignetting_equals_the_throughput_of_the_calibration(variant, at):
     """Lines are multiplied by the throughput that calibration divides by, at any place of the field."""
     sweep = sweep_at(-2300, 1700, 50, 4)
-    fractions = mirror_throughput(
-        getattr(SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640)), at)
-    ).reshape(50, -1)
-    np.testing.assert_allclose(vignetting_factors(sweep, variant), fractions.mean(axis=1), rtol=1e-7)
+    block = SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640))
+    fractions = mirror_throughput(getattr(block, at)).reshape(50, -1)
+    found = factors(sweep, VIGNETTING, variant, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
+    np.testing.assert_allclose(found, fractions.mean(axis=1), rtol=1e-7)
 
 
 def test_vignetting_changes_by_138_dn_over_640_lines():
     """The change is 3.4 %, 138 of 4095 DN (139 if rounded first); the bound counts the difference from rest."""
     sweep = sweep_at(0, -320, 640)
-    held = vignetting_factors(sweep)
+    held = factors(sweep, VIGNETTING, "held", VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
     assert 4095 * np.ptp(held) == pytest.approx(138.5, abs=0.5)
-    bound = VIGNETTING.bound(probe_of(VIGNETTING_FLAT, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)
+    flat = np.full((2, 8, 1), 10_000, np.float32)
+    bound = VIGNETTING.bound(probe_of(flat, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)
     assert bound.value == pytest.approx(2000 * np.abs(held - 1).max(), rel=1e-5)
     assert "0.983 to 1.017" in bound.why
 
@@ -119,5 +116,4 @@ def test_glass_matches_fresnel_by_hand() -> None:
 )
 def test_metals_match_published_reflectances_at_normal_incidence(coating: str, nm: float, fraction: float) -> None:
     """Evaporated films (Hass in the American Institute of Physics Handbook, table 6g) agree within 2 points."""
-    found = reflectance(coating, np.array([nm]), np.zeros(1))
-    assert found[0, 0] == pytest.approx(fraction, abs=0.02)
+    assert reflectance(coating, np.array([nm]), np.zeros(1))[0, 0] == pytest.approx(fraction, abs=0.02)

@@ -44,16 +44,14 @@ def fit(counts: Radiance, edges: NDArray[np.float64], chances: NDArray[np.float6
 
 def poisson_fit(counts: Radiance, level: float) -> float:
     """Return the p-value of counts against Poisson, in about 200 classes with tails of 1e-4."""
-    edges = np.unique(
-        stats.poisson.ppf(np.concatenate([[1e-4, 1e-3], np.linspace(0.005, 0.995, 199), [0.9999]]), level)
-    )
+    edges = np.unique(stats.poisson.ppf(np.r_[1e-4, 1e-3, np.linspace(0.005, 0.995, 199), 0.9999], level))
     return fit(counts, edges, np.diff(stats.poisson.cdf(edges, level), prepend=0, append=1))
 
 
 def test_deviates_are_normal() -> None:
     """A million deviates pass a chi-square test in 1000 classes; their first four moments are within 4 sigma."""
-    drawn, edges = deviates(1_000_000), stats.norm.ppf(np.arange(1, 1000) / 1000)
-    assert fit(drawn, edges, np.full(1000, 1e-3)) > 1e-3
+    drawn = deviates(1_000_000)
+    assert fit(drawn, stats.norm.ppf(np.arange(1, 1000) / 1000), np.full(1000, 1e-3)) > 1e-3
     z = drawn.astype(np.float64)
     for moment, truth, sd in ((1, 0, 1), (2, 1, 2**0.5), (3, 0, 15**0.5), (4, 3, 96**0.5)):
         assert abs((z**moment).mean() - truth) < 4 * sd / 1000
@@ -143,7 +141,8 @@ def test_compiled_loops_match_their_formulae() -> None:
         wanted += [radius * np.cos(turn), radius * np.sin(turn)]
     np.testing.assert_allclose(drawn, np.concatenate(wanted), atol=2e-5)
     light = np.random.default_rng(2).uniform(-100, 60_000, count).astype(np.float32)
-    mean, z = np.maximum(light, 0).astype(np.float64), drawn.astype(np.float64)
+    mean = np.maximum(light, 0).astype(np.float64)
+    z = drawn.astype(np.float64)
     skew = mean / (mean + 400) / 6
     numbers = np.rint(np.clip(mean + np.sqrt(mean + 400) * z + skew * (z * z - 1) + DARK_DN, 0, 65_535))
     apart = np.abs(read(light, drawn) - numbers)
@@ -154,7 +153,8 @@ def test_compiled_loops_match_their_formulae() -> None:
 @pytest.mark.parametrize("value", [np.inf, np.nan, -np.inf])
 def test_loop_reports_non_finite_light(value: float) -> None:
     """NaN and infinity are found in the last place; minus infinity is dark."""
-    light, raw = even(100.0, 1030), np.empty(1030, np.uint16)
+    light = even(100.0, 1030)
+    raw = np.empty(1030, np.uint16)
     light[-1] = value
     told = read_merged(light, np.zeros(1, np.float32), deviates(1030), 20.0, 1.0, DARK_DN, 65_535, raw)
     assert told == (value == -np.inf)
@@ -163,7 +163,8 @@ def test_loop_reports_non_finite_light(value: float) -> None:
 def merged_chances(level: float, read: float, edges: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability that the cheap draw lies below each edge, by solving its square for the deviate."""
     variance = level + read**2
-    bend, slope = level / (6 * variance), np.sqrt(variance)
+    bend = level / (6 * variance)
+    slope = np.sqrt(variance)
     if bend == 0:
         return np.asarray(stats.norm.cdf((edges - level) / slope))
     root = np.sqrt(np.maximum(slope**2 + 4 * bend * (edges - level + bend), 0))
@@ -198,6 +199,5 @@ def test_least_expected_keeps_a_patch_within_its_variation() -> None:
     for read in (0.0, 1.0, 5.0, 20.0):
         assert counting.chip_variation(read) <= counting.MOST_VARIATION
     light = np.array(counting.least_expected(0.0))
-    assert np.sqrt(counting.CHIP_SAMPLES * counting.divergence(light, 0.0)) / 2 == pytest.approx(
-        counting.MOST_VARIATION, rel=0.01
-    )
+    variation = np.sqrt(counting.CHIP_SAMPLES * counting.divergence(light, 0.0)) / 2
+    assert variation == pytest.approx(counting.MOST_VARIATION, rel=0.01)

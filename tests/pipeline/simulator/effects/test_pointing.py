@@ -129,7 +129,8 @@ def test_no_point_of_a_line_moves_beyond_the_bound(swath_px: float):
     """Shifts of 5 px in four directions move no point beyond the bound, which is at most 1.1 of the greatest motion."""
     sweep = Sweep("a", "fine", "x", swath_px, -1500.0, 301, step=10)
     plan = np.stack(points_of_scan(swath_px, CAMERA, sweep.line_px()[:, None], CAMERA.pixel_slopes()))
-    bound, most = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0)), np.zeros(2)
+    bound = np.array(at_line_ends([sweep], CAMERA, 3.0, 4.0))
+    most = np.zeros(2)
     for along, scan in ((3, 4), (3, -4), (-3, 4), (-3, -4)):
         beside = points_of_scan(swath_px + along, CAMERA, sweep.line_px()[:, None] + scan, CAMERA.pixel_slopes())
         most = np.maximum(most, np.abs(np.stack(beside) - plan).max(axis=(1, 2)))
@@ -143,8 +144,7 @@ POINTING_ERRORS_SWEEP = Sweep("s", "fine", "x", swath_px=0.0, start_px=-19.5, li
 def source_of(pointing: PointingErrors | None) -> SimulatedSource:
     """Return a source without noise over a smooth scene."""
     y, x = np.mgrid[:120, :760]
-    values = (1 + 0.3 * np.cos(y / 7) * np.cos(x / 11))[..., None]
-    scene = image_scene(values, CAMERA, [500.0])
+    scene = image_scene((1 + 0.3 * np.cos(y / 7) * np.cos(x / 11))[..., None], CAMERA, [500.0])
     return SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit"), pointing=pointing)
 
 
@@ -157,14 +157,11 @@ def test_pointing_offset_moves_the_view_but_not_reported_positions():
     seen = SimulatedSweep(source_of(errors), POINTING_ERRORS_SWEEP)
     np.testing.assert_allclose(seen.read(0, 40), SimulatedSweep(source_of(None), moved).read(0, 40), atol=1)
     np.testing.assert_array_equal(seen.position, wire_positions(line_positions(POINTING_ERRORS_SWEEP, CAMERA)))
-    line = next(source_of(errors).lines(POINTING_ERRORS_SWEEP))
-    assert line.mirror_x == seen.position[0, 0]
+    assert next(source_of(errors).lines(POINTING_ERRORS_SWEEP)).mirror_x == seen.position[0, 0]
 
 
 MIRROR_EFFECTS_CAMERA = LineCamera(samples=64, exposure_ms=4.0)
-MOTION = replace(
-    MirrorMotion(), positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=5.0, drift_px_per_min=500.0
-)
+MOTION = MirrorMotion(positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=5.0, drift_px_per_min=500.0)
 AIR = Air(distance_m=30.0, relief="step", nearest_m=3.0, wind_amplitude_m=0.005, wind_hz=20.0)
 MIRROR_EFFECTS_RIG = Rig(camera=MIRROR_EFFECTS_CAMERA, mirror=MOTION, air=AIR)
 SWATH = Sweep("swath", "fine", "x", 3.0, -25.0, 40)

@@ -34,7 +34,8 @@ NM = np.linspace(400.0, 1000.0, 25)
 def test_spectra_after_gains_keep_the_stated_slope(seed: int):
     """Random spectra get two random gains and added light; the greatest gains are divided out."""
     rng = np.random.default_rng(seed)
-    spectra, first, second = rng.uniform(50, 100, (4, 25)), rng.uniform(0.5, 1.5, (3, 25)), rng.uniform(0.1, 1, (3, 25))
+    spectra = rng.uniform(50, 100, (4, 25))
+    first, second = rng.uniform(0.5, 1.5, (3, 25)), rng.uniform(0.1, 1, (3, 25))
     added = rng.uniform(0, 20, (3, 25))
     ranges = [GainRange.of(first, uneven=1.0), replace(GainRange.of(second, uneven=1.0), added_e=added.max(axis=0))]
     probe = even_probe(
@@ -43,7 +44,8 @@ def test_spectra_after_gains_keep_the_stated_slope(seed: int):
         spectral_slope=steepest_difference(spectra, NM).max(axis=0) / 5,
         unit_least_dn=5 / RIG.camera.electrons_per_dn,
     )
-    after, greatest = light_after(probe, RIG, ranges), np.maximum(first.max(axis=0), 1).max()
+    after = light_after(probe, RIG, ranges)
+    greatest = np.maximum(first.max(axis=0), 1).max()
     for way in range(3):
         light = spectra * first[way] * second[way] + added[way]
         assert (steepest_difference(light, NM) / 5 <= greatest * after.spectral_slope + 1e-9).all()
@@ -52,22 +54,21 @@ def test_spectra_after_gains_keep_the_stated_slope(seed: int):
 def test_even_gains_do_not_change_the_spectral_slope():
     """Their factors count in the growth of errors instead."""
     probe = even_probe(spectral_slope=np.full(1, 0.3))
-    after = light_after(probe, RIG, [GainRange.between(1.0, 2.0, 1)])
-    assert after.spectral_slope == probe.spectral_slope
+    assert light_after(probe, RIG, [GainRange.between(1.0, 2.0, 1)]).spectral_slope == probe.spectral_slope
 
 
 def test_errors_grow_with_the_light_over_its_noise():
     """Doubling the darkest 100 e-, with 402 e-^2 of fixed noise, turns an error of 1 unit into 2 sqrt(502 / 602)."""
-    probe, fixed = even_probe(), fixed_variance(RIG)
-    expected = 2 * np.sqrt((100 + fixed) / (200 + fixed))
-    assert error_growth(probe, RIG, None, 2.0) == pytest.approx(expected)
+    probe = even_probe()
+    fixed = fixed_variance(RIG)
+    assert error_growth(probe, RIG, None, 2.0) == pytest.approx(2 * np.sqrt((100 + fixed) / (200 + fixed)))
     assert error_growth(replace(probe, unit="dn"), RIG, None, 2.0) == 2.0
 
 
 def test_shadow_counts_by_the_noise_within_it():
     """Half of 10,000 e- counts as 5,000 e- over the noise of 5,000 e-."""
-    probe, rig = even_probe(darkest_e=1e4), Rig()
-    growth = error_growth(probe, rig, GainRange.between(0.5, 1, 1), 1.0)
+    rig = Rig()
+    growth = error_growth(even_probe(darkest_e=1e4), rig, GainRange.between(0.5, 1, 1), 1.0)
     lost = 1e4 / np.sqrt(1e4 + fixed_variance(rig)) / 2 * growth
     assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed_variance(rig)))
 
@@ -101,7 +102,9 @@ COLOURED_RIG = Rig(optics=Optics(keystone_px=0.6))
 @pytest.mark.parametrize("px", [3.0, 8.0, 30.0])
 def test_coloured_edges_keep_the_stated_slope(px: float):
     """A grey wave passes a pupil and shifts that differ from band to band, in closed form."""
-    k, x, bands = 2 * np.pi / px, np.linspace(0, px, 200), np.ones(len(NM))
+    k = 2 * np.pi / px
+    x = np.linspace(0, px, 200)
+    bands = np.ones(len(NM))
     grey = even_probe(unit="dn", wavelength_nm=NM, level=bands, span=2 * bands, slope=k * np.ones((2, 25)))
     grey = replace(grey, spectral_slope=0 * bands, curvature=k**2 * np.ones((2, 25)))
     diffraction, keystone = (blur.moments(COLOURED_RIG, NM, blur.variants[0]) for blur in (DIFFRACTION, KEYSTONE))
@@ -124,7 +127,8 @@ def test_stored_mean_matches_the_stored_sum(binning: int, samples: int, seed: in
 @given(binning=st.integers(1, 16), signal=st.floats(0, 1e6), noiseless=st.booleans())
 def test_noise_of_a_sum_adds_the_variances_of_its_samples(binning: int, signal: float, noiseless: bool) -> None:
     """The sum has root n times the noise of a sample, so its mean has a root n-th of it."""
-    rig, light = Rig(detector=Detector(noiseless=noiseless)), np.full(1, signal, np.float32)
+    rig = Rig(detector=Detector(noiseless=noiseless))
+    light = np.full(1, signal, np.float32)
     of_sum = binning * noise_electrons(light, rig, binning)
     np.testing.assert_allclose(of_sum, np.sqrt(binning) * noise_electrons(light, rig), rtol=1e-6)
 

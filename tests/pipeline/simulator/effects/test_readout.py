@@ -31,15 +31,8 @@ SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-32.0, lines=64)
 BANDS = 20
 # Read noise is 0 and wells have no limit unless a test sets them; 1 e- is 1 DN, so that DN are counts.
 COUNTING = LineCamera(electrons_per_dn=1.0, bits=16, dark_dn=0.0, read_noise_e=0.0)
-EVERYTHING: dict[Any, str] = {
-    DARK_CURRENT: "exact",
-    DEFECTS: "exact",
-    SHOT: "gaussian",
-    READ_NOISE: "exact",
-    SATURATION: "exact",
-    QUANTISATION: "exact",
-}
-ALL_EXACT = EVERYTHING | {SHOT: "exact"}
+ALL_EXACT: dict[Any, str] = dict.fromkeys((DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION), "exact")
+EVERYTHING = ALL_EXACT | {SHOT: "gaussian"}
 
 
 def block_of(rig: Rig, lines: range = range(16), seed: int = 0, bands: int = BANDS) -> SweepBlock:
@@ -56,10 +49,8 @@ def test_read_noise_alone_is_normal() -> None:
     """Without shot noise numbers are normal around the light, also below zero light."""
     camera = LineCamera(electrons_per_dn=1.0, dark_dn=500.0)
     raw = read_out(even(0), block_of(Rig(camera=camera)), {READ_NOISE: "exact"}).astype(np.float64) - 500
-    assert (
-        stats.kstest(raw.ravel()[:20_000] + np.random.default_rng(0).uniform(-0.5, 0.5, 20_000), "norm", (0, 20)).pvalue
-        > 1e-3
-    )
+    unrounded = raw.ravel()[:20_000] + np.random.default_rng(0).uniform(-0.5, 0.5, 20_000)
+    assert stats.kstest(unrounded, "norm", (0, 20)).pvalue > 1e-3
     assert raw.min() < -60
 
 
@@ -90,8 +81,7 @@ def test_full_wells_have_read_noise_but_no_shot_noise() -> None:
 
 def test_dark_current_follows_the_temperature_and_has_shot_noise() -> None:
     """200 e-/s at 25 deg C become 1360 e- in 1 s at 50 deg C, with a variance of 1360."""
-    detector = Detector(temperature_deg_c=50.0)
-    rig = Rig(camera=replace(COUNTING, exposure_ms=1000.0), detector=detector)
+    rig = Rig(camera=replace(COUNTING, exposure_ms=1000.0), detector=Detector(temperature_deg_c=50.0))
     counts = read_out(even(0), block_of(rig), {DARK_CURRENT: "exact", SHOT: "exact"}).astype(np.float64)
     assert counts.mean() == pytest.approx(1360, rel=1e-3)
     assert counts.var() == pytest.approx(1360, rel=0.01)
@@ -110,15 +100,14 @@ def test_dead_and_hot_elements_have_their_levels() -> None:
 @pytest.mark.parametrize(("dark_dn", "exposure_ms"), [(64.0, 500.0), (0.0, 500.0), (2.0, 20.0)])
 def test_mean_dark_frame_matches_that_of_many_lines(dark_dn: float, exposure_ms: float) -> None:
     """A capped lens shows dark level, dark current and hot elements up to full scale, and nothing below 0."""
-    rig = Rig(
-        camera=LineCamera(exposure_ms=exposure_ms, dark_dn=dark_dn),
-        detector=Detector(hot_fraction=0.01, dead_fraction=0.01),
-    )
+    camera = LineCamera(exposure_ms=exposure_ms, dark_dn=dark_dn)
+    rig = Rig(camera=camera, detector=Detector(hot_fraction=0.01, dead_fraction=0.01))
     block = block_of(rig, range(64))
     mean = read_out(np.zeros((64, 640, BANDS), np.float32), block, ALL_EXACT).mean(axis=0)
     expected = dark_frame(block, ALL_EXACT)
     assert (expected.max() == 4095) == (exposure_ms == 500)
-    fine, sd = expected < 4000, np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
+    fine = expected < 4000
+    sd = np.sqrt((expected - dark_dn) * 5 + 400) / 5 / 8
     assert np.abs((mean - expected) / sd)[fine].max() < 5.5
     assert abs((mean - expected)[fine].mean()) < 0.05
 
@@ -127,16 +116,16 @@ def test_noiseless_sensor_has_no_noise() -> None:
     """Shot noise, read noise and dark current are absent even if chosen: numbers are those without effects."""
     rig = Rig(detector=Detector(noiseless=True))
     light = np.random.default_rng(0).uniform(-100, 25_000, (4, 640, BANDS)).astype(np.float32)
-    np.testing.assert_array_equal(
-        read_out(light, block_of(rig, range(4)), EVERYTHING), read_out(light, block_of(rig, range(4)), {})
-    )
+    block = block_of(rig, range(4))
+    np.testing.assert_array_equal(read_out(light, block, EVERYTHING), read_out(light, block, {}))
 
 
 def test_other_effects_do_not_change_the_draws() -> None:
     """With read noise or dark current off, the shot noise of every element is still that of the same photons."""
-    rig, light = Rig(), even(10_000, 4)
+    block = block_of(Rig(), range(4))
+    light = even(10_000, 4)
     noise = {
-        name: read_out(light, block_of(rig, range(4)), chosen).astype(np.float64).ravel()
+        name: read_out(light, block, chosen).astype(np.float64).ravel()
         for name, chosen in {
             "both": {SHOT: "gaussian", READ_NOISE: "exact"},
             "shot": {SHOT: "gaussian"},
@@ -148,11 +137,8 @@ def test_other_effects_do_not_change_the_draws() -> None:
         assert np.corrcoef(noise["both"], noise[name])[0, 1] > 0.999
     assert np.abs(noise["shot"] - noise["exact"]).max() <= 1
     assert np.abs(noise["both"] - noise["shot"]).max() <= 3
-    read = {
-        read_out(light, block_of(rig, range(4)), {READ_NOISE: "exact"} | others).tobytes()
-        for others in ({}, {DEFECTS: "exact"}, {SATURATION: "exact"})
-    }
-    assert len(read) == 1
+    ways = ({READ_NOISE: "exact"} | others for others in ({}, {DEFECTS: "exact"}, {SATURATION: "exact"}))
+    assert len({read_out(light, block, chosen).tobytes() for chosen in ways}) == 1
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -38,7 +38,8 @@ def test_narrow_line_becomes_a_gaussian_of_6_nm():
 def test_straight_spectra_and_end_bands_are_kept():
     """A straight spectrum is kept up to its ends; the first and last band of any spectrum keep their light."""
     wavelength, light = random_light(1)
-    narrow, straight = np.full(90, 1.0), 3 * wavelength
+    narrow = np.full(90, 1.0)
+    straight = 3 * wavelength
     np.testing.assert_allclose(spectrometer.widen_bands(straight, wavelength, narrow, 6.0), straight, rtol=1e-6)
     made = spectrometer.widen_bands(light, wavelength, narrow, 6.0)
     np.testing.assert_allclose(made[..., [0, -1]], light[..., [0, -1]], rtol=1e-6)
@@ -57,10 +58,10 @@ def test_response_is_off_for_wide_or_unknown_bands():
 @pytest.mark.parametrize("bands", [1, 2])
 def test_response_keeps_one_or_two_bands(bands):
     """A band without neighbours on both sides cannot be averaged."""
-    nm, light = np.linspace(500, 510, bands), np.full((2, 3, bands), 7, np.float32)
+    nm = np.linspace(500, 510, bands)
+    light = np.full((2, 3, bands), 7, np.float32)
     light[..., -1] = 9
-    made = spectrometer.widen_bands(light, nm, np.zeros(bands), 6.0)
-    np.testing.assert_allclose(made, light)
+    np.testing.assert_allclose(spectrometer.widen_bands(light, nm, np.zeros(bands), 6.0), light)
     assert spectrometer.RESPONSE.bound(probe_of(light, nm, fwhm_nm=np.zeros(bands)), rig_with()).value == 0
 
 
@@ -134,15 +135,15 @@ def test_smile_does_not_mix_detectors():
 
 def test_smile_without_any_effect_has_a_bound_of_0():
     """One band, a straight slit and a flat spectrum have a bound of 0; a single band is unchanged and is the reason."""
-    one, light = np.array([550.0]), np.full((6, SAMPLES, 1), 900, np.float32)
+    one = np.array([550.0])
+    light = np.full((6, SAMPLES, 1), 900, np.float32)
     bound = spectrometer.SMILE.bound(probe_of(light, one), rig_with())
     assert bound.value == 0
     assert "single band" in bound.why
     np.testing.assert_array_equal(bent(light, one, 0.3), light)
     wavelength, varied = random_light(0)
     assert spectrometer.SMILE.bound(probe_of(varied, wavelength), rig_with(smile_nm=0.0)).value == 0
-    flat = np.full_like(varied, 700)
-    assert spectrometer.SMILE.bound(probe_of(flat, wavelength), rig_with()).value == 0
+    assert spectrometer.SMILE.bound(probe_of(np.full_like(varied, 700), wavelength), rig_with()).value == 0
 
 
 def scattered(light, variant="halo", **optics):
@@ -196,10 +197,9 @@ def test_fixed_pattern_gains_have_the_stated_spread() -> None:
 
 def test_fixed_pattern_gains_belong_to_the_unit() -> None:
     """Another sensor has other gains; more bands keep the gains of the first ones."""
-    assert not np.array_equal(
-        spectrometer.PRNU.gains(RIG, 5), spectrometer.PRNU.gains(Rig(detector=Detector(unit=1)), 5)
-    )
-    np.testing.assert_array_equal(spectrometer.PRNU.gains(RIG, 9)[:, :5], spectrometer.PRNU.gains(RIG, 5))
+    gains = spectrometer.PRNU.gains
+    assert not np.array_equal(gains(RIG, 5), gains(Rig(detector=Detector(unit=1)), 5))
+    np.testing.assert_array_equal(gains(RIG, 9)[:, :5], gains(RIG, 5))
 
 
 def test_fixed_pattern_gains_never_fall_below_0() -> None:

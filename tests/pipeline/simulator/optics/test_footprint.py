@@ -32,7 +32,8 @@ def test_equal_bands_need_one_kernel() -> None:
 @pytest.mark.parametrize("parts", [(1, 1), (3, 1)])
 def test_windows_group_kernels_of_similar_width(parts: tuple[int, int]) -> None:
     """Each kernel has one window, with others of its level whose standard deviations differ by at most 0.2 px."""
-    waves, shift = np.array([[0.63], [0.89]]) * np.linspace(0.4, 1.0, 9), np.outer([0.075, 0.0], np.linspace(-1, 1, 9))
+    waves = np.array([[0.63], [0.89]]) * np.linspace(0.4, 1.0, 9)
+    shift = np.outer([0.075, 0.0], np.linspace(-1, 1, 9))
     found = fold((2.7, 1.0), parts, 1, Moments(shift, np.full((2, 9), 0.04), waves))
     windows = found.windows()
     assert sorted(np.concatenate([some for _, some in windows]).tolist()) == list(range(found.kernels))

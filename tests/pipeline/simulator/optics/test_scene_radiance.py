@@ -26,7 +26,8 @@ KINDS = {"one": 1, "few": 3, "materials": 27, "own plane": 2, "own planes": 40}
 
 def scene_of(kind: str, bands: int = 40) -> RasterScene:
     """Return independent random pixels, mixed to bands or with a plane for each band."""
-    rng, components = np.random.default_rng(5), KINDS[kind]
+    rng = np.random.default_rng(5)
+    components = KINDS[kind]
     planes = rng.uniform(0, 1, (*SHAPE, components))
     if kind == "materials":  # a pixel has few of many materials
         planes *= rng.random((6, 7, components)).repeat(4, axis=0).repeat(6, axis=1)[: SHAPE[0], : SHAPE[1]] < 0.15
@@ -52,16 +53,17 @@ def views_of(count: int, far: float = 6.0) -> RayViews:
 
 def scan_pass(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> np.ndarray:
     """Return the light (n, band) of one exposure."""
-    return SceneSampler(footprint_of(scene), views_of(COUNT)).scan_pass(
-        scene, [views], along_y=along_y, exposure_ratio=1.0
-    )
+    sampler = SceneSampler(footprint_of(scene), views_of(COUNT))
+    return sampler.scan_pass(scene, [views], along_y=along_y, exposure_ratio=1.0)
 
 
 @pytest.mark.parametrize(("kind", "along_y"), [(kind, bool(number % 2)) for number, kind in enumerate(KINDS)])
 def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: bool) -> None:
     """Each sample has the same bits in any order and any division among calls and threads."""
-    scene, views = scene_of(kind), views_of(COUNT)
-    whole, order = scan_pass(scene, views, along_y=along_y), np.random.default_rng(1).permutation(COUNT)
+    scene = scene_of(kind)
+    views = views_of(COUNT)
+    whole = scan_pass(scene, views, along_y=along_y)
+    order = np.random.default_rng(1).permutation(COUNT)
     np.testing.assert_array_equal(scan_pass(scene, views[order], along_y=along_y), whole[order])
     parts = [slice(first, first + 37) for first in range(0, COUNT, 37)]
     with ThreadPoolExecutor(4) as pool:
@@ -72,7 +74,8 @@ def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: boo
 @pytest.mark.parametrize("kind", KINDS)
 def test_lines_along_y_see_the_transposed_scene(kind: str) -> None:
     """A line along y over a scene equals one along x over its transpose."""
-    scene, views = scene_of(kind), views_of(COUNT)
+    scene = scene_of(kind)
+    views = views_of(COUNT)
     turned = made_scene(scene.planes.swapaxes(0, 1), scene.electrons, scene.wavelength_nm)
     np.testing.assert_allclose(scan_pass(scene, views, along_y=True), scan_pass(turned, views), rtol=2e-6)
 
@@ -122,7 +125,8 @@ def test_loops_stay_within_their_arrays(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["few", "materials", "own planes"])
 def test_places_far_outside_read_the_edge_of_the_scene(kind: str, place: float) -> None:
     """A sample at any distance from the scene reads no other memory."""
-    scene, views = scene_of(kind), views_of(4)
+    scene = scene_of(kind)
+    views = views_of(4)
     far = scan_pass(scene, replace(views, along=np.full(4, place), scan=np.full(4, 3.0)))
     near = scan_pass(scene, replace(views, along=np.full(4, np.copysign(1e6, place)), scan=np.full(4, 3.0)))
     seen = np.isfinite(far)  # an infinite place has no finite offset from its pixel
@@ -133,16 +137,16 @@ def test_places_far_outside_read_the_edge_of_the_scene(kind: str, place: float) 
 @pytest.mark.parametrize(("nodes", "bands"), [(1, 2), (1, 270), (3, 17), (5, 70), (5, 270), (9, 33)])
 def test_mixing_does_not_depend_on_the_row(nodes: int, bands: int) -> None:
     """The same components give the same bits in any row, and match the product of the matrices."""
-    rng, kernels, components = np.random.default_rng(bands), nodes + 2, 6
+    rng = np.random.default_rng(bands)
+    kernels = nodes + 2
+    components = 6
     place = np.linspace(0, nodes - 1, bands)
     between = np.stack([np.interp(place, np.arange(nodes), one) for one in np.eye(nodes)])
-    fractions, spectra = (
-        rng.uniform(0, 1, shape).astype(np.float32) for shape in ((nodes, kernels), (components, bands))
-    )
-    mixing = _Mixing.of(fractions, between, spectra)
+    fractions = rng.uniform(0, 1, (nodes, kernels)).astype(np.float32)
+    spectra = rng.uniform(0, 1, (components, bands)).astype(np.float32)
     one = rng.uniform(0, 1, (kernels, 1, components)).astype(np.float32)
     light = np.full((1031, bands), np.nan, np.float32)
-    mixing.write(np.repeat(one, len(light), axis=1), light)
+    _Mixing.of(fractions, between, spectra).write(np.repeat(one, len(light), axis=1), light)
     np.testing.assert_array_equal(light, np.broadcast_to(light[:1], light.shape))
     wanted = np.einsum("jk,kc,jb,cb->b", fractions, one[:, 0], between, spectra)
     np.testing.assert_allclose(light[0], wanted, rtol=1e-5)

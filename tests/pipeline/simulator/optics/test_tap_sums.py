@@ -34,8 +34,7 @@ MIDDLE = Sweep("middle", "fine", "y", swath_px=0.0, start_px=-1279.0, lines=2560
 
 def grain(bands: int = 3) -> RasterScene:
     """Return a scene of independent pixels, the roughest possible, as large as needed."""
-    rng = np.random.default_rng(0)
-    values = rng.uniform(0.05, 1, (120, 160, bands))
+    values = np.random.default_rng(0).uniform(0.05, 1, (120, 160, bands))
     return image_scene(values, CAMERA, np.linspace(400, 1000, bands))
 
 
@@ -104,7 +103,8 @@ def test_box_weight_is_the_mean_of_the_kernel(width: float) -> None:
 def test_blurred_weight_is_the_mean_over_a_gaussian(held: int) -> None:
     """Kernels with Gaussians are means of the sharp kernel over thousands of even steps."""
     step = np.arange(-8, 8, 0.002)
-    fraction, variance = np.exp(-(step**2) / 2), np.array([0.0, 0.08, 0.5])
+    fraction = np.exp(-(step**2) / 2)
+    variance = np.array([0.0, 0.08, 0.5])
     distance, weight = blurred_weight(2.7, variance, held)
     some = slice(0, len(distance), 37)
     for one, row in zip(variance, weight[:, some], strict=True):
@@ -118,10 +118,12 @@ def test_table_matches_the_kernel_at_any_place_and_scale(width: float, blur: flo
     """Weights from the table sum to 1 and match those of the kernel to 0.002."""
     variance = np.array([0.0, blur**2])
     table = TapTable.of(width, variance, 1, (0.99, 1.04), 0.5)
-    weight, places = np.empty((2, table.weight.shape[1], 1), np.float32), np.full((2, 1, 1), off, np.float32)
+    weight = np.empty((2, table.weight.shape[1], 1), np.float32)
+    places = np.full((2, 1, 1), off, np.float32)
     for kernel in range(2):
         read_weights(table, kernel, np.full((2, 1), scale), places, 0, 0, weight[kernel])
-    weight, apart = weight[..., 0].T, table.left + off - np.arange(table.weight.shape[1])
+    weight = weight[..., 0].T
+    apart = table.left + off - np.arange(table.weight.shape[1])
     distance, kernels = blurred_weight(width * scale, variance * scale**2)
     wanted = np.stack([np.interp(apart, distance, kernel, 0.0, 0.0) for kernel in kernels], axis=1)
     np.testing.assert_allclose(weight.sum(axis=0), 1, atol=1e-6)
@@ -133,9 +135,12 @@ PER_PX = 24  # steps of the explicit sums
 
 def fine_light(scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[Any, str]) -> np.ndarray:
     """Return electrons (line, every tenth sample, band) of a diagonal scene; ``moved`` displaces points."""
-    rig, bands = block.rig, len(block.wavelength_nm)
-    ifov, size = rig.camera.ifov_rad, scene.shape if block.sweep.along == "y" else scene.shape[::-1]
-    normals, centres = position_to_normal(block.middle)[:, None], block.slopes[::10, None]
+    rig = block.rig
+    bands = len(block.wavelength_nm)
+    ifov = rig.camera.ifov_rad
+    size = scene.shape if block.sweep.along == "y" else scene.shape[::-1]
+    normals = position_to_normal(block.middle)[:, None]
+    centres = block.slopes[::10, None]
     found = np.zeros((len(block.lines), len(centres), bands))
     for band, (shift, variance) in enumerate(zip(*_moments(block, blurs), strict=True)):
         if band and not blurs:
@@ -156,7 +161,8 @@ def fine_light(scene: RasterScene, block: SweepBlock, moved: Any, blurs: dict[An
 
 def _moments(block: SweepBlock, blurs: dict[Any, str]) -> tuple[np.ndarray, np.ndarray]:
     """Return shift and variance, (band, 2) each."""
-    nm, normal = block.wavelength_nm, middle_normal(block.sweep, block.rig.camera)
+    nm = block.wavelength_nm
+    normal = middle_normal(block.sweep, block.rig.camera)
     found = [blur.moments(block.rig, nm, variant, normal) for blur, variant in blurs.items()]
     none = np.zeros((2, len(nm)))
     return sum((one.shift for one in found), none).T, sum((one.variance for one in found), none).T
@@ -167,7 +173,8 @@ def _axis(width: float, variance: float) -> tuple[np.ndarray, np.ndarray]:
     if variance == 0:
         count = int(np.ceil(PER_PX * width))
         return ((np.arange(count) + 0.5) / count - 0.5) * width, np.full(count, 1 / count)
-    sd, steps = np.sqrt(variance), 2 * PER_PX // 3
+    sd = np.sqrt(variance)
+    steps = 2 * PER_PX // 3
     half = int(np.ceil((width / 2 + 5 * sd) * steps))
     place = np.arange(-half, half + 1) / steps
     weight = ndtr((place + width / 2) / sd) - ndtr((place - width / 2) / sd)

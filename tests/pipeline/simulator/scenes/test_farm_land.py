@@ -24,7 +24,8 @@ def test_parcels_cover_the_land_once() -> None:
 
 def test_coverage_sums_to_the_area_of_the_polygon() -> None:
     """Coverage summed over the pixels is the polygon's area to 0.2 %, at any angle."""
-    square, cuts = np.array([[-40.0, -40], [-40, 40], [40, 40], [40, -40]]), []
+    square = np.array([[-40.0, -40], [-40, 40], [40, 40], [40, -40]])
+    cuts = []
     for angle in (0.3, 1.7, 2.9, 4.4):
         cuts.append((float(np.cos(angle)), float(np.sin(angle)), -20.0))
         square = clip_polygon(square, cuts[-1])
@@ -62,7 +63,9 @@ def wave(image: NDArray[np.float32], near_period: float) -> tuple[float, float]:
 
 def test_crop_rows_have_their_period_and_heading() -> None:
     """In every field with a crop, the Fourier transform finds the period to 2 % and the heading to 1.2 degrees."""
-    plan, scene, seen = farm_plan(1), farm_scene(1, bands=4), 0
+    plan = farm_plan(1)
+    scene = farm_scene(1, bands=4)
+    seen = 0
     picture = scene.planes @ np.ascontiguousarray(scene.spectra()[:, 3])  # in June, in the near infrared
     for field in plan.fields:
         window = middle(field, picture)

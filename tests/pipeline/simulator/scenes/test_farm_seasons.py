@@ -94,9 +94,9 @@ def test_spectral_library_has_any_number_of_bands(bands: int) -> None:
 
 def test_band_response_is_centred_with_the_stated_width() -> None:
     """Bands weigh a straight line to its value at their centre and have the stated width at half maximum."""
-    centre, grid = np.array([500.0, 700.0]), np.arange(400.0, 1031.0)
+    centre = np.array([500.0, 700.0])
     weight = band_response(centre, np.full(2, FWHM_NM))
-    np.testing.assert_allclose(weight @ grid, centre, rtol=1e-9)
+    np.testing.assert_allclose(weight @ np.arange(400.0, 1031.0), centre, rtol=1e-9)
     np.testing.assert_allclose(weight[0, 103] / weight[0, 100], 0.5, rtol=1e-9)
 
 

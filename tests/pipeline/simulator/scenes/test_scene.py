@@ -41,8 +41,7 @@ def test_rate_of_morning_light_matches_hand_calculation(day: tuple[int, int], el
     """Due east at 29.5 deg north the sun rises by 13.05 deg an hour: cot(h) dh/dt is 1.04, 0.66, 0.38 % in 60 s."""
     sky = replace(EQUINOX, started=datetime(2026, *day, tzinfo=UTC))
     seconds = np.arange(4 * 3600.0, 12 * 3600.0, 60.0)
-    height = sun_elevation_deg(sky, seconds)
-    start = float(np.interp(elevation, height, seconds))
+    start = float(np.interp(elevation, sun_elevation_deg(sky, seconds), seconds))
     before, after = np.sin(np.deg2rad(sun_elevation_deg(sky, np.array([start, start + 60]))))
     assert 100 * (after / before - 1) == pytest.approx(percent, abs=0.02)
 
@@ -51,7 +50,8 @@ def test_low_sun_is_redder() -> None:
     """At 5 deg green has lost more than the near infrared; at 20 deg it has lost more than the sine of elevation."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, 15, 0, tzinfo=UTC))
     seconds = np.arange(0, 4 * 3600, 60.0)
-    height, light = sun_elevation_deg(sky, seconds), relative_daylight(sky, BANDS, seconds)
+    height = sun_elevation_deg(sky, seconds)
+    light = relative_daylight(sky, BANDS, seconds)
     low = light[np.abs(height - 5).argmin()]
     assert low[1] < 0.8 * low[3]
     twenty = np.abs(height - 20).argmin()
@@ -63,7 +63,8 @@ def test_night_is_dark_and_finite(hour: int) -> None:
     """Over a day from any start hour, light is finite, positive with the sun up and exactly 0 with the sun down."""
     sky = replace(EQUINOX, started=datetime(2026, 3, 20, hour, tzinfo=UTC))
     seconds = np.arange(0, 86400, 300.0)
-    light, height = relative_daylight(sky, BANDS, seconds), sun_elevation_deg(sky, seconds)
+    light = relative_daylight(sky, BANDS, seconds)
+    height = sun_elevation_deg(sky, seconds)
     assert np.isfinite(light).all()
     assert (light[height < -0.1] == 0).all()
     assert (light[height > 0.1] > 0).all()
@@ -115,11 +116,9 @@ def test_scene_returns_the_values_it_was_made_of() -> None:
     """A scene made of values returns them; a scene of components returns their mixture."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
-    planes, electrons = np.ones((4, 5, 3), np.float32), np.full((3, 2), 100, np.float32)
-    white_reference, white = np.full(2, 0.5, np.float32), np.full(2, 200, np.float32)
-    mixed = RasterScene(
-        "m", "k", SceneRaster.of(planes), Once.of(SceneRadiance(electrons, white)), white_reference, WAVELENGTH
-    )
+    raster = SceneRaster.of(np.ones((4, 5, 3), np.float32))
+    light = Once.of(SceneRadiance(np.full((3, 2), 100, np.float32), np.full(2, 200, np.float32)))
+    mixed = RasterScene("m", "k", raster, light, np.full(2, 0.5, np.float32), WAVELENGTH)
     np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
 
 
@@ -129,8 +128,7 @@ def test_gaps_are_filled_and_counted() -> None:
     values[3, 4, 0], values[5, 6, 0], values[5, 6, 1] = np.nan, np.inf, -np.inf
     scene = raster_from_values(values, CAMERA, name="gaps", wavelength_nm=WAVELENGTH)
     assert scene.filled_px == 2
-    known = values[..., 0][np.isfinite(values[..., 0])]
-    assert scene.planes[3, 4, 0] == np.median(known)
+    assert scene.planes[3, 4, 0] == np.median(values[..., 0][np.isfinite(values[..., 0])])
     values[..., 1] = np.nan
     assert (raster_from_values(values, CAMERA, name="gaps", wavelength_nm=WAVELENGTH).planes[..., 1] == 0).all()
 
@@ -153,8 +151,7 @@ def test_key_follows_the_content() -> None:
 
 def test_bright_end_of_a_large_scene_is_sampled() -> None:
     """Above 2^24 values the percentile is read from a part of the pixels, and stays right to 0.1 %."""
-    row = np.linspace(0, 1, 6_000, dtype=np.float32)
-    values = np.broadcast_to(row[:, None, None], (6_000, 3_000, 2))
+    values = np.broadcast_to(np.linspace(0, 1, 6_000, dtype=np.float32)[:, None, None], (6_000, 3_000, 2))
     scene = raster_from_values(values, CAMERA, name="large", wavelength_nm=WAVELENGTH, key="k")
     np.testing.assert_allclose(scene.white_reference * 0.6, 0.999, rtol=1e-3)
 
@@ -176,9 +173,8 @@ def test_raster_is_drawn_on_first_use() -> None:
     """Size and labels are stated before; the drawn planes and labels must match them."""
     draw = Mock(return_value=(np.ones((4, 5, 2), np.float32), np.zeros((4, 5), np.uint8)))
     light = Once.of(SceneRadiance(np.ones(2, np.float32), np.ones(2, np.float32)))
-    scene = RasterScene(
-        "s", "k", SceneRaster((4, 5, 2), labelled=True, draw=draw), light, np.ones(2, np.float32), WAVELENGTH
-    )
+    raster = SceneRaster((4, 5, 2), labelled=True, draw=draw)
+    scene = RasterScene("s", "k", raster, light, np.ones(2, np.float32), WAVELENGTH)
     assert (scene.shape, scene.labelled, draw.call_count) == ((4, 5), True, 0)
     assert scene.labels.shape == scene.planes.shape[:2]
     assert replace(scene, key="other").planes is scene.planes
@@ -207,7 +203,8 @@ def test_values_too_small_for_float32_are_refused() -> None:
 
 def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
     """A pixel with half of its bands is kept; a scene with every value has no missing pixels."""
-    values, labels = np.ones((4, 5, 2)), np.zeros((4, 5), np.uint8)
+    values = np.ones((4, 5, 2))
+    labels = np.zeros((4, 5), np.uint8)
     values[0, 0], values[1, 1, 0], values[2, 2] = np.nan, np.nan, np.inf
     scene = raster_from_values(values, CAMERA, name="p", wavelength_nm=WAVELENGTH, labels=labels)
     assert scene.missing is not None

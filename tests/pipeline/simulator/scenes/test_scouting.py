@@ -44,9 +44,8 @@ def test_patches_cover_the_requested_fraction(seed: int, interest: float | None)
     day = 185  # every kind is visible
     scene, plain = (scouting_scene(seed, SIZE, 2, day=day, interest=share) for share in (interest, 0.0))
     changed = float((np.abs(scene.planes - plain.planes).sum(axis=2) > 0.2).mean())
-    cover = sum(
-        float(one.mean()) for one in patches_of(scouting_plan(seed, SIZE, day=day, hour=11.0), interest).values()
-    )
+    patches = patches_of(scouting_plan(seed, SIZE, day=day, hour=11.0), interest)
+    cover = sum(float(one.mean()) for one in patches.values())
     if interest is None:
         assert 0.015 < cover < 0.105
     else:
@@ -57,8 +56,7 @@ def test_patches_cover_the_requested_fraction(seed: int, interest: float | None)
 @pytest.mark.parametrize("seed", SEEDS[::2])
 def test_patches_are_clustered(seed: int) -> None:
     """Patches on 1/16 of the field are at most 15; their 5 to 95 % range of rows and columns is below a third."""
-    patches = patches_of(scouting_plan(seed, (512, 640), day=172, hour=11.0), 1 / 16)
-    interest = sum(patches.values()) > 0.5
+    interest = sum(patches_of(scouting_plan(seed, (512, 640), day=172, hour=11.0), 1 / 16).values()) > 0.5
     assert ndimage.label(interest)[1] <= 15
     y, x = (np.percentile(place, [5, 95]) for place in np.nonzero(interest))
     assert np.ptp(y) * np.ptp(x) < 512 * 640 / 3

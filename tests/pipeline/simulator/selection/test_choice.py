@@ -29,7 +29,8 @@ _COSTS = st.sampled_from((0.0, 0.3, 1.0, 7.7, 24.7)) | st.floats(0, 30)
 @st.composite
 def made_up(draw: st.DrawFn, most: int = 6) -> list[MadeUp]:
     """Draw some effects, perhaps with quantisation, each with up to three variants."""
-    names, effects = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most)), []
+    names = draw(st.lists(st.sampled_from([*"abcdefgh", "quantisation"]), unique=True, max_size=most))
+    effects = []
     for name in names:
         cheap = [(f"v{i}", draw(_BOUNDS), draw(_COSTS)) for i in range(draw(st.integers(0, 2)))]
         effects.append(MadeUp(name, draw(_BOUNDS), (("exact", 0.0, draw(_COSTS)), *cheap)))
@@ -99,7 +100,8 @@ def test_selection_by_name_switches_on_only_named_effects(effects: list[MadeUp],
 @given(made_up(5), st.floats(1e-3, 5))
 def test_decision_saves_at_least_half_of_the_possible_cost(effects: list[MadeUp], tolerance: float):
     """The rule's worst case is compared with an enumeration of all options."""
-    decision, menus = decide(PROBE, RIG, effects, tolerance), list_options(PROBE, RIG, effects)
+    decision = decide(PROBE, RIG, effects, tolerance)
+    menus = list_options(PROBE, RIG, effects)
     ways = [menu.variants if menu.name == "quantisation" else (*menu.variants, menu.off) for menu in menus]
     fitting = (way for way in itertools.product(*ways) if math.fsum(one.error for one in way) <= tolerance)
     least = min(math.fsum(one.cost_ns for one in way) for way in fitting)
@@ -168,7 +170,8 @@ def test_worst_of_several_binnings_counts():
 
 def test_gain_that_only_darkens_does_not_multiply_errors():
     """A shadow states its own range; leaving it out counts by the smaller noise within the shadow."""
-    rig, slope = Rig(sky=Sky(cloud_fraction=0.5)), even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
+    rig = Rig(sky=Sky(cloud_fraction=0.5))
+    slope = even_probe(slope=np.ones((2, 1)), brightest_e=1e4, darkest_e=1e4)
     shift, cloud = (menu.off.error for menu in list_options(slope, rig, [Shift("shift", 0.1), CLOUD]))
     assert shift == pytest.approx(0.1 * SAFETY)
     assert cloud == pytest.approx(0.5 * SAFETY * math.sqrt((1e4 + 402.083) / (5e3 + 402.083)), rel=1e-6)
@@ -184,7 +187,8 @@ def test_later_gains_multiply_errors_of_the_renderer(name: str):
 
 def test_readout_is_bounded_by_the_light_that_it_receives():
     """Under a cloud that takes all light, read noise is all noise, and its bound is that of darkness."""
-    probe, rig = even_probe(brightest_e=1e4, darkest_e=1e4), Rig(sky=Sky(cloud_fraction=1.0))
+    probe = even_probe(brightest_e=1e4, darkest_e=1e4)
+    rig = Rig(sky=Sky(cloud_fraction=1.0))
     found = {menu.name: menu.off.error for menu in list_options(probe, rig, [READ_NOISE, CLOUD])}
     dark = READ_NOISE.bound(replace(probe, darkest_e=0.0), rig).value
     assert found["read-noise"] == pytest.approx(SAFETY * dark)
@@ -250,7 +254,8 @@ def test_rows_have_the_fields_of_a_receipt_and_plain_values():
 def test_totals_are_sums_of_the_rows():
     """Bounds sum to the whole bound, and seconds to those saved relative to everything on."""
     decision = decide(PROBE, RIG, EFFECTS, 0.1)
-    rows, totals = list_effects(decision), sum_up(decision)
+    rows = list_effects(decision)
+    totals = sum_up(decision)
     assert math.fsum(row["bound"] for row in rows) == pytest.approx(totals["bound"])
     assert totals["bound"] <= totals["tolerance"] == 0.1
     assert math.fsum(row["cost_s"] for row in rows) == pytest.approx(totals["cost_s"])

@@ -88,8 +88,10 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
 @pytest.mark.parametrize("seed", [0, 11])
 def test_image_does_not_exceed_the_probe(seed: int) -> None:
     """Levels, spans and differences of neighbours stay within 1.05 of the probe's; slit variants keep their bounds."""
-    scene, sweep = mixed(seed), replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
-    probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep)
+    scene = mixed(seed)
+    sweep = replace(SWEEP, swath_px=40.0 * (seed % 3), start_px=-30.0 + seed)
+    probe = probe_scene(scene, RIG, [sweep])
+    light = seen(scene, sweep)
     noise = noise_electrons(light, RIG)
     level = (light / noise).max(axis=(0, 1))
     assert (level <= 1.03 * probe.level).all()
@@ -109,8 +111,10 @@ def test_image_does_not_exceed_the_probe(seed: int) -> None:
 @pytest.mark.parametrize(("swath", "seed"), [(300.0, 0), (900.0, 1)])
 def test_rotated_lines_do_not_exceed_the_probe(seed: int, swath: float) -> None:
     """Far from the middle, with lines rotated by 3 and 8 deg, each slit variant keeps its bound with all blurs on."""
-    scene, sweep = mixed(seed, (80, 2000)), replace(SWEEP, swath_px=swath)
-    probe, light = probe_scene(scene, RIG, [sweep]), seen(scene, sweep, "9x3", BLURS)
+    scene = mixed(seed, (80, 2000))
+    sweep = replace(SWEEP, swath_px=swath)
+    probe = probe_scene(scene, RIG, [sweep])
+    light = seen(scene, sweep, "9x3", BLURS)
     noise = noise_electrons(light, RIG)
     for variant in (*SLIT.variants[1:], "off"):
         change = np.abs(seen(scene, sweep, variant, BLURS) - light) / noise
@@ -142,19 +146,22 @@ def test_stored_sums_do_not_exceed_their_probe(binning: int, along: str) -> None
     """Levels of sums, and their differences from line to line, are within 1.05 of the probe for the binning."""
     scene = mixed(binning, (96, 110))
     sweep = replace(SWEEP, along=along, binning=binning, start_px=-20.0, lines=41)
-    probe, light = quick(probe_scene, scene, RIG, [sweep]), seen(scene, sweep)
+    probe = quick(probe_scene, scene, RIG, [sweep])
+    light = seen(scene, sweep)
     noise = noise_electrons(stored_mean(light, binning), RIG, binning)
     level = (stored_mean(light, binning) / noise).max(axis=(0, 1))
     assert (level <= 1.03 * probe.level).all()
     assert (level >= 0.9 * probe.level).all()
-    steps, least = np.abs(np.diff(light, axis=0)), np.minimum(noise[1:], noise[:-1])
+    steps = np.abs(np.diff(light, axis=0))
+    least = np.minimum(noise[1:], noise[:-1])
     assert (stored_mean(steps, binning) / least).max() <= 1.05 * probe.slope[1].max()
     assert probe.binning == binning
 
 
 def test_level_of_a_sum_grows_with_the_root_of_its_samples() -> None:
     """For an even scene the level of a sum of 4 is that of a sample times 2 in sigmas, and times 4 in DN."""
-    scene, four = scene_of(np.full((50, 60, 1), 3.0)), replace(SWEEP, binning=4)
+    scene = scene_of(np.full((50, 60, 1), 3.0))
+    four = replace(SWEEP, binning=4)
     for unit, growth in (("sigma", 2.0), ("dn", 4.0)):
         probes = [quick(probe_scene, scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
         assert probes[1].level[0] == pytest.approx(growth * probes[0].level[0], rel=1e-4)
@@ -163,7 +170,8 @@ def test_level_of_a_sum_grows_with_the_root_of_its_samples() -> None:
 
 def test_survey_has_a_probe_for_each_exposure() -> None:
     """Each probe is that of a rig which takes all lines with this exposure, except for the survey's time and lines."""
-    scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
+    scene = mixed(4)
+    coarse = replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
     fast = replace(SWEEP, name="f", exposure_ms=5.0)
     probes = quick(probe_survey, scene, RIG, [coarse, SWEEP, fast])
     assert [(one.binning, one.sweeps) for one in probes] == [(1, (fast,)), (1, (SWEEP,)), (4, (coarse,))]
@@ -181,7 +189,8 @@ def test_survey_has_a_probe_for_each_exposure() -> None:
 
 def test_survey_time_includes_slow_setups() -> None:
     """Drifts are bounded over the whole survey, including slews of 10 s and reloads of 60 s."""
-    slow, sweeps = CostModel(slew_s=10, reload_s=60), [replace(SWEEP, name=name) for name in "ab"]
+    slow = CostModel(slew_s=10, reload_s=60)
+    sweeps = [replace(SWEEP, name=name) for name in "ab"]
     (probe,) = quick(probe_survey, mixed(4), RIG, sweeps, "sigma", slow)
     assert probe.seconds == slow.seconds(sweeps, RIG.camera) > CostModel().seconds(sweeps, RIG.camera) + 60
 
