@@ -118,17 +118,20 @@ class CaptureAugmentation:
         self.darkest_ms = darkest_ms
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
-    def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> Tensor:
-        """Return a crop (y, x, column) by a random capture, as input of the networks.
+    def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """Return a crop (y, x, column) by a random capture, as inputs of the overview and the full network.
 
-        It is a uniform scan, or a first pass with closer lines in some areas. Exposures are log-uniform.
+        Both are one image: a uniform scan, or a first pass with closer lines in some areas. Exposures are log-uniform.
+        For the paper's tables the networks get two (`make paper`).
         """
         odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
         step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))
         least_power = float(np.exp(rng.uniform(*np.log(LEAST_POWERS)))) if rng.random() < CONDENSED else 0.0
         if step > 1 and rng.random() < INTERLACED:
-            return self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
-        return self.scan(columns, noise, light=self._light(rng), step=step, rng=rng, least_power=least_power)
+            image = self.interlaced(columns, noise, step=step, rng=rng, least_power=least_power)
+        else:
+            image = self.scan(columns, noise, light=self._light(rng), step=step, rng=rng, least_power=least_power)
+        return image, image
 
     def _light(self, rng: np.random.Generator) -> float:
         """Draw an exposure between the darkest and the reference, as a fraction of the latter."""

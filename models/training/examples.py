@@ -107,7 +107,8 @@ def normalised(seen: Example, normalisation: Normalisation, reached: NDArray[np.
 class Batch:
     """Crops for one training step, with the planes of their capture."""
 
-    image: Tensor  # (B, J + PLANES, y, x), which overview and full network read
+    image: Tensor  # (B, J + PLANES, y, x) that the overview reads
+    detail: Tensor  # (B, J + PLANES, y, x) that the full network reads
     labels: Tensor  # (B, y, x) int64
     origin: Tensor  # (B, 2) random offsets of the places [tokens]
 
@@ -140,10 +141,12 @@ class CropSampler:
     def draw(self, count: int, rng: np.random.Generator, gain_shift: NDArray[np.float32], *, larger: int = 1) -> Batch:
         """Draw ``count`` crops. ``gain_shift`` is the shift of normalised columns by brightness."""
         crops = [self._crop(rng, gain_shift, self.size(larger)) for _ in range(count)]
-        image, labels = (torch.stack(one) for one in zip(*crops, strict=True))
-        return Batch(image, labels.to(torch.int64), torch.from_numpy(rng.integers(0, 4096, (count, 2))))
+        image, detail, labels = (torch.stack(one) for one in zip(*crops, strict=True))
+        return Batch(image, detail, labels.to(torch.int64), torch.from_numpy(rng.integers(0, 4096, (count, 2))))
 
-    def _crop(self, rng: np.random.Generator, gain_shift: NDArray[np.float32], size: int) -> tuple[Tensor, Tensor]:
+    def _crop(
+        self, rng: np.random.Generator, gain_shift: NDArray[np.float32], size: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
         number = int(rng.choice(len(self.examples), p=self.fraction))
         example = self.examples[number]
         zoom = 2 ** rng.uniform(*ZOOMS) if self.zoomed and rng.random() < ZOOMED else 1.0
@@ -168,9 +171,9 @@ class CropSampler:
         plain = turn(seen)
         columns = plain * gain + beside(plain, (gain - 1) * gain_shift)
         if self.augmentation is not None and example.noise is not None:
-            image = self.augmentation.draw(columns, example.noise, rng)
+            image, detail = self.augmentation.draw(columns, example.noise, rng)
         else:
             if rng.random() < NOISY:
                 columns += normal(columns, rng) * rng.uniform(0, self.noise)
-            image = with_capture(columns, LineSpec().planes)
-        return image.permute(2, 0, 1), turn(torch.from_numpy(labels).to(self.device))
+            image = detail = with_capture(columns, LineSpec().planes)
+        return image.permute(2, 0, 1), detail.permute(2, 0, 1), turn(torch.from_numpy(labels).to(self.device))

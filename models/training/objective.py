@@ -65,7 +65,7 @@ def batch_loss(
     if model.config.deep and rng.random() >= PATCHED:
         return loss_of(overview.logits)
     patch_index = draw_patches(overview.logits.detach(), model.config, rng, phase)
-    cells = cut(batch.image, model.config.patch)
+    cells = cut(batch.detail, model.config.patch)
     chosen = cells.gather(1, patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:]))
     drawn = model.composite(overview.logits, model.read_patches(overview, chosen, patch_index), patch_index)
     return loss_of(drawn) + OVERVIEW_WEIGHT * loss_of(overview.logits)

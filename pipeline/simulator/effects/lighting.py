@@ -2,7 +2,8 @@
 
 [1] Born and Wolf, "Principles of Optics", 7th edition, 1999, section 1.5.2 (Fresnel's formulae).
 [2] Rakic, "Algorithm for the determination of intrinsic optical constants of metal films: application to aluminum",
-    Applied Optics 34, 1995. [3] Johnson and Christy, "Optical constants of the noble metals", Physical Review B 6, 1972.
+    Applied Optics 34, 1995.
+[3] Johnson and Christy, "Optical constants of the noble metals", Physical Review B 6, 1972.
 """
 
 from __future__ import annotations
