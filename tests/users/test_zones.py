@@ -82,7 +82,8 @@ def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 def test_the_class_map_covers_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
     """Pixels there have a class and a confidence; all other pixels have neither."""
-    found, wanted = drawn(*kept_to), inside(AREA) & ~inside(NO_GO)
+    found = drawn(*kept_to)
+    wanted = inside(AREA) & ~inside(NO_GO)
     classed = found.classes != UNLABELLED
     assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border only, if at all
     assert np.array_equal(classed, np.isfinite(found.confidence))

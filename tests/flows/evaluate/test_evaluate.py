@@ -116,7 +116,8 @@ def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Pat
     """Their training masks differ, so they would be judged on different pixels of one frame."""
     scene = scene_at(data)
     halves = [np.zeros(scene.shape, bool) for _ in range(2)]
-    halves[0][:12], halves[1][12:] = True, True
+    halves[0][:12] = True
+    halves[1][12:] = True
     paths = [
         write_weights(
             tmp_path / f"{number}.safetensors",
@@ -226,7 +227,8 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     row, less = collect_row([joined], "none", 0.0), collect_row([joined, part], "none", 0.0)
     assert less.counts.shape == (2, 3, 2, 2)
     assert not less.counts[1, 2].any()
-    found, wanted = difference(row, less, TRIAL), row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
+    found = difference(row, less, TRIAL)
+    wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
 
 

@@ -146,7 +146,8 @@ def test_a_later_visit_shows_the_changes(monkeypatch: pytest.MonkeyPatch, tmp_pa
 def test_class_colours_are_exact(tmp_path: Path) -> None:
     """Among many colours, a rare class and pixels without a class keep their colours."""
     data = make_data(96, 128)
-    data.class_map[:3, :3], data.class_map[3:6, :3] = 2, 255
+    data.class_map[:3, :3] = 2
+    data.class_map[3:6, :3] = 255
     (tmp_path / "q.png").write_bytes(draw_quicklook(replace(data, truth=None)))
     with Image.open(tmp_path / "q.png") as image:
         found = {colour for _, colour in image.convert("RGB").getcolors(2**24)}

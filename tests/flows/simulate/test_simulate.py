@@ -143,7 +143,8 @@ def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path)
     assert {row["name"]: row["reason"] for row in record["effects"]}["smear"] == "absent"
     assert record["effects_total"]["within"]
     values = np.ones((20, 30, 4), np.float32)
-    values[3, 4, 2], values[7, 8, 2] = np.nan, np.inf
+    values[3, 4, 2] = np.nan
+    values[7, 8, 2] = np.inf
     np.save(tmp_path / "gaps.npy", values)
     given = ["simulate", tmp_path / "gaps.npy", "-o", tmp_path / "none", "--bands", "1,2", "--wavelengths", "550,650"]
     command_line(*given).refused(1, "has 2 pixels without a finite value")
