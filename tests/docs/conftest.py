@@ -12,11 +12,11 @@ from PIL import Image
 from tests.conftest import Survey, WeightsMaker, patchy_scene
 from tests.prior_work import without_effects
 
+CAMERA = "[camera]\nsamples = 320\n"  # narrow, as most time of a small survey goes into samples outside of the field
 SETTINGS = (
     'name = "{name}"\nsource = "sim"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\n'
-    "budget = 0.8\n{camera}"
+    f"budget = 0.8\n{CAMERA}"
 )
-CAMERA = "[camera]\nsamples = 320\n"  # narrow, as most time of a small survey goes into samples outside of the field
 CLASSES = 'labels = "labels/{number}_labels.png"\n[classes]\nclass_0 = 0\nclass_1 = 1\nclass_2 = 2\n'
 HEADER = "ENVI\nsamples = 40\nlines = 24\nbands = 3\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
 
@@ -39,7 +39,8 @@ def surveyed(
     (folder / "cube.hdr").write_text(HEADER + "wavelength units = nm\nwavelength = {640, 550, 460}\n")
     for number in ("001", "002"):
         values, labels = patchy_scene((64, 64), 3, seed=int(number))
-        image, colours = values.astype(np.uint8), np.array([(0, 0, 0), (0, 255, 0), (255, 0, 0)], np.uint8)
+        image = values.astype(np.uint8)
+        colours = np.array([(0, 0, 0), (0, 255, 0), (255, 0, 0)], np.uint8)
         pictures = {
             **{f"fields/images/{number}_image.png": image, f"fields/labels/{number}_labels.png": labels},
             **{f"meadow/images/{number}.png": image, f"meadow/masks/{number}.png": colours[labels]},  # no scene.toml
@@ -48,9 +49,8 @@ def surveyed(
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(picture).save(folder / path)
     (folder / "fields" / "scene.toml").write_text(CLASSES)
-    for name in ("north", "south", "survey"):
-        told = SETTINGS.format(name="south" if name == "south" else "north", camera=CAMERA)
-        (folder / f"{name}.toml").write_text(told)
+    for file, name in {"north": "north", "south": "south", "survey": "north"}.items():
+        (folder / f"{file}.toml").write_text(SETTINGS.format(name=name))
     (folder / "camera.toml").write_text(CAMERA)
     with without_effects():
         for given in ({"budget": "0.6"}, {"accuracy": False}):

@@ -47,7 +47,8 @@ class Block:
 def blocks_of(page: Path) -> tuple[Block, ...]:
     """Return every fenced block of a page, in order."""
     lines = page.read_text(encoding="utf-8").splitlines()
-    found, number = [], 0
+    found = []
+    number = 0
     while number < len(lines):
         fence = _FENCE.match(lines[number])
         if fence is None:

@@ -36,7 +36,6 @@ from storage.readers.scene_toml import load_scene_settings
 from tests.docs.pages import ROOT, Block
 from tests.flows.conftest import FEW_BANDS
 
-COMMANDS, TREE = ("sh",), ("pipeline", "models", "storage", "flows")
 SHOWN = ("text",)  # program output and pictures of letters: nothing to run
 BUILT = ("{toctree}", "{eval-rst}")  # run by `make docs`
 BUCKET = "s3://bucket/prefix"
@@ -66,7 +65,7 @@ class Reader:
         word, _, rest = block.mark.partition(" ")
         if block.language in (*SHOWN, *BUILT):
             assert not block.mark, f"{block.place}: nothing of a {block.language} block is tested"
-        elif block.language in COMMANDS:
+        elif block.language == "sh":
             assert word in ("", "with", "parses", "bucket", "tree", "meanwhile"), f"{block.place}: {block.mark}?"
             for command in commands_of(block):
                 self._command(block, command, word, rest)
@@ -86,17 +85,16 @@ class Reader:
         """Return a copy of the four folders that a page may add to."""
         root = self.folder / "tree"
         if not root.exists():
-            for name in TREE:
+            for name in ("pipeline", "models", "storage", "flows"):
                 shutil.copytree(ROOT / name, root / name)  # with bytecode, valid for files of the same dates
         return root
 
     def _command(self, block: Block, command: str, word: str, rest: str) -> None:
         words = shlex.split(command.partition(" '>' ")[0])
-        program = Path(words[0]).name
         check_words(words, block.place)
         if word == "parses":
             return
-        assert program == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
+        assert Path(words[0]).name == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
         if word == "tree":
             return  # all are run together
         flags = shlex.split(rest.replace("FEW", FEW_BANDS))
@@ -191,8 +189,9 @@ def run_here(words: list[str]) -> int:
 
 def commands_of(block: Block) -> list[str]:
     """Return the commands of a block: continued lines joined, comments removed, variables filled in."""
-    text, known, found = block.text.replace("\\\n", " "), {"DATA": "data"}, []
-    for line in text.splitlines():
+    known = {"DATA": "data"}
+    found = []
+    for line in block.text.replace("\\\n", " ").splitlines():
         bare = shlex.join(shlex.split(Template(line).safe_substitute(known), comments=True))
         setting = re.fullmatch(r"([A-Z_]+)=(\S*)", bare)
         if setting:

@@ -75,13 +75,13 @@ class Program:
         for name, folder in self.runs.items():
             self._save(name, self.line.camera().fetch(folder, KeptInMemory()).values)
             if name.startswith(REFERENCES):
-                both = seen.view.references((seen.exposure_ms, seen.period_ms))
-                for kind, frames in both.items():
+                for kind, frames in seen.view.references((seen.exposure_ms, seen.period_ms)).items():
                     self._save(f"{name}_{kind.removesuffix('Reference')}", frames)
         self.runs.clear()
 
     def _save(self, name: str, values: np.ndarray[Any, Any]) -> None:
-        fps, path = 1000 / self.line.rig.camera.period_ms, str(self.folder / f"{name}.hdr")
+        fps = 1000 / self.line.rig.camera.period_ms
+        path = str(self.folder / f"{name}.hdr")
         envi.save_image(path, values, dtype=np.uint16, interleave="bil", ext="raw", force=True, metadata={"fps": fps})
 
 
@@ -121,7 +121,8 @@ def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]
 def test_the_camera_of_the_page_takes_a_sweep(tmp_path: Path) -> None:
     """All lines are valid, within 3 px by the mirror's log, and have values and references of the camera's files."""
     with folder_rig(tmp_path / "incoming") as (source, _, _):
-        found, references = list(source.lines(FINE)), source.references(FINE)
+        found = list(source.lines(FINE))
+        references = source.references(FINE)
         (told,) = source.record["captures"]
     assert [line.number for line in found] == list(range(FINE.lines))
     assert all(line.valid for line in found)

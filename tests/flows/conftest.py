@@ -127,7 +127,8 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
         (run,) = client.read_flow_runs(
             flow_filter=named, flow_run_filter=begun, sort=FlowRunSort.START_TIME_DESC, limit=1
         )
-        of_it, latest = FlowRunFilter(id=FlowRunFilterId(any_=[run.id])), time.monotonic() + RECORDED_S
+        of_it = FlowRunFilter(id=FlowRunFilterId(any_=[run.id]))
+        latest = time.monotonic() + RECORDED_S
         tasks = client.read_task_runs(flow_run_filter=of_it)
         while time.monotonic() < latest and not (
             len(tasks) >= count and all(task.state is not None and task.state.is_final() for task in tasks)

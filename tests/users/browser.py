@@ -30,7 +30,8 @@ class Tab:
     """Show one page at a time, in a window of a chosen size. ``asked`` lists the addresses of its network requests."""
 
     def __init__(self, line: ClientConnection) -> None:
-        self._line, self._number = line, 0
+        self._line = line
+        self._number = 0
         self.asked: list[str] = []
         self.troubles: list[str] = []
         for domain in ("Page", "Network", "Runtime", "Log"):
@@ -84,11 +85,8 @@ class Tab:
 
     def key(self, name: str, code: int) -> None:
         """Press a key once."""
-        words = {"key": name, "code": name, "windowsVirtualKeyCode": code}
-        if name == "Enter":
-            words["text"] = "\r"
-        self.call("Input.dispatchKeyEvent", type="keyDown", **words)
-        self.call("Input.dispatchKeyEvent", type="keyUp", key=name, code=name, windowsVirtualKeyCode=code)
+        for event in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=event, key=name, code=name, windowsVirtualKeyCode=code)
 
     def pdf(self) -> bytes:
         """Return the page as a PDF, as it prints on A4."""

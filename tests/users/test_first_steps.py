@@ -121,7 +121,8 @@ def test_init_finds_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> 
     """An array of five dates beside LULC.npy is a series with labels; the advised command uses its first date."""
     np.save(tmp_path / "LULC.npy", CLASSES)
     np.save(tmp_path / "series.npy", np.stack([image() for _ in range(5)]).astype(np.float32))
-    ended, series = command_line("init", tmp_path), tmp_path / "series.npy"
+    ended = command_line("init", tmp_path)
+    series = tmp_path / "series.npy"
     assert f"note: {series} has 5 steps of time; each is a scene, {series}:0 to {series}:4" in ended.out
     assert f"then: spectralzoom train {series}:0 " in ended.out
 
@@ -134,7 +135,8 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "field.npy", image().astype(np.float32))
     np.save(tmp_path / "field_labels.npy", CLASSES)
-    told, toml = json.loads(command_line("init", ".", "--json").out), tmp_path / "scene.toml"
+    told = json.loads(command_line("init", ".", "--json").out)
+    toml = tmp_path / "scene.toml"
     assert (
         told["first"] == "write the 3 wavelengths into scene.toml: wavelengths_nm or wavelengths_file, as its lines say"
     )

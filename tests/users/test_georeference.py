@@ -88,10 +88,9 @@ def survey(scene: Path, weights: Path, out: Path, **flags: Any) -> Published:
 
 def opened(run: Published, product: str) -> xr.Dataset:
     """Open a store of the run by plain xarray; a warning is an error."""
-    archive = run.folder.parent.parent
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return xr.open_zarr(archive / run.receipt["products"][product])
+        return xr.open_zarr(run.folder.parent.parent / run.receipt["products"][product])
 
 
 def corners_px(found: Any, wanted: Affine, shape: tuple[int, int]) -> float:
@@ -140,10 +139,9 @@ def test_transparent_pixels_are_nodata_in_every_product(tmp_path: Path, weights:
     assert np.isnan(mosaic.values()[gap]).all()
     np.testing.assert_array_equal(mosaic.coverage() > 0, ~gap)
     assert run.receipt["pixels"]["map_without_a_class"] == gap.sum()
-    geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
     hectares = sum(run.receipt["areas"]["ha"].values())
     assert hectares == pytest.approx((~gap).sum() * 0.05**2 / 1e4, rel=2e-3)  # UTM's scale
-    whole = np.sum(list(pixel_rows_m2(geobox)))
+    whole = np.sum(list(pixel_rows_m2(GeoBox(SHAPE, NORTH_UP, "EPSG:32632"))))
     assert hectares * 1e4 == pytest.approx(whole * (~gap).mean(), rel=1e-6)
     with opened(run, "attention") as attention:
         assert (attention["score"].values[:2, :3] == 0).all()  # patches of 8 px without a pixel of the scene
@@ -178,8 +176,7 @@ def test_keys_of_mosaic_and_map_contain_the_georeference(tmp_path: Path, weights
         ref = next(ref for ref in archive.refs() if run.receipt["products"][product].startswith(ref.uri))
         assert not {"georeference", "missing"} & set(archive.manifest(ref)["params"])
         assert "spatial_ref" not in opened(run, product)
-    scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
-    here = survey(scene, weights, tmp_path / "archive", **ONE_SCAN)
+    here = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive", **ONE_SCAN)
     ref = next(ref for ref in archive.refs("rectify") if here.receipt["products"]["mosaic"].startswith(ref.uri))
     assert archive.manifest(ref)["params"]["georeference"]["crs"] == "EPSG:32632"
 
@@ -202,9 +199,8 @@ def test_lines_keep_the_georeference_of_their_scene(tmp_path: Path, weights: Pat
 
 def test_a_pose_replaces_the_georeference_of_the_scene(tmp_path: Path, weights: Path) -> None:
     """A note says so, and only the ground map has a CRS."""
-    scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
     pose = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
-    run = survey(scene, weights, tmp_path / "archive", **ONE_SCAN, pose=pose)
+    run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive", **ONE_SCAN, pose=pose)
     assert any("[pose] replaces the georeference" in note for note in run.receipt["settings"]["notes"])
     assert "spatial_ref" not in opened(run, "class_map")
     assert "spatial_ref" in opened(run, "ground_map")
@@ -236,12 +232,11 @@ def test_a_georeferenced_file_is_surveyed_and_exported(tmp_path: Path, real_data
     if not scene.is_file():
         pytest.skip(f"there is no {scene}")
     run = survey(scene, make_weights((640.0, 550.0, 460.0, 800.0)), tmp_path / "archive", **FILE_ALONE)
-    with rasterio.open(scene) as source:
-        known, transform, shape, empty = source.crs, source.transform, source.shape, (source.read() == 0).all(axis=0)
     files = run_export(tmp_path / "archive", None, tmp_path / "out", envi=False, console=QUIET)["files"]
-    with rasterio.open(tmp_path / "out" / files["class_map"]) as file:
-        assert (file.crs.to_epsg(), file.shape) == (known.to_epsg(), shape)
-        assert corners_px(file.transform, transform, shape) < 0.1
+    with rasterio.open(scene) as source, rasterio.open(tmp_path / "out" / files["class_map"]) as file:
+        assert (file.crs.to_epsg(), file.shape) == (source.crs.to_epsg(), source.shape)
+        assert corners_px(file.transform, source.transform, source.shape) < 0.1
+        empty = (source.read() == 0).all(axis=0)
         classes = file.read(1)
     assert (classes[empty] == 255).all()
     hectares = sum(run.receipt["areas"]["ha"].values())

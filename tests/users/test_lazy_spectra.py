@@ -24,7 +24,9 @@ from storage.arrays.cubes import SweepHeader
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 
-LINES, SAMPLES, BANDS, COUNT, STEP = 70, 90, 12, 4, 0.5
+LINES, SAMPLES, BANDS = 70, 90, 12
+COUNT = 4  # of components
+STEP = 0.5
 Restored = tuple[Path, NDArray[np.float64]]  # a store, and its values
 WAVELENGTHS = np.linspace(400, 900, BANDS)
 RARE = np.array([[3, 5], [66, 80]])
@@ -46,7 +48,8 @@ def restored(scores: NDArray[np.float32]) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Restored:
     """Write a compressed sweep with two rare spectra and an unusable one; return its path and the expected values."""
-    path, rng = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr", np.random.default_rng(1)
+    path = tmp_path_factory.mktemp("sweep") / "coarse-0.zarr"
+    rng = np.random.default_rng(1)
     frames = References(np.zeros((SAMPLES, BANDS)), np.ones((SAMPLES, BANDS)), np.ones(BANDS))
     header = SweepHeader(Sweep("coarse-0", "coarse", "x", 0.0, 0.0, LINES), frames, WAVELENGTHS, None, "test")
     scores = rng.normal(0, 20, (LINES, SAMPLES, COUNT)).astype(np.float32)
@@ -140,7 +143,8 @@ def test_a_selection_needs_only_its_own_memory(tmp_path: Path) -> None:
     assert cube[0, 0].values.shape == (bands,)
     for chosen, most in ((cube[..., 3], 3), (cube[5, 7], 0.3), (cube[100:110, 50:60], 0.3)):
         tracemalloc.start()
-        values, peak = chosen.values, tracemalloc.get_traced_memory()[1]
+        values = chosen.values
+        peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < values.nbytes + most * 1e6
     assert cube.nbytes == side * side * bands * 4

@@ -97,11 +97,7 @@ CASES = {
     "several label files": (1, TRAIN + "several", "001_labels.png and .*001_mask.png; keep one"),
     "two files of one stem": (1, TRAIN + "one_stem", "001.png and .*001.tif would both have the labels"),
     "labels of one class": (1, TRAIN + "soil", "two or more classes.* unlabelled = "),
-    "labels without a class": (
-        1,
-        TRAIN + "unlabelled",
-        "has no pixel with a class; correct its labels, or 'unlabelled'",
-    ),
+    "no labelled pixel": (1, TRAIN + "unlabelled", "has no pixel with a class; correct its labels, or 'unlabelled'"),
     "soft labels": (1, TRAIN + "soft", "at most 64.* hard edges"),
     "scenes of other bands": (1, TRAIN + "other_bands", "other bands"),
     "unknown key of scene.toml": (1, TRAIN + "bad_key", "unknown key label; known are"),
@@ -182,7 +178,8 @@ def test_unusual_but_valid_files_are_read(case: str, files: Path) -> None:
 
 def test_a_time_step_is_read_by_its_number(files: Path) -> None:
     """Steps count from 0, in .npy, .npz and Zarr."""
-    nm, cube = [float(one) for one in NM.split(",")], np.load(files / "cube.npy")
+    nm = [float(one) for one in NM.split(",")]
+    cube = np.load(files / "cube.npy")
     for address, more in {"series.npy:2": 2, "series.npz:1": 1, "series.zarr:1": 1}.items():
         np.testing.assert_array_equal(load_scene_file(f"{files}/{address}", wavelengths=nm).values, cube + more)
 
@@ -207,5 +204,6 @@ FOLDERS = {  # names of scenes and of their label files
 def test_images_find_their_labels_by_name(folder: str, files: Path) -> None:
     """Suffixes such as _mask and case do not matter; hidden files and labels without an image are ignored."""
     data = load_data_set(files / folder)
-    found, root = {name: data.label_files.get(name) for name in data.files}, files / folder
+    found = {name: data.label_files.get(name) for name in data.files}
+    root = files / folder
     assert {name: path and path.relative_to(root).as_posix() for name, path in found.items()} == FOLDERS[folder]

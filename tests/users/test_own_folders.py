@@ -148,7 +148,7 @@ def test_unusable_found_labels_do_not_refuse_a_survey(folder: str, made: Path) -
 
 def test_an_evaluation_notes_frames_of_a_single_class(made: Path, weights: Path) -> None:
     """The note asks whether the value of that class means unlabelled."""
-    candidates, choices = open_candidates((weights,)), {"labels": None, "bands": None, "wavelengths": None}
-    data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
+    candidates = open_candidates((weights,))
+    data = open_frames(str(made / "soil"), (), None, LineCamera(), {"labels": None, "bands": None, "wavelengths": None})
     jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)
     assert jobs.notes[0].startswith("all labels are class_0 in 001, 002; if its value")

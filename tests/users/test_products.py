@@ -66,8 +66,8 @@ def test_the_reflectance_file_has_the_grid_of_the_map_and_wavelengths(posed: Exp
     """It is a COG of the mosaic on the ground map's grid; bands are described as in GDAL, and NaN is nodata."""
     ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
     assert is_cog(posed.file("reflectance"))
-    scene, about = posed.store("class_map"), posed.store("class_map").attrs["angular_grid"]
-    grid = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape)
+    scene = posed.store("class_map")
+    grid = ground_grid(GroundView(POSE, scene.attrs["angular_grid"]["ifov_rad"]), scene["classes"].shape)
     rows, columns = (slice(0, size) for size in grid.shape)
     values = open_mosaic(posed.archive / posed.receipt["products"]["mosaic"]).values()
     wanted = image_at(values, grid.scene_pixels(rows, columns))
@@ -87,7 +87,8 @@ def test_the_reflectance_file_has_the_grid_of_the_map_and_wavelengths(posed: Exp
 def test_an_index_follows_its_formula(posed: Exported) -> None:
     """NDVI equals the formula on the file's own bands; it is NaN if a band has no value or both are dark."""
     with rasterio.open(posed.file("reflectance")) as file:
-        cube, wave = np.moveaxis(file.read(), 0, -1), [float(file.tags(band)["wavelength"]) for band in file.indexes]
+        cube = np.moveaxis(file.read(), 0, -1)
+        wave = [float(file.tags(band)["wavelength"]) for band in file.indexes]
     near, red = (int(np.argmin(np.abs(np.array(wave) - nm))) for nm in (832.8, 664.6))
     wanted = (cube[..., near] - cube[..., red]) / (cube[..., near] + cube[..., red])
     wanted[~(cube[..., [near, red]].mean(axis=-1) >= 0.01)] = np.nan
@@ -102,7 +103,8 @@ def test_polygons_cover_the_map_without_gap_or_overlap(posed: Exported) -> None:
     found = geopandas.read_file(posed.file("polygons"))
     assert found.crs.to_epsg() == 32632
     ground = posed.store("ground_map")
-    classes, transform = ground["classes"].values, Affine(*ground.attrs["spatial:transform"])
+    classes = ground["classes"].values
+    transform = Affine(*ground.attrs["spatial:transform"])
     shapes = zip(found.geometry, found["class"], strict=True)
     again = rasterio.features.rasterize(shapes, classes.shape, 255, transform=transform, dtype="uint8")
     np.testing.assert_array_equal(again, classes)
@@ -242,14 +244,13 @@ def test_a_prescription_over_a_border_is_refused(posed: Exported, crs: str, box:
 
 def test_a_survey_without_a_place_exports_polygons_and_ratio_indices(surveyed_png: Any, tmp_path: Path) -> None:
     """Polygons are in camera angles, without GeoJSON; doses and reflectance indices are refused with the reason."""
-    archive, out, needs_none = tmp_path / "archive", tmp_path / "out", {"polygons": True, "reflectance": True}
-    one_picture = exported(archive, out, surveyed_png(archive).receipt, indices="VARI", **needs_none)
+    archive, out = tmp_path / "archive", tmp_path / "out"
+    one_picture = exported(archive, out, surveyed_png(archive).receipt, indices="VARI", polygons=True, reflectance=True)
     found = geopandas.read_file(one_picture.file("polygons"))
     assert found.crs is None
     assert "polygons_geojson" not in one_picture.answer["files"]
-    transform = one_picture.store("class_map").attrs["spatial:transform"]
-    pixels = one_picture.store("class_map")["classes"].size
-    assert found.area.sum() == pytest.approx(pixels * transform[0] ** 2, rel=0.01)
+    store = one_picture.store("class_map")
+    assert found.area.sum() == pytest.approx(store["classes"].size * store.attrs["spatial:transform"][0] ** 2, rel=0.01)
     with pytest.raises(SettingsError, match=r"metres, and the run has no place .* \[pose\]"):
         exported(archive, out / "no", {}, prescription="class_1=1")
     words = r"ExG wants reflectance \(0 to 1\), and the values .* choose an index of ratios"
@@ -279,8 +280,7 @@ def test_products_have_the_position_of_their_scene(tmp_path: Path, weights: Path
         assert np.isnan(file.read(1)[:5, :6]).all()
     found = geopandas.read_file(done.file("polygons"))
     assert str(found.crs) == crs
-    places = shapely.get_coordinates(found.geometry)
-    column, row = ~transform * places.T
+    column, row = ~transform * shapely.get_coordinates(found.geometry).T
     rows, columns = SHAPE
     assert (column.min(), column.max(), row.min(), row.max()) == pytest.approx((0, columns, 0, rows), abs=0.1)
     assert ((column >= 24 - 0.1) | (row >= 20 - 0.1)).all()  # nothing in the gap
@@ -302,7 +302,8 @@ def test_cells_have_the_dose_of_the_pixels_that_they_overlap(turned_deg: float, 
     """Single weed pixels of a rotated map treat a cell of which they cover 0.1 %; 5 % of any class give it a dose."""
     classes = (np.random.default_rng(1).random((40, 50)) < 0.02).astype(np.uint8)
     place = Affine.translation(400_000, 5_750_000) * Affine.rotation(turned_deg) * Affine.scale(pixel_m, -pixel_m)
-    field, legend = GeoBox((40, 50), place, "EPSG:32632"), ClassNames(("soil", "weed"), np.zeros((2, 3), np.uint8))
+    field = GeoBox((40, 50), place, "EPSG:32632")
+    legend = ClassNames(("soil", "weed"), np.zeros((2, 3), np.uint8))
     cells = GeoBox.from_bbox(tuple(field.extent.boundingbox), crs="EPSG:32632", resolution=3)
     dose = dose_cells(ClassRaster(classes, legend, place, field), {"weed": 2.0}, cells)
     row, column = np.indices(cells.shape)

@@ -61,7 +61,8 @@ PASSES: dict[str, dict[str, Any]] = {
 
 def field() -> RasterScene:
     """Return a field of three classes for the emulated rig."""
-    camera, values = load_settings(None, dict(NARROW)).camera, patchy_scene(SIZE[::-1], 3, 1)[0]
+    camera = load_settings(None, dict(NARROW)).camera
+    values = patchy_scene(SIZE[::-1], 3, 1)[0]
     return raster_from_values(values, camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0]))
 
 
@@ -98,7 +99,8 @@ def write_sweeps(out: Path, published: Published, folder: Path) -> Path:
 @pytest.mark.parametrize("asked", PASSES.values(), ids=PASSES)
 def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any]) -> None:
     """The class map's hash is the same from ENVI and CSV files, and from the raw cubes of the archive."""
-    weights, made = tmp_path / "reflectance.safetensors", random_weights((640.0, 550.0, 460.0))
+    weights = tmp_path / "reflectance.safetensors"
+    made = random_weights((640.0, 550.0, 460.0))
     centre, spread = (np.full_like(made.normalisation.centre, level) for level in (0.3, 0.05))
     save_weights(replace(made, normalisation=replace(made.normalisation, centre=centre, spread=spread)), weights)
     settings = rig_settings(tmp_path / "rig", weights, keep="raw", **asked)
@@ -110,8 +112,7 @@ def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.Monk
     along = {open_raw_cube(path).sweep.along for path in (tmp_path / "rig").glob("stages/capture/*/*.zarr")}
     assert along == ({"y"} if "camera.samples" in asked else {"x"})
     plan = asked if "budget" in asked else {}
-    size = f"{SIZE[0]}x{SIZE[1]}"
-    of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=size, **plan)
+    of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=f"{SIZE[0]}x{SIZE[1]}", **plan)
     assert digest_of_map(tmp_path / "files", of_files.receipt) == expected
     of_run = survey_sweeps(tmp_path / "again", published.folder)
     assert digest_of_map(tmp_path / "again", of_run.receipt) == expected
@@ -156,9 +157,8 @@ def test_a_budget_reads_only_the_requested_lines(
     tmp_path: Path, full_scan: FullScan, weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two passes read only their own lines of a recorded full scan; the receipt counts them against all lines."""
-    _, _, sweeps = full_scan
     with counted_lines(monkeypatch) as read:
-        published = survey_sweeps(tmp_path / "a", sweeps, weights=str(weights), budget=0.6, keep="raw")
+        published = survey_sweeps(tmp_path / "a", full_scan[2], weights=str(weights), budget=0.6, keep="raw")
     told = published.receipt["recording"]
     recorded = sum(open_raw_cube(path).sweep.lines for path in raw_cubes(full_scan))
     assert told["lines_recorded"] == recorded
@@ -196,9 +196,9 @@ def test_a_recorded_scan_is_compared_with_all_of_its_lines(tmp_path: Path, full_
 
 def test_recorded_lines_of_a_run_have_its_date(full_scan: FullScan) -> None:
     """Exports, histories and prior maps then use the date of capture; an explicit visit takes precedence."""
-    sweeps, captured = str(full_scan[1].folder), datetime.fromisoformat(full_scan[1].receipt["started"])
+    sweeps = str(full_scan[1].folder)
     visit = load_settings(None, {"sweeps": sweeps}).visit
-    assert datetime.fromisoformat(visit) == captured
+    assert datetime.fromisoformat(visit) == datetime.fromisoformat(full_scan[1].receipt["started"])
     assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
 
 
@@ -255,10 +255,9 @@ def test_a_straight_scan_is_surveyed_as_a_recording(
     published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights), **asked)
     notes = " ".join(published.receipt["settings"]["notes"])
     assert ("scan has no pointing: taken as an even straight scan" in notes) == (column is None)
-    width, height = published.receipt["settings"]["size"]
-    assert (width, height) == (64, 96)
-    seen = open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"])
-    mosaic, light = block_means(seen.values(), 4), (values.astype(np.float64) - 60) / (3500 - 60)
+    assert published.receipt["settings"]["size"] == [64, 96]
+    mosaic = block_means(open_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values(), 4)
+    light = (values.astype(np.float64) - 60) / (3500 - 60)
     light = light[::-1] if column == "position_px" else light
     coarse = light.reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))
     inner = (slice(2, 20), slice(2, 14))
@@ -324,7 +323,8 @@ def test_bad_input_gives_one_message(
     command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, pushbroom: Pushbroom, weights: Path, mistake: str
 ) -> None:
     """The command prints one message with value and remedy, no traceback, and writes no archive."""
-    (folder, _), (flags, message) = pushbroom, BAD[mistake]
+    folder, _ = pushbroom
+    flags, message = BAD[mistake]
     monkeypatch.chdir(folder)
     write_envi_cube(folder / "two", np.full((1, 64, 2), 3500, np.uint16), ".img", wavelength="{640, 550}")
     if mistake in POSITIONS:
@@ -466,8 +466,7 @@ def test_recorded_swaths_are_surveyed_in_two_passes(tmp_path: Path, weights: Pat
 
 def test_a_16_bit_recording_is_surveyed_and_reprocessed(tmp_path: Path, weights: Path) -> None:
     """The receipt's camera has the bits and the line period of the recording, and reprocessing finds nothing to do."""
-    values = (patchy_scene((96, 64), 3, 3)[0] * 200 + 60).astype(np.uint16)
-    folder = write_pushbroom(tmp_path / "drone", values)
+    folder = write_pushbroom(tmp_path / "drone", (patchy_scene((96, 64), 3, 3)[0] * 200 + 60).astype(np.uint16))
     table(folder, "time,position_px", [f"{3.5 * line},{line}" for line in range(96)])
     published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
     camera = published.receipt["settings"]["camera"]

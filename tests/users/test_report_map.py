@@ -50,7 +50,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     receipt["survey"] = f"field{BAD}"
     file = io.BytesIO()
     Image.new("L", (1800, 1400), 128).save(file, "PNG")
-    picture, path = file.getvalue(), tmp_path_factory.mktemp("report") / "report.html"
+    picture = file.getvalue()
+    path = tmp_path_factory.mktemp("report") / "report.html"
     path.write_text(render_report(receipt, picture, [Picture(picture, "a picture")], field=field), "utf-8")
     return path
 

@@ -28,7 +28,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "ground-and-zones.md"
 
 def test_example_poses_see_the_farms_ground_pixel() -> None:
     """The settings' examples, by height and by range, and the page on the ground agree within 1 % (hectares 3 %)."""
-    shape, camera = (1024, 1280), LineCamera()
+    shape = (1024, 1280)
+    camera = LineCamera()
     told = {one.name: one.metadata["json_schema_extra"]["example"] for one in fields(RigPose)}
     common = {name: told[name] for name in ("lon_deg", "lat_deg", "heading_deg", "tilt_deg")}
     (block,) = re.findall(r"```toml\n(\[pose\].*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)

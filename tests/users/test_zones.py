@@ -82,7 +82,8 @@ def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 def test_the_class_map_covers_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
     """Pixels there have a class and a confidence; all other pixels have neither."""
-    found, wanted = drawn(*kept_to), inside(AREA) & ~inside(NO_GO)
+    found = drawn(*kept_to)
+    wanted = inside(AREA) & ~inside(NO_GO)
     classed = found.classes != UNLABELLED
     assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border only, if at all
     assert np.array_equal(classed, np.isfinite(found.confidence))
@@ -120,14 +121,14 @@ def test_lines_outside_are_left_out(kept_to: tuple[Path, Published], opened: Ope
 
 def test_accuracy_counts_the_pixels_of_the_area(kept_to: tuple[Path, Published]) -> None:
     """The number of evaluated pixels is the number of pixels with a class."""
-    found = drawn(*kept_to)
-    assert kept_to[1].receipt["accuracy"]["pixels"] == (found.classes != UNLABELLED).sum()
+    assert kept_to[1].receipt["accuracy"]["pixels"] == (drawn(*kept_to).classes != UNLABELLED).sum()
 
 
 def test_plots_are_listed_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> None:
     """Fractions, pixels and confidence are those of the map; a plot outside of the field has 0 pixels."""
     _, published = kept_to
-    found, table = drawn(*kept_to), pandas.read_csv(published.folder / "plots.csv").set_index("plot")
+    found = drawn(*kept_to)
+    table = pandas.read_csv(published.folder / "plots.csv").set_index("plot")
     rows = {row["plot"]: row for row in published.receipt["plots"]}
     assert list(rows) == ["north", "south", "away"] == list(table.index)
     for name in ("north", "south"):
@@ -181,11 +182,11 @@ def test_polygons_in_any_crs_give_the_same_mask(opened: Opened, tmp_path: Path) 
     place = opened(pose=POSE).zones.place
     west, south, east, north = place.outline.bounds
     half = shapely.intersection(place.outline, shapely.box(west, (south + north) / 2, east, north))
-    fine, masks = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500), []
+    fine = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500)
+    masks = []
     for name, crs in (("utm.gpkg", 32632), ("globe.geojson", 4326), ("web.shp", 3857), ("laea.gpkg", 3035)):
         path = sketch(tmp_path / name, {"half": fine.to_crs(crs).iloc[0]}, crs)
-        found = opened(pose=POSE, zones={"area": path}).zones.kept
-        masks.append(found.kept)
+        masks.append(opened(pose=POSE, zones={"area": path}).zones.kept.kept)
     assert 0.2 < masks[0].mean() < 0.8
     differ = [(mask != masks[0]).sum() for mask in masks]
     assert max(differ) <= 16  # of 12 288: datums differ by half a millimetre after a round trip, a pixel has 7

@@ -22,10 +22,10 @@ from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import is_cog
 
-SHAPE, PATCH = (96, 128), 8
+SHAPE = (96, 128)
+PATCH = 8
 MEMORY = ("age", "changed", "changed_from")
 VISITS = ("2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z")
-PLACES = ("georeferenced", "posed")
 
 
 def harvested(folder: Path, place: str) -> Iterator[Path]:
@@ -46,7 +46,7 @@ def harvested(folder: Path, place: str) -> Iterator[Path]:
         yield folder / f"{number}" / "field.tif"
 
 
-@pytest.fixture(scope="module", params=PLACES)
+@pytest.fixture(scope="module", params=["georeferenced", "posed"])
 def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, weights: Path) -> list[Exported]:
     """Return both visits; the later one, after three days, captured some lines of a swath only."""
     folder = tmp_path_factory.mktemp(request.param)
@@ -115,7 +115,8 @@ def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
     assert set(first["ground"]["older_ha"].values()) == {0.0}
     posed = "ground_map" in later["products"]
     store = visited[1].store("ground_map" if posed else "class_probabilities")
-    pixel_ha, slack = store.attrs["spatial:transform"][0] ** 2 / 1e4, 0.05 if posed else 1e-3  # footprints' borders
+    pixel_ha = store.attrs["spatial:transform"][0] ** 2 / 1e4
+    slack = 0.05 if posed else 1e-3  # footprints' borders
     changes, older = later["ground"]["changes_ha"], later["ground"]["older_ha"]
     names = store.attrs["class_names"]
     drawn = visited[1].store("ground_map" if posed else "class_map")["classes"].values

@@ -131,7 +131,8 @@ def test_an_ingested_store_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -
 def test_the_scale_of_scene_toml_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
     """The store reads as the file with its scene.toml does: scaled, and with nodata as NaN."""
     numbers = raw.astype(np.int16)
-    numbers[3, 4], numbers[5] = -1, -9999
+    numbers[3, 4] = -1
+    numbers[5] = -9999
     path = write_envi(tmp_path / "a.img", numbers)
     (tmp_path / "scene.toml").write_text("nodata = -1\n")
     unscaled = ingest(path, tmp_path / "archive")

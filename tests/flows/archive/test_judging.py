@@ -90,7 +90,8 @@ def break_off(survey: Survey, monkeypatch: pytest.MonkeyPatch, **flags: Any) -> 
 
 def test_a_run_is_published_before_it_is_judged(survey: Survey, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """During the evaluation the run is valid and its accuracy pending; afterwards the same run has it."""
-    real, seen = STAGES["evaluate"], list[Any]()
+    real = STAGES["evaluate"]
+    seen: list[Any] = []
 
     def looking(*given: Any) -> Any:
         wanted = real.wants(*given)
@@ -160,8 +161,7 @@ def test_labels_may_come_later(
     """A run without labels is judged with the given ones, and records their absolute path."""
     survey(labels=None)
     monkeypatch.chdir(scene)
-    ended = command_line("evaluate", out, "latest")
-    ended.refused(1, "there are no labels to judge runs/.* by; give --labels FILE")
+    command_line("evaluate", out, "latest").refused(1, "there are no labels to judge runs/.* by; give --labels FILE")
     assert command_line("evaluate", out, "latest", "--labels", "labels.png").code == 0
     (receipt,) = receipts(out)
     assert receipt["accuracy_is"] == "judged"
@@ -210,11 +210,10 @@ def test_runs_that_cannot_be_judged_are_refused(
     assert Archive.open(unjudged).runs() == [run]
 
 
-JUDGED = "--weights is for weights that are judged"
 WORDS = {
     "a data set without weights": (2, "farm", "give --weights FILE to judge weights on this data set, or a run"),
     "an archive without a run": (2, "ARCHIVE", "such as evaluate .*archive latest, to judge its map"),
-    "a run with weights": (2, "ARCHIVE latest --weights w.safetensors", JUDGED),
+    "a run with weights": (2, "ARCHIVE latest --weights w.safetensors", "--weights is for weights that are judged"),
     "a run by shares": (2, "ARCHIVE latest --fractions 0.1", "--fractions is for weights that are judged on a data"),
     "a run with a folder": (2, "ARCHIVE latest -o out", "--out is for weights"),
     "weights with controls": (2, "farm --weights w --controls", "--controls is for a run of an archive"),

@@ -40,13 +40,13 @@ TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=(), draws=10)
 def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
     """Rows hold the mean over the seeds and its spread; the folder holds evaluation.json alone."""
     request, content = judged
-    folder, keys = request.out, [(row["policy"], row["fraction"]) for row in content["rows"]]
+    keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
     policies = [(policy, fraction) for policy in ("entropy", "random", ORACLE) for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
-    assert {path.name for path in folder.iterdir()} == {"evaluation.json"}
-    assert json.loads((folder / "evaluation.json").read_text())["rows"][1]["miou"] == content["rows"][1]["miou"]
+    assert {path.name for path in request.out.iterdir()} == {"evaluation.json"}
+    assert json.loads((request.out / "evaluation.json").read_text())["rows"][1]["miou"] == content["rows"][1]["miou"]
     row = _row(content, "entropy", 0.25)
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
     assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
@@ -68,9 +68,11 @@ def test_costs_are_relative_to_all_patches_and_the_oracle_captures_all_gain(judg
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Trained weights are judged on the frames that were held out or kept for validation."""
-    settings, out = TrainingSettings(steps=1, batch=1, crop=16), tmp_path / "w.safetensors"
+    settings = TrainingSettings(steps=1, batch=1, crop=16)
+    out = tmp_path / "w.safetensors"
     train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, width=4, settings=settings))
-    split, content = load_weights(out).record["split"], evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
+    split = load_weights(out).record["split"]
+    content = evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
     assert content["weights"][0]["left_out"] == sorted(split["train"])
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["left_out"] == sorted(split["train"])
@@ -91,14 +93,14 @@ def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
     assert sum(content["support"].values()) == 3 * 24 * 40
     assert content["seeds"] == [["a.safetensors", "b.safetensors"]]
     assert content["rows"][0]["spread"] is None
-    one = {**QUICK, "frames": ("001",)}
-    alone = evaluate_weights(EvaluateRequest(str(data), (first, second), **one))
+    alone = evaluate_weights(EvaluateRequest(str(data), (first, second), frames=("001",), **QUICK))
     assert [weights["covers"] for weights in alone["weights"]] == [[], ["001"]]
 
 
 def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path: Path):
     """One fold held out the frame on which the other validated; a single fold is judged on both frames."""
-    keys, paths = {name: scene_at(data, name).key for name in FRAMES}, []
+    keys = {name: scene_at(data, name).key for name in FRAMES}
+    paths = []
     for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
         split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": {validated: keys[validated]}}
         paths.append(write_weights(tmp_path / f"{number}.safetensors", number, data="field", split=split))
@@ -114,7 +116,8 @@ def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Pat
     """Their training masks differ, so they would be judged on different pixels of one frame."""
     scene = scene_at(data)
     halves = [np.zeros(scene.shape, bool) for _ in range(2)]
-    halves[0][:12], halves[1][12:] = True, True
+    halves[0][:12] = True
+    halves[1][12:] = True
     paths = [
         write_weights(
             tmp_path / f"{number}.safetensors",
@@ -123,10 +126,9 @@ def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Pat
         )
         for number, half in enumerate((halves[0], halves[1], halves[0]))
     ]
-    quick = {**QUICK, "frames": ("001",)}
     with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
-        evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[1]), **quick))
-    content = evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[2]), **quick))
+        evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[1]), frames=("001",), **QUICK))
+    content = evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[2]), frames=("001",), **QUICK))
     assert sum(content["support"].values()) == 12 * 40
 
 
@@ -225,7 +227,8 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     row, less = collect_row([joined], "none", 0.0), collect_row([joined, part], "none", 0.0)
     assert less.counts.shape == (2, 3, 2, 2)
     assert not less.counts[1, 2].any()
-    found, wanted = difference(row, less, TRIAL), row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
+    found = difference(row, less, TRIAL)
+    wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
     assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
 
 
@@ -233,8 +236,8 @@ def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.Mo
     """The built-in fields of the test data have seeds of their own, apart from training."""
     monkeypatch.setattr("flows.training.data.FARM_SHAPE", (32, 48))
     monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
-    made, weights = make_weights(classes=len(CLASSES), columns=6), tmp_path / "w.safetensors"
-    save_weights(replace(made, class_names=CLASSES), weights)
+    weights = tmp_path / "w.safetensors"
+    save_weights(replace(make_weights(classes=len(CLASSES), columns=6), class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "fractions": (0.25,)}
     content = evaluate_weights(EvaluateRequest("farm", (weights,), scenes=2, **quick))
     assert content["frames"] == [*farm_test_data(2, LineCamera()).train]

@@ -11,7 +11,7 @@ import pytest
 from flows.archive.commands import contents
 from flows.publish.receipt_table import saving_rows
 from flows.publish.report import render_report
-from flows.publish.run_folder import Published, publish_counted
+from flows.publish.run_folder import publish_counted
 from storage.archive.archive import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
@@ -48,12 +48,6 @@ def spooled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
-@pytest.fixture
-def published(survey_png: Survey, tmp_path: Path) -> Published:
-    """Return a survey of the small picture in an archive of its own."""
-    return survey_png(tmp_path / "archive", accuracy=False, **ONE_SCAN)
-
-
 @pytest.mark.parametrize(("keep", "budget", "accuracy"), [("raw", "0.45", False), ("signal", "0.8", True)])
 def test_the_account_of_a_survey_matches_its_folders(
     spooled: list[int], survey_png: Survey, tmp_path: Path, keep: str, budget: str, accuracy: bool
@@ -82,21 +76,22 @@ def test_the_account_of_a_survey_matches_its_folders(
     assert problems(root) == []
 
 
-def test_cached_stores_count_as_kept_not_as_written(published: Published, survey_png: Survey, tmp_path: Path) -> None:
+def test_cached_stores_count_as_kept_not_as_written(survey_png: Survey, tmp_path: Path) -> None:
     """A second run of the same survey writes its folder alone, and keeps the stores of the first."""
     root = tmp_path / "archive"
-    again = survey_png(root, accuracy=False, **ONE_SCAN)
-    assert again.folder != published.folder
-    account, first = told(again.folder), told(published.folder)
+    first, again = (survey_png(root, accuracy=False, **ONE_SCAN) for _ in range(2))
+    assert again.folder != first.folder
+    account = told(again.folder)
     assert account["written"] == walked(again.folder)
     stores = [ref for ref in Archive.open(root).refs() if ref.stage != "capture"]
     assert account["kept"] == walked(*(ref.path for ref in stores), again.folder)
-    assert account["captured"] == first["captured"]  # its passes are the same
+    assert account["captured"] == told(first.folder)["captured"]  # its passes are the same
 
 
 def test_a_visit_does_not_count_the_one_before(survey_png: Survey, tmp_path: Path) -> None:
     """The stores of its prior map belong to the visit before; both accounts add up to the archive."""
-    root, flags = tmp_path / "archive", ONE_SCAN | {"prior": "latest", "accuracy": False}
+    root = tmp_path / "archive"
+    flags = ONE_SCAN | {"prior": "latest", "accuracy": False}
     visits = [survey_png(root, **flags, visit=f"2026-06-0{day}T10:00:00Z") for day in (1, 8)]
     assert visits[1].receipt["prior_map"]["days"] == 7
     accounts = [told(visit.folder) for visit in visits]
@@ -155,9 +150,8 @@ def test_terminal_and_page_show_bytes_against_the_reference() -> None:
 
 def test_a_tiny_field_has_no_absurd_percentage() -> None:
     """For 384 captured bytes the rows have B and kB, and kept bytes are given as a multiple."""
-    told = {"captured": 384, "written": 655_553, "kept": 655_553, "moved_bucket": 0, "reference": 384}
     receipt = make_receipt()
-    receipt["data_bytes"] |= told
+    receipt["data_bytes"] |= {"captured": 384, "written": 655_553, "kept": 655_553, "moved_bucket": 0, "reference": 384}
     rows = {row["label"]: (row["done"], row["full"]) for row in saving_rows(receipt)}
     assert rows["bytes captured"] == ("384 B", "384 B")
     assert rows["bytes kept"] == ("656 kB", "384 B")

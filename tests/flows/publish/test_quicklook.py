@@ -58,7 +58,8 @@ def test_picture_has_a_readable_size(tmp_path: Path, height, width):
 @pytest.mark.parametrize("score", [-np.inf, np.inf, 0.0])
 def test_scores_without_a_range_are_drawn(score):
     """Scores that are all equal or infinite do not stop the picture."""
-    data, figure = make_data(64, 64), Figure(figsize=(8, 6))
+    data = make_data(64, 64)
+    figure = Figure(figsize=(8, 6))
     _draw_attention(figure.add_subplot(), replace(data, score=np.full_like(data.score, score)))
     FigureCanvasAgg(figure).draw()
 
@@ -114,13 +115,12 @@ def test_outline_is_the_border_of_the_patches():
 @pytest.mark.parametrize("confident", [True, False])
 def test_a_uniform_scan_shows_the_confidence_of_its_map(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, confident):
     """It replaces the panel of lines that were captured again."""
-    words = []
-    monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
+    told: dict[str, str] = {}
+    monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: told.update({title: text}))
     data = make_data(96, 128)
     data.class_map[:9] = data.truth[:9] = UNLABELLED
     confidence = data.confidence if confident else None
     (tmp_path / "q.png").write_bytes(draw_quicklook(replace(data, policy=None, blocks=(), confidence=confidence)))
-    told = dict(words)
     assert told["2  Confidence"] == ("of the model" if confident else "the map has none")
     assert told["4  Labels"].endswith(f"correct: {100 * (data.class_map == data.truth)[9:].mean():.1f} %")
     assert "2  Captured again" not in told
@@ -128,10 +128,12 @@ def test_a_uniform_scan_shows_the_confidence_of_its_map(monkeypatch: pytest.Monk
 
 def test_a_later_visit_shows_the_changes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Changed pixels have the colours of today's classes, others are grey; the caption has their number and days."""
-    words, shown = list[tuple[str, str]](), Mock(wraps=quicklook._show)
+    words: list[tuple[str, str]] = []
+    shown = Mock(wraps=quicklook._show)
     monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
     monkeypatch.setattr(quicklook, "_show", shown)
-    data, was = make_data(96, 128), np.full((96, 128), 255, np.uint8)
+    data = make_data(96, 128)
+    was = np.full((96, 128), 255, np.uint8)
     was[5:7, 10:20] = 1
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
     (tmp_path / "picture.png").write_bytes(draw_quicklook(replace(data, was=was, days=7.0, class_map=now)))
@@ -144,7 +146,8 @@ def test_a_later_visit_shows_the_changes(monkeypatch: pytest.MonkeyPatch, tmp_pa
 def test_class_colours_are_exact(tmp_path: Path) -> None:
     """Among many colours, a rare class and pixels without a class keep their colours."""
     data = make_data(96, 128)
-    data.class_map[:3, :3], data.class_map[3:6, :3] = 2, 255
+    data.class_map[:3, :3] = 2
+    data.class_map[3:6, :3] = 255
     (tmp_path / "q.png").write_bytes(draw_quicklook(replace(data, truth=None)))
     with Image.open(tmp_path / "q.png") as image:
         found = {colour for _, colour in image.convert("RGB").getcolors(2**24)}

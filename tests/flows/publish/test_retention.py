@@ -69,7 +69,8 @@ def test_raw_lines_stay_for_their_time(archive: Archive, capsys: pytest.CaptureF
 def test_expired_raw_lines_are_cleared(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
     """A dry run lists them with the reason; gc clears them, and the archive is valid with the same condensed lines."""
     run = spectralzoom.open(archive.root).latest
-    before, there = {n: one.values for n, one in run.lines.items()}, raw_uris(archive)
+    before = {n: one.values for n, one in run.lines.items()}
+    there = raw_uris(archive)
     code, planned = of_gc(capsys, archive.root, dry_run=True)
     assert (code, raw_uris(archive)) == (DONE, there)
     assert {row["uri"] for row in planned["removals"]} == there

@@ -18,7 +18,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 from unittest.mock import Mock
 
 import httpx
@@ -107,8 +107,7 @@ def test_a_run_has_its_due_time_as_visit_and_the_newest_prior_map(north: Any) ->
     deployment = deployed(north)
     states = [run_here(planned(deployment, DUE.replace(day=day))) for day in (1, 2)]
     assert [state.name for state in states] == ["Completed", "Completed"]
-    asked = settings_of(Path(north.settings.out))
-    assert [one["visit"] for one in asked] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
+    assert [one["visit"] for one in settings_of(north.settings.out)] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
     memories = [read_run(folder).receipt.get("prior_map") for folder in Archive.open(north.settings.out).runs()]
     assert [memory is None for memory in memories] == [True, False]
 
@@ -161,18 +160,19 @@ def test_two_fields_due_at_once_use_the_rig_in_turn(tmp_path: Path) -> None:
     """Prefect's limit makes the second wait; the rig's own lock would refuse it."""
     from prefect import flow
 
-    archive, usual = Archive.open(tmp_path / "archive"), load_settings(None, {"scene": "farm"})
+    usual = load_settings(None, {"scene": "farm"})
     rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
-    run = SimpleNamespace(settings=rig, archive=archive, name="x")
+    run: Any = SimpleNamespace(settings=rig, archive=Archive.open(tmp_path / "archive"), name="x")
     held: list[tuple[float, float]] = []
     inside = threading.Barrier(2)
 
     @flow(persist_result=False)
     def scan_pass() -> None:
-        plan, capture = OpenSurvey(cast(Any, run), Observer()), SimpleNamespace(wants=Mock(), find=lambda *_: None)
+        plan = OpenSurvey(run, Observer())
+        capture: Any = SimpleNamespace(wants=Mock(), find=lambda *_: None)
         inside.wait(PATIENCE_S)
         with plan.at_work():
-            plan.hold_rig(cast(Any, capture))
+            plan.hold_rig(capture)
             began = time.monotonic()
             time.sleep(0.5)
             held.append((began, time.monotonic()))
@@ -298,8 +298,7 @@ def test_the_automation_reports_a_failed_run(north: Any, tmp_path: Path, schedul
         (tmp_path / "automation.yaml").write_text(text.replace(unset, str(block)))
         prefect_cli(tmp_path, "automation", "create", "--from-file", "automation.yaml")
         settings = {"settings_file": str(tmp_path / "gone.toml")}
-        state = run_here(planned(deployed(north), DUE, {"settings": settings}))
-        assert state.is_failed()
+        assert run_here(planned(deployed(north), DUE, {"settings": settings})).is_failed()
         found = told.get(timeout=PATIENCE_S)
     finally:
         listener.shutdown()
@@ -326,18 +325,20 @@ def test_serve_resumes_after_the_server_restarts(field_file: Callable[..., Path]
     from prefect.deployments import run_deployment
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
-    file, home, port = field_file("north", source="raster", budget=None), tmp_path / "home", free_port()
+    file = field_file("north", source="raster", budget=None)
+    home = tmp_path / "home"
+    port = free_port()
     with server_process(home, port) as server:
-        password, api = (home / "password").read_text().strip(), f"http://127.0.0.1:{port}/api"
+        password = (home / "password").read_text().strip()
+        api = f"http://127.0.0.1:{port}/api"
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
         environment |= {"PREFECT_API_URL": api, "PREFECT_API_AUTH_STRING": password}
         environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it retries for minutes
         words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
         words += ["serve", str(file), "--every", "365d"]
-        user, _, secret = password.partition(":")
         with (
             temporary_settings({PREFECT_API_URL: api, PREFECT_API_AUTH_STRING: password}),
-            httpx.Client(base_url=f"{api}/v2/concurrency_limits", auth=(user, secret)) as limits,
+            httpx.Client(base_url=f"{api}/v2/concurrency_limits", auth=tuple(password.split(":", 1))) as limits,
             (tmp_path / "said").open("w") as said,
             subprocess.Popen(words, cwd=ROOT, env=environment, stderr=said) as process,
         ):

@@ -59,7 +59,7 @@ def test_a_scene_without_a_pattern_is_kept(tmp_path: Path) -> None:
 
 def test_new_scenes_are_surveyed_newest_first_until_none_is_left(tmp_path: Path, weights: Path) -> None:
     """Order is by modification time without label files; then the latest run remains until another file comes."""
-    folder, quiet = tmp_path / "scenes", QUIET
+    folder = tmp_path / "scenes"
     with pytest.raises(NoSceneYet, match="no file yet that --scene"):
         scene_of_visit(asked(tmp_path, "{new}.png"), JUNE)
     write_scene(folder, "z.png", 1)
@@ -67,10 +67,10 @@ def test_new_scenes_are_surveyed_newest_first_until_none_is_left(tmp_path: Path,
     write_scene(folder, "a_mask.png", 3)
     more = {"weights": str(weights), "name": "north"}
     for wanted in (newest, folder / "z.png"):
-        published = run_survey(asked(tmp_path, "{new}.png", **more), quiet)
+        published = run_survey(asked(tmp_path, "{new}.png", **more), QUIET)
         assert published.receipt["settings"]["scene"] == str(wanted)
     with pytest.raises(NothingToMend, match=r"nothing new: .*-north surveyed .*a.png") as told:
-        run_survey(asked(tmp_path, "{new}.png", **more), quiet)
+        run_survey(asked(tmp_path, "{new}.png", **more), QUIET)
     assert (tmp_path / "a" / "runs" / told.value.run).is_dir()
     later = write_scene(folder, "b.png", 4)
     assert scene_of_visit(asked(tmp_path, "{new}.png", **more), JUNE).scene == str(later)

@@ -50,14 +50,14 @@ class Waves:
 def through(frequency: NDArray[np.float64], width: float) -> NDArray[np.float64]:
     """Return the gain of a box, at pixel centres, for waves linear between pixels: with all images, in phase."""
     images = frequency + np.arange(-200, 201)[:, None]
-    left: NDArray[np.float64] = (np.sinc(images) ** 2 * np.sinc(images * width)).sum(axis=0)
-    return left
+    return (np.sinc(images) ** 2 * np.sinc(images * width)).sum(axis=0)
 
 
 def waves(shape: tuple[int, int], shortest_px: float, longest_px: float) -> Waves:
     """Return twelve waves of seeded directions."""
     rng = np.random.default_rng(11)
-    period, angle = np.linspace(shortest_px, longest_px, 12), rng.uniform(0, np.pi, 12)
+    period = np.linspace(shortest_px, longest_px, 12)
+    angle = rng.uniform(0, np.pi, 12)
     frequency = np.stack([np.sin(angle), np.cos(angle)], axis=1) / period[:, None]
     return Waves(shape, frequency, rng.uniform(0, 2 * np.pi, 12), 0.8 * period / period.sum())
 
@@ -74,7 +74,8 @@ def test_survey_equals_the_scene_behind_the_footprint(
     shape: tuple[int, int], along: str, survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path
 ) -> None:
     """For waves of 4 to 40 px the mosaic equals the convolved pixels, and inside it the waves' closed form."""
-    scene, archive = waves(shape, 4, 40), tmp_path / "archive"
+    scene = waves(shape, 4, 40)
+    archive = tmp_path / "archive"
     np.save(tmp_path / "waves.npy", scene.raster())
     flags = {"labels": None, "wavelengths": "500,700", "weights": str(make_weights((500.0, 700.0))), "budget": None}
     flags |= {"effects": "rotation,slit,smear", "tol": "0", "camera.samples": SAMPLES, "scan_step": "1"}

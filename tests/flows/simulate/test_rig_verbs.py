@@ -125,7 +125,8 @@ def test_rig_check_reads_the_file_of_an_emulated_rig(command_line: CommandLine, 
     wanted |= {"interest": "0.5", "day": "150", "hour": "9.5", "sky.light_fraction": "0.4"}
     wanted |= {"rig.mirror_axes": "y,-x", "camera.samples": "320", "detector.noiseless": True, "optics.focus_m": 40.0}
     settings = emulated_settings(None, wanted)
-    ended, codes = threading.Event(), []
+    ended = threading.Event()
+    codes = []
 
     def emulate() -> None:
         codes.append(run_emulate(settings, QUIET, baud=0, speed=20.0, out=file, as_json=True, ended=ended))
@@ -137,8 +138,7 @@ def test_rig_check_reads_the_file_of_an_emulated_rig(command_line: CommandLine, 
             thread.join(0.05)
         written = load_settings(file)
         assert written.simulated_rig == settings.simulated_rig
-        rig = written.rig
-        assert (rig.provenance, rig.mirror_axes) == ("emulated", "y,-x")
+        assert (written.rig.provenance, written.rig.mirror_axes) == ("emulated", "y,-x")
         of_the_light = {one.name for one in fields(RenderingFlags)} & (set(SURVEY) - set(TABLES))
         assert {"seed", "interest", "hour"} <= of_the_light
         for name in ("scene", "size", *of_the_light):
@@ -167,8 +167,7 @@ def test_emulation_ends_at_ctrl_c(scene_files: Path) -> None:
         [sys.executable, "-m", "flows.cli.main", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         lines = iter(process.stdout.readline, "")
-        table = "".join(next(lines) for _ in range(7))
-        port = tomllib.loads(table)["rig"]["port"]
+        port = tomllib.loads("".join(next(lines) for _ in range(7)))["rig"]["port"]
         assert Path(port).exists()
         process.send_signal(signal.SIGINT)
         _, words_left = process.communicate(timeout=30)

@@ -23,8 +23,7 @@ from typing import Any
 RECORD = "stage"  # decorates a function with its record: no stored byte depends on it
 PACKAGES = ("flows", "models", "pipeline", "storage")
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
-FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
-SCOPES = FUNCTIONS | ast.ClassDef | ast.Lambda | COMPREHENSIONS
+SCOPES = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Lambda | COMPREHENSIONS
 
 Target = tuple[str, str]  # a module by its dotted name, and a definition in it; "" for statements that define nothing
 
@@ -80,7 +79,8 @@ class Sources:
     def closure(self, roots: Iterable[str], barriers: Collection[str] = ()) -> set[Target]:
         """Return every definition that the roots reach without passing one of the barriers."""
         ends = {self.named(name) for name in barriers}
-        found, waiting = set[Target](), [self.named(name) for name in roots]
+        found: set[Target] = set()
+        waiting = [self.named(name) for name in roots]
         while waiting:
             target = waiting.pop()
             if target not in found:
@@ -97,7 +97,8 @@ class Sources:
         """Follow a dotted name through imports; return its name where it is defined, and the definitions it reaches."""
         parts = dotted.split(".")
         for count in range(len(parts), 0, -1):
-            module, rest = self.modules.get(".".join(parts[:count])), parts[count:]
+            module = self.modules.get(".".join(parts[:count]))
+            rest = parts[count:]
             if module is None:
                 continue
             if not rest:  # the module itself, as a value
@@ -113,7 +114,8 @@ class Module:
     """Names at the top of one file, with their definitions."""
 
     def __init__(self, sources: Sources, path: str, tree: ast.Module) -> None:
-        self.sources, self.path = sources, path
+        self.sources = sources
+        self.path = path
         self.imported: dict[str, str] = {}  # a name here -> a dotted name
         self.defined: dict[str, list[Definition]] = {}
         self._enter(tree.body)
@@ -153,7 +155,8 @@ class Definition:
     """One statement at the top of a file: its syntax without parts that have no effect, and the names it uses."""
 
     def __init__(self, module: Module, node: ast.stmt) -> None:
-        self._module, self._node = module, node
+        self._module = module
+        self._node = node
         if isinstance(node, ast.FunctionDef):
             node.decorator_list = [one for one in node.decorator_list if _decorator(one) != RECORD]
         self._decorators = [_decorator(one) for one in getattr(node, "decorator_list", ())]
@@ -161,7 +164,8 @@ class Definition:
     @property
     def registers(self) -> bool:
         """Return whether a function of the four packages decorates it."""
-        known, resolve = self._module.names, self._module.sources.resolve
+        known = self._module.names
+        resolve = self._module.sources.resolve
         parts = (name.partition(".") for name in self._decorators)
         return any(resolve(f"{known[head]}{dot}{rest}")[1] for head, dot, rest in parts if head in known)
 
@@ -275,9 +279,11 @@ class _Bare(ast.NodeTransformer):
         return node
 
     def _attribute(self, node: ast.Attribute) -> ast.AST:
-        names, inner = [node.attr], node.value
+        names = [node.attr]
+        inner = node.value
         while isinstance(inner, ast.Attribute):
-            names, inner = [inner.attr, *names], inner.value
+            names = [inner.attr, *names]
+            inner = inner.value
         return self._called(node, inner.id, names) if isinstance(inner, ast.Name) else self.generic_visit(node)
 
     def _called(self, node: ast.Name | ast.Attribute, name: str, attributes: Iterable[str]) -> ast.AST:

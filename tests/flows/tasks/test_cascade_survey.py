@@ -26,7 +26,8 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 @pytest.fixture(scope="module")
 def judged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return tiny weights with a table of the loss when a part is read."""
-    path, tiny = tmp_path_factory.mktemp("weights") / "weights.safetensors", random_weights(RGB_NM)
+    path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
+    tiny = random_weights(RGB_NM)
     save_weights(replace(tiny, record={**tiny.record, CASCADE: asdict(TABLE)}), path)
     return path
 
@@ -52,8 +53,7 @@ def test_the_allowed_loss_sets_the_smallest_gain(cascade: tuple[Path, Any]) -> N
     out, receipt = cascade
     attention = _open(out, receipt, "attention")
     gain, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
-    asked = {"macs": None, "least_gain": pytest.approx(0.15), "expected_loss": 0.3}
-    assert receipt["kept"]["asked"] == asked
+    assert receipt["kept"]["asked"] == {"macs": None, "least_gain": pytest.approx(0.15), "expected_loss": 0.3}
     np.testing.assert_array_equal(rank >= 0, gain >= 0.15)
     assert 0 < receipt["kept"]["patches"] == np.count_nonzero(rank >= 0) < receipt["kept"]["of_patches"]
     assert (np.diff(gain[np.argsort(rank)][rank.size - np.count_nonzero(rank >= 0) :]) <= 0).all()
@@ -62,8 +62,7 @@ def test_the_allowed_loss_sets_the_smallest_gain(cascade: tuple[Path, Any]) -> N
 def test_read_patches_equal_a_full_reading(cascade: tuple[Path, Any], survey_png: Survey, tmp_path: Path) -> None:
     """The other patches come from the overview, and some differ."""
     out, receipt = cascade
-    weights = str(receipt["settings"]["weights"])
-    everything = survey_png(tmp_path, **RASTER, weights=weights, expected_loss="0").receipt
+    everything = survey_png(tmp_path, **RASTER, weights=receipt["settings"]["weights"], expected_loss="0").receipt
     assert "kept" not in everything
     ours, whole = _classes(out, receipt), _classes(tmp_path, everything)
     patches = _open(out, receipt, "attention")["rank"].values >= 0

@@ -126,12 +126,12 @@ def test_edges_need_one_patch_of_halo(surveyed: Surveyed) -> None:
 def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:
     """A worker uses the weights that were sent, whatever file is at their path."""
     run, stages = surveyed
-    copy, work = tmp_path / "w.safetensors", run.work
-    copy.write_bytes(work.weights.path.read_bytes())
-    scoring = Scoring(replace(work.weights, path=copy), _mosaics(stages)[0], "entropy", run.capture)
-    sent = pickle.dumps((scoring, work.regions[0]))
+    copy = tmp_path / "w.safetensors"
+    copy.write_bytes(run.work.weights.path.read_bytes())
+    scoring = Scoring(replace(run.work.weights, path=copy), _mosaics(stages)[0], "entropy", run.capture)
+    sent = pickle.dumps((scoring, run.work.regions[0]))
     assert len(sent) < copy.stat().st_size + 2000
-    expected = scoring(work.regions[0])
+    expected = scoring(run.work.regions[0])
     copy.write_bytes(b"other weights")
     travelled, region = pickle.loads(sent)
     assert (travelled(region) == expected).all()
@@ -176,11 +176,10 @@ def test_keys_contain_regions_for_divided_fields_only(size: tuple[int, int]) -> 
 def test_a_shifted_prior_map_is_nodata_at_its_old_place(surveyed: Surveyed, shift: tuple[int, int]) -> None:
     """Values move by ``shift`` in fine and coarse pixels alike; pixels without a source are NaN."""
     run, stages = surveyed
-    probabilities, mosaic = _store(stages, "segment"), _mosaics(stages)[0]
     (region,) = plan_regions(run.grid, SHARD)
-    classes = tuple(range(len(run.weights.class_names)))
-    still = FieldPriorMap(probabilities, mosaic, 1.0, None, classes).of(region, run.weights)
-    moved = FieldPriorMap(probabilities, mosaic, 1.0, None, classes, shift).of(region, run.weights)
+    given = (_store(stages, "segment"), _mosaics(stages)[0], 1.0, None, tuple(range(len(run.weights.class_names))))
+    still = FieldPriorMap(*given).of(region, run.weights)
+    moved = FieldPriorMap(*given, shift).of(region, run.weights)
     coarse = tuple(round(by / CELL_PX) for by in shift)
     pairs = [
         (still.probabilities.log_probability, moved.probabilities.log_probability, shift),
@@ -198,10 +197,10 @@ def test_a_shifted_prior_map_is_nodata_at_its_old_place(surveyed: Surveyed, shif
 def test_a_shifted_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
     """Features come from outside of a region's halo, as far as the field has them."""
     run, stages = surveyed
-    probabilities, mosaic = _store(stages, "segment"), _mosaics(stages)[0]
-    before = FieldPriorMap(probabilities, mosaic, 1.0, None, tuple(range(len(run.weights.class_names))), (40, -8))
+    classes = tuple(range(len(run.weights.class_names)))
+    before = FieldPriorMap(_store(stages, "segment"), _mosaics(stages)[0], 1.0, None, classes, (40, -8))
     (field,) = plan_regions(run.grid, SHARD)
     whole = before.of(field, run.weights).coarse
     for region in plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=16):
-        part, here = before.of(region, run.weights).coarse, region.read.over(CELL_PX)
-        np.testing.assert_array_equal(part, whole[here.rows, here.columns])
+        here = region.read.over(CELL_PX)
+        np.testing.assert_array_equal(before.of(region, run.weights).coarse, whole[here.rows, here.columns])

@@ -62,8 +62,8 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
     class_maps.create_probabilities(path, SHAPE, LEGEND, goes_on=old_class is not None)
     for top in range(0, SHAPE[0], 64):
         rows = slice(top, top + 64)
-        packed, light = class_maps.packed_probabilities(values[rows]), np.ones(SHAPE, np.float32)[rows]
-        class_maps.write_probabilities_tile(path, (top, 0), packed, age_days[rows], light)
+        packed = class_maps.packed_probabilities(values[rows])
+        class_maps.write_probabilities_tile(path, (top, 0), packed, age_days[rows], np.ones(SHAPE, np.float32)[rows])
         if old_class is not None:
             class_maps.write_changes_tile(path, (top, 0), old_class[rows])
     if old_class is not None:
@@ -119,8 +119,8 @@ def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: S
 
 def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores) -> None:
     """Each scene pixel's class is at the end of its ray; the picture brightens towards the rig, as the mosaic does."""
-    ref = draw(run, stores)
-    found, grid = load_ground_map(ref.path / STORE), run.ground_grid
+    found = load_ground_map(draw(run, stores).path / STORE)
+    grid = run.ground_grid
     y, x = pixel_places(SHAPE)
     points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
     places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
@@ -156,8 +156,7 @@ def test_age_and_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, t
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
     write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
     believe(tmp_path / "later", age, old.astype(np.uint8))
-    ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
-    found = load_ground_map(ref.path / STORE)
+    found = load_ground_map(draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1])).path / STORE)
     seen, (row, column) = field_pixels(run, found)
     np.testing.assert_array_equal(found.age_days[seen], age[row, column])
     np.testing.assert_array_equal(found.old_class[seen], old[row, column])
@@ -182,8 +181,8 @@ def test_a_first_visit_has_ages_and_no_changes(run: Run, stores: Stores) -> None
 def test_the_store_has_areas_pose_and_crs(run: Run, stores: Stores) -> None:
     """Areas are sums of footprints at any resolution; plain xarray reads pose, pixel counts and CRS."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
-    areas, grid = load_ground_map(ref.path / STORE).areas, run.ground_grid
-    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
+    areas = load_ground_map(ref.path / STORE).areas
+    exact = run.ground_grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
     assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
@@ -202,7 +201,6 @@ def test_the_key_follows_pose_and_map(run: Run, stores: Stores) -> None:
         replace(run.settings, map=MapChoice(resolution_m=0.01)),
         run.settings,
     ]
-    refs = [draw(replace(run, settings=settings), stores) for settings in changed]
-    keys = [ref.key for ref in refs]
+    keys = [draw(replace(run, settings=settings), stores).key for settings in changed]
     assert keys[0] == keys[3]
     assert len(set(keys)) == 3

@@ -32,7 +32,8 @@ ONE, TWO, THREE = (WorkerPool(workers=count) for count in (1, 2, 3))
 @pytest.fixture(scope="module")
 def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[SignalCube]:
     """Return two stored sweeps of noise, side by side."""
-    folder, rng = tmp_path_factory.mktemp("raw"), np.random.default_rng(8)
+    folder = tmp_path_factory.mktemp("raw")
+    rng = np.random.default_rng(8)
     frame = (CAMERA.samples, len(BANDS))
     references = References(np.zeros(frame, np.float32), np.full(frame, 2000, np.float32), np.ones(3, np.float32))
     for strip in (-250.0, 250.0):
@@ -82,8 +83,7 @@ def test_a_worker_frees_its_raw_lines(cubes: list[SignalCube]) -> None:
 def test_memory_of_workers_on_other_machines_is_not_counted(tmp_path: Path, cubes: list[SignalCube]) -> None:
     """On a cluster the smallest memory setting refuses nothing."""
     work = MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
-    elsewhere = WorkerPool("tcp://127.0.0.1:9")
     tiles = plan_tiles(work.placed, CAMERA, GRID, (64, 640))
-    assert tile_budget(work, tiles, (64, 640), memory=1, pool=elsewhere).workers == 1
+    assert tile_budget(work, tiles, (64, 640), memory=1, pool=WorkerPool("tcp://127.0.0.1:9")).workers == 1
     with pytest.raises(SettingsError, match="exceeds --memory 1 MiB"):
         tile_budget(work, tiles, (64, 640), memory=1, pool=ONE)

@@ -40,16 +40,21 @@ SCANNED: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms":
 OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "condense_raster"}
 
 
-def states(receipt: dict[str, object]) -> set[str]:
+def states(receipt: dict[str, Any]) -> set[str]:
     """Return the states of the stages."""
-    rows = receipt["stages"]
-    assert isinstance(rows, list)
-    return {row["state"] for row in rows}
+    return {row["state"] for row in receipt["stages"]}
 
 
 def map_of(archive: Archive, published: Published) -> NDArray[np.uint8]:
     """Return the class map of a survey."""
     return load_class_map(archive.locate(published.receipt["products"]["class_map"])).classes
+
+
+def raw(bucket: str) -> set[str]:
+    """Return the names of the files in the stores of raw lines."""
+    archive = open_archive(bucket)
+    assert isinstance(archive, ObjectArchive)
+    return {name.rpartition("/")[2] for name in archive.objects.listing("stages/capture")}
 
 
 def test_a_rerun_finds_every_stage_in_the_bucket(
@@ -71,10 +76,7 @@ def test_a_rerun_finds_every_stage_in_the_bucket(
     elsewhere = survey_png(bucket)
     assert states(elsewhere.receipt) <= CACHED
     assert elsewhere.folder != again.folder
-    archive = open_archive(bucket)
-    assert isinstance(archive, ObjectArchive)
-    raw = {name.rpartition("/")[2] for name in archive.objects.listing("stages/capture")}
-    assert raw == {"manifest.json"}  # raw lines were cleared in the bucket; neither machine captured or sent them again
+    assert raw(bucket) == {"manifest.json"}  # cleared in the bucket; neither machine captured or sent them again
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "a desk"))
     run = spectralzoom.open(bucket).latest
@@ -115,23 +117,17 @@ def test_another_machine_clears_expired_raw_lines_in_a_bucket(
 ) -> None:
     """Raw lines stay for 7 days; then gc clears them, and no later survey sends them."""
     survey_png(bucket, **SCANNED)
-
-    def raw() -> set[str]:
-        archive = open_archive(bucket)
-        assert isinstance(archive, ObjectArchive)
-        return {name.rpartition("/")[2] for name in archive.objects.listing("stages/capture")}
-
     assert command_line("gc", bucket).code == 0
-    assert len(raw()) > 1
+    assert len(raw(bucket)) > 1
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
     with monkeypatch.context() as later:
         later.setattr(ObjectArchive, "now", lambda self: datetime.now(UTC) + timedelta(days=8))
         ended = json.loads(command_line("gc", bucket, "--json").out)
     assert [removal["uri"].split("/")[1] for removal in ended["removals"]] == ["capture"]
-    assert raw() == {"manifest.json"}
+    assert raw(bucket) == {"manifest.json"}
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "work"))
     assert states(survey_png(bucket, **SCANNED).receipt) <= CACHED
-    assert raw() == {"manifest.json"}
+    assert raw(bucket) == {"manifest.json"}
     assert command_line("verify", bucket).code == 0
 
 
@@ -168,7 +164,8 @@ def test_commands_read_an_archive_in_a_bucket(
     ended = command_line("export", bucket, "-o", tmp_path / "export", "--json")
     assert (ended.code, ended.errors) == (0, [])
     assert json.loads((tmp_path / "export" / "collection.json").read_text())["id"] == bucket.rpartition("/")[2]
-    item, archive = Path(json.loads(ended.out)["item"]), open_archive(bucket)
+    item = Path(json.loads(ended.out)["item"])
+    archive = open_archive(bucket)
     assets = json.loads(item.read_text())["assets"]
     assert {"report", "quicklook", "receipt", "mosaic_zarr"} <= set(assets)
     assert isinstance(archive, ObjectArchive)
@@ -212,11 +209,8 @@ def test_a_flipped_bit_is_reported_and_repaired(
 def test_missing_buckets_are_reported(bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
     """The message has cause and remedy; the exit code is 1, and 2 for an invalid address."""
     missing = command_line("survey", "--out", "s3://no-such-bucket/x", *SMALL)
-    assert missing.code == 1
-    assert "there is no such bucket: create it" in missing.errors[0]
+    missing.refused(1, "there is no such bucket: create it")
     monkeypatch.setattr("storage.remote.object_stores.RETRIES", 0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    silent = command_line("ls", bucket)
-    assert silent.code == 1
-    assert "it does not answer: check the network and AWS_ENDPOINT_URL" in silent.errors[0]
+    command_line("ls", bucket).refused(1, "it does not answer: check the network and AWS_ENDPOINT_URL")
     assert command_line("ls", "s3://").code == 2

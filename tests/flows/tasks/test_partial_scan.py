@@ -83,7 +83,8 @@ def product(out: Path, published: Any, name: str) -> xr.Dataset:
 def test_a_partial_scan_maps_the_rest_from_the_prior_map(visits: tuple[Path, Any, Any]) -> None:
     """The scan keeps its seconds; captured patches have age 0, the others 3 days, and every pixel has a class."""
     out, first, part = visits
-    scan_pass, age = part.receipt["extent"], product(out, part, "class_probabilities").age.values
+    scan_pass = part.receipt["extent"]
+    age = product(out, part, "class_probabilities").age.values
     assert 0.1 < scan_pass["patches_touched"] < 0.9
     assert part.receipt["settings"]["scan_step"] < 4  # cheaper lines, and less accurate than the prior map
     assert part.receipt["savings"]["capture_s"]["done"] == pytest.approx(scan_pass["seconds"])
@@ -146,7 +147,8 @@ def test_patches_beyond_max_age_come_first(visited: Path, visits: Any, survey_pn
     """With --max-age, lines over patches that the visit before left out are captured; notes and page count them."""
     flags = {**PART, "seconds": "1.95", "max_age": "8", "weights": str(recorded)}
     part = survey_png(visited, **flags, visit=LAST)
-    due, scan_pass = product(visited, visits[2], "class_probabilities").age.values == 3.0, part.receipt["extent"]
+    due = product(visited, visits[2], "class_probabilities").age.values == 3.0
+    scan_pass = part.receipt["extent"]
     assert (product(visited, part, "class_probabilities").age.values[due] < 1).any()
     assert 0 < scan_pass["due"] - scan_pass["due_left"] < scan_pass["due"]
     notes = " ".join(part.receipt["settings"]["notes"])
@@ -195,11 +197,10 @@ def test_a_visit_below_the_expected_error_is_skipped(
 
 def test_lines_that_cover_a_field_capture_its_border(recorded: Path) -> None:
     """Patches that cross the border count as captured if lines cover their part within the field."""
-    grid, covered = SceneGrid(100, 103, 16), np.ones((100, 103), np.uint8)
-    (region,) = plan_regions(grid, SHARD)
+    covered = np.ones((100, 103), np.uint8)
+    (region,) = plan_regions(SceneGrid(100, 103, 16), SHARD)
     mosaic: Any = SimpleNamespace(coverage=lambda rows, columns: covered[rows, columns])
-    missing: Any = None
-    drawing = Drawing(missing, missing, missing, missing, part=True)
+    drawing = Drawing(None, None, None, None, part=True)
     assert drawing._shown(region, mosaic).all()
     covered[96:] = 0
     assert not drawing._shown(region, mosaic)[96:].any()
@@ -229,12 +230,12 @@ def test_a_prior_map_read_in_swaths_equals_the_whole_one(
 
 def test_due_patches_have_the_highest_expected_gain() -> None:
     """A due patch outweighs ten times the sum of the others; without gains the oldest patches rank highest."""
-    grid, probabilities = SceneGrid(4, 16, 4), np.log([0.6, 0.4]) * np.ones((4, 16, 1))
+    probabilities = np.log([0.6, 0.4]) * np.ones((4, 16, 1))
     age = np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1)
-    expected_errors = PatchExpectedErrors.of([(probabilities, age)], grid, 2)
-    record, all_patches = ScanPerformance.read(RECORD), np.ones(4, bool)
+    expected_errors = PatchExpectedErrors.of([(probabilities, age)], SceneGrid(4, 16, 4), 2)
     due = np.array([False, True, False, False])
-    wanted = ExtentGains(record, ("class_0", "class_1"), expected_errors, due, all_patches)
+    record = ScanPerformance.read(RECORD)
+    wanted = ExtentGains(record, ("class_0", "class_1"), expected_errors, due, np.ones(4, bool))
     gains = wanted.gains(1, 25.0)
     assert (gains > 0).all()
     assert wanted.expected_gain(gains)[1] > 10 * wanted.expected_gain(gains)[[0, 2, 3]].sum()
@@ -292,9 +293,10 @@ def test_impossible_partial_scans_are_refused(
 
 def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
     """The choice reads a quarter of the prior map's pixels; a turned prior map is not read for the map."""
-    reader, read = SimpleNamespace(sizes=TemporalSizes(2, 4)), MultiplyAdds(5, 0, 7)
-    run: Any = SimpleNamespace(costs=SimpleNamespace(of_map=lambda index: read), least_gain=None, chooses=False)
-    run.prior, run.reader, run.grid = "there", reader, SceneGrid(95, 63, 4)
+    reader = SimpleNamespace(sizes=TemporalSizes(2, 4))
+    costs = SimpleNamespace(of_map=lambda index: MultiplyAdds(5, 0, 7))
+    facts = {"prior": "there", "reader": reader, "grid": SceneGrid(95, 63, 4), "least_gain": None, "chooses": False}
+    run: Any = SimpleNamespace(costs=costs, **facts)
     map_px, choice_px = 95 * 63, 48 * 32
     cases = (None, None, map_px), ("chosen", None, map_px + choice_px), ("chosen", TURNED, choice_px), (None, TURNED, 0)
     for extent, aside, pixels in cases:

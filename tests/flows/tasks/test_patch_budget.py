@@ -46,7 +46,8 @@ def _budget(**limits: object) -> PatchBudget:
 def test_budgets_are_spent_and_not_exceeded(given_scores: NDArray[np.float64], macs: float, policy: str) -> None:
     """Multiply-adds, with those of the scores, stay within the fraction; one patch more would exceed it."""
     budget = _budget(macs=f"{macs}%", policy=policy)
-    bought, promising = budget.choose(given_scores), np.argsort(-given_scores)[: np.count_nonzero(given_scores > 0)]
+    bought = budget.choose(given_scores)
+    promising = np.argsort(-given_scores)[: np.count_nonzero(given_scores > 0)]
 
     def pays(patch_index: NDArray[np.intp]) -> bool:
         return budget.operations_of(patch_index) <= macs / 100 * budget.everything
@@ -74,8 +75,7 @@ def test_patches_without_gain_are_not_read(worthless: float) -> None:
 
 def test_zones_limit_patches_and_their_fraction() -> None:
     """Only patches within the zones are chosen, and fractions refer to those patches."""
-    shown = np.arange(PATCHES) < PATCHES // 2
-    budget = _asked(shown, macs="80%")
+    budget = _asked(np.arange(PATCHES) < PATCHES // 2, macs="80%")
     assert budget.everything < _budget(macs="80%").everything
     assert max(budget.choose(np.ones(PATCHES))) < PATCHES // 2
 
@@ -98,7 +98,8 @@ def test_a_refusal_names_the_smallest_budget() -> None:
 
 def test_a_budget_may_be_a_number_of_multiply_adds() -> None:
     """Half of all multiply-adds chooses the same patches as 50 %; a number too small is refused with the minimum."""
-    half, one = _budget(macs="50%"), np.linspace(1, 2, PATCHES)
+    half = _budget(macs="50%")
+    one = np.linspace(1, 2, PATCHES)
     np.testing.assert_array_equal(_budget(macs=str(half.everything // 2)).choose(one), half.choose(one))
     with pytest.raises(BudgetError, match=r"the least is --\S+ \d+$"):
         _asked(macs="10")
@@ -131,7 +132,8 @@ def test_the_best_patches_are_read_within_the_budget(survey_png: Survey, tmp_pat
     assert np.flatnonzero(seen["rank"].values.ravel() >= 0).tolist() == patch_index  # which the map reads in detail
     best = np.argsort(-seen["score"].values.ravel(), kind="stable")[: len(patch_index)]
     assert sorted(patch_index) == sorted(best)
-    kept, costs = published.receipt["kept"], published.receipt["savings"]["multiply_adds"]
+    kept = published.receipt["kept"]
+    costs = published.receipt["savings"]["multiply_adds"]
     assert (kept["patches"], kept["of_patches"]) == (len(patch_index), 12 * 16)
     assert 0.7 < costs["ratio"] <= 0.8
     assert kept["multiply_adds"] == {"done": costs["done"], "everything": costs["full"]}

@@ -25,7 +25,8 @@ from tests.conftest import QUIET
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects
 
-OFF_PX, SEED = 6.0, 0
+OFF_PX = 6.0
+SEED = 0
 
 
 @pytest.fixture(scope="module")
@@ -52,19 +53,19 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
 
 def test_registration_finds_the_simulated_pointing_errors(surveyed: tuple[dict[str, Any], Path]) -> None:
     """Offsets relative to the reference sweep are within 0.5 px of the simulated ones, in coarse and fine passes."""
-    pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, SEED)
+    pointing = surveyed[0]["pointing"]
+    errors = PointingErrors(OFF_PX, SEED)
     coarse = pointing["coarse"]
     assert len(coarse["sweeps"]) > 1
     for name, offset in coarse["sweeps"].items():
         assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.5
     assert coarse["residual_rms_px"] is None  # at most as many windows as unknowns: the residual means nothing
-    held = errors.offset(coarse["held"])
     told = {
         name: offset for name, offset in pointing["fine"]["sweeps"].items() if name not in pointing["fine"]["not_found"]
     }
     assert told
     for name, offset in told.items():
-        assert np.abs(errors.offset(name) - held - offset).max() < 0.5
+        assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.5
 
 
 def test_partly_seen_patches_are_counted_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
@@ -83,8 +84,7 @@ def test_partly_seen_patches_are_counted_and_detail_still_helps(surveyed: tuple[
 
 def found_of(**told: Any) -> dict[str, Any]:
     """Return the part of a receipt about the pointing of a coarse pass."""
-    nothing: dict[str, Any] = {"held": "a", "sweeps": {"a": [0.0, 0.0]}, "residual_rms_px": None}
-    nothing |= {"not_found": [], "too_narrow": []}
+    nothing = {"held": "a", "sweeps": {"a": [0.0, 0.0]}, "residual_rms_px": None, "not_found": [], "too_narrow": []}
     return {"pointing": {"prior_px": 5.0, "coarse": {**nothing, **told}}}
 
 

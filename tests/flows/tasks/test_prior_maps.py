@@ -35,7 +35,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
-from tests.conftest import CLASSES, Survey, WeightsMaker, patchy_scene
+from tests.conftest import CLASSES, QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects
 
@@ -234,22 +234,19 @@ def test_prior_map_classes_are_matched_by_name(visited: Path, survey_png: Survey
     published = survey_png(visited, **{**RASTER, **flags})
     assert published.receipt["prior_map"]["days"] == 3.0
     strangers = make_weights(names=("a", "b", "c"))
-    words, published = words_of(
-        visited, survey_png, **{**flags, "weights": str(strangers), "visit": "2026-06-06T10:00:00Z"}
-    )
+    words, _ = words_of(visited, survey_png, **{**flags, "weights": str(strangers), "visit": "2026-06-06T10:00:00Z"})
     assert "it has none of the classes of these weights, but class_0, class_1, class_2" in words
 
 
 def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights: WeightsMaker) -> None:
     """With new weights, the prior map of the second visit is the reprocessed first visit."""
-    weights, told = make_weights(width=4), io.StringIO()
-    run_reprocess(visited, Console(file=told, width=300), weights=weights)
+    weights = make_weights(width=4)
+    run_reprocess(visited, QUIET, weights=weights)
     runs = [read_run(path) for path in sorted(visited.glob("runs/*"))]
     again = [run for run in runs if run.folder.name not in (twice[1].folder.name, twice[2].folder.name)]
     assert [run.settings["prior"] for run in again] == ["none", again[0].folder.name]
     assert again[1].receipt["prior_map"]["run"] == again[0].folder.name
-    content = io.StringIO()
-    run_reprocess(visited, Console(file=content, width=300), weights=weights)
+    run_reprocess(visited, QUIET, weights=weights)
     assert len(list(visited.glob("runs/*"))) == 4  # nothing is left to do
 
 
@@ -273,7 +270,8 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
 
 def test_a_rig_moved_between_two_partial_visits_is_detected(survey_png: Survey, tmp_path: Path) -> None:
     """Without a common part, today's lines are registered to the visit before the last."""
-    out, (values, _) = tmp_path / "archive", patchy_scene((160, 192), 3, seed=5)
+    out = tmp_path / "archive"
+    values, _ = patchy_scene((160, 192), 3, seed=5)
     flags = {**RASTER, "labels": None, "prior": "latest", "source": "sim", "scan_step": "2"}
     before, now = ({**flags, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
     for one, part in ((before, np.s_[12:140, 0:160]), (now, np.s_[0:128, 20:180])):  # 12 px lower, 20 further left
@@ -292,12 +290,12 @@ def test_a_rig_moved_between_two_partial_visits_is_detected(survey_png: Survey, 
 def test_a_rig_turned_by_four_degrees_is_detected(survey_png: Survey, tmp_path: Path) -> None:
     """The prior map is put aside; receipt and terminal give the angle."""
     values, _ = patchy_scene((300, 320), 3, seed=6)
-    soft, there = gaussian_filter(values, (1.5, 1.5, 0)), np.s_[2:290, 8:312]
+    soft = gaussian_filter(values, (1.5, 1.5, 0))
+    there = np.s_[2:290, 8:312]
     images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
     for name, image in images.items():
         Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
-    flags = {**RASTER, "labels": None}
-    survey_png(tmp_path / "a", **flags, scene=str(tmp_path / "before.png"), visit=FIRST)
+    survey_png(tmp_path / "a", **RASTER, labels=None, scene=str(tmp_path / "before.png"), visit=FIRST)
     now = {"labels": None, "scene": str(tmp_path / "now.png"), "visit": LATER, "prior": "latest"}
     words, later = words_of(tmp_path / "a", survey_png, **now)
     assert later.receipt["prior_map"]["put_aside"] == "turned"
@@ -310,12 +308,10 @@ def test_finding_a_prior_map_reads_the_newest_runs(visited: Path, twice: Any, mo
     _, first, later = twice
     for number in range(70):
         for name, source in (("north", later), ("south", first)):
-            copy = visited / "runs" / f"20270101T{number:06d}-{name}"
-            shutil.copytree(visited / "runs" / source.folder.name, copy)
+            shutil.copytree(visited / "runs" / source.folder.name, visited / "runs" / f"20270101T{number:06d}-{name}")
     counted = Mock(wraps=read_run)
     monkeypatch.setattr(memory, "read_run", counted)
-    found = found_prior(visited, "2026-06-20T10:00:00Z", "latest")
-    assert found[1] == 16.0
+    assert found_prior(visited, "2026-06-20T10:00:00Z", "latest")[1] == 16.0
     assert counted.call_count == memory.NEWEST_RUNS
     assert {call.args[0].name.rpartition("-")[2] for call in counted.call_args_list} == {"north"}
 

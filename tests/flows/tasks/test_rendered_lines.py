@@ -73,7 +73,9 @@ def test_a_capture_resumes_at_any_line(expected: list[Line], first: int) -> None
 
 def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first block ends last: the others wait for it, and one block more than there are workers is begun."""
-    real, others, begun = SimulatedSource.lines_of, threading.Semaphore(0), []
+    real = SimulatedSource.lines_of
+    others = threading.Semaphore(0)
+    begun = []
 
     def unfair(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
         begun.append(numbers.start)
@@ -86,8 +88,7 @@ def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
         return real(self, sweep, numbers)
 
     monkeypatch.setattr(SimulatedSource, "lines_of", unfair)
-    lines = taken(source_of("rotation"), WorkerPool("threads", 3), at_once=7)
-    assert [line.number for line in lines] == list(range(70))
+    assert [line.number for line in taken(source_of("rotation"), WorkerPool("threads", 3), at_once=7)] == [*range(70)]
 
 
 @pytest.mark.parametrize("workers", [2, 4])
@@ -110,7 +111,8 @@ def test_errors_are_raised_in_the_order_of_blocks(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize("error", [RigError("disk full"), KeyboardInterrupt()])
 def test_rendering_stops_when_a_line_is_refused(error: BaseException) -> None:
     """A full disk or Ctrl-C at a line ends the capture there, and no thread is left."""
-    lines, before = [], threading.active_count()
+    lines = []
+    before = threading.active_count()
 
     def take(line: Line) -> None:
         if line.number == 40:
@@ -126,7 +128,8 @@ def test_rendering_stops_when_a_line_is_refused(error: BaseException) -> None:
 def test_every_visit_has_its_own_seed() -> None:
     """So have every day and hour of a farm, and pointing errors; the default day has the seed of the settings."""
     asked = ({}, {"visit": "a"}, {"visit": "b"}, {"day": "179"}, {"day": "179", "visit": "a"}, {"hour": "9"})
-    given, scene = {"scene": "farm", "seed": "7", "pointing_px": "2"}, source_of().scene
+    given = {"scene": "farm", "seed": "7", "pointing_px": "2"}
+    scene = source_of().scene
     sources = [make_source(scene, load_settings(None, given | one)) for one in (*asked, {"day": "172"})]
     seeds = [source.seed for source in sources]
     assert seeds[0] == seeds[-1] == 7

@@ -12,7 +12,7 @@ from flows.tasks.run import open_run
 from flows.tasks.survey_model import shipped_weights, weights_path
 from flows.tradeoff.store import coarse_of_sweeps
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import Placements, ReadTwice, placement_figures, run_controls
+from models.evaluation.placement import ReadTwice, placement_figures, run_controls
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
@@ -33,16 +33,6 @@ SHAPE = (512, 640)  # smaller farms have too few pixels of rare classes to rank 
 def weights() -> Weights:
     """Return the shipped weights."""
     return load_weights(PATH)
-
-
-def placements(weights: Weights) -> Placements:
-    """Return the placements of all policies on a farm outside of the training, through the rig's exact rays."""
-    camera, scene = LineCamera(), farm_scene(41, SHAPE)
-    grid, source = SceneGrid(*SHAPE, weights.config.patch), SimulatedSource(scene, Rig(camera), 41)
-    sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]
-    seen = coarse_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights)
-    twice = ReadTwice.of(weights, seen, np.asarray(scene.labels))
-    return run_controls(twice, weights.config.classes, fraction=0.35, seed=41)
 
 
 def test_file_is_small_and_has_a_training_record(weights: Weights) -> None:
@@ -76,7 +66,14 @@ def test_seconds_below_every_scan_are_refused(tmp_path: Path) -> None:
 
 def test_reading_by_expected_gain_beats_random_patches(weights: Weights) -> None:
     """With K = 35 % its mIoU exceeds random by more than the spread, and closes over 70 % of the gap to all."""
-    controls = placements(weights)
+    camera = LineCamera()
+    scene = farm_scene(41, SHAPE)  # outside of the training
+    grid = SceneGrid(*SHAPE, weights.config.patch)
+    source = SimulatedSource(scene, Rig(camera), 41)
+    sweeps = [SimulatedSweep(source, sweep) for sweep in full_sweeps(grid, camera, "x")]  # by the rig's exact rays
+    seen = coarse_of_sweeps(sweeps, camera, source.wavelength_nm, grid, weights)
+    twice = ReadTwice.of(weights, seen, np.asarray(scene.labels))
+    controls = run_controls(twice, weights.config.classes, fraction=0.35, seed=41)
     rows = placement_figures(controls)
     assert rows["gain"]["miou"] > rows["random"]["miou"] + rows["random"]["spread"]
     none, every = mean_iou(controls["none"][0]), mean_iou(controls["all"][0])

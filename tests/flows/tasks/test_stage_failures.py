@@ -30,7 +30,6 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 NOT_HERE = ("register_coarse", "register_fine", "ground", "condense_raster")
 OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes without pointing errors
-CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 BUG = "rectify"  # the stage that fails with a bug
 FULL_DISK = "cannot write to the archive: no space left; make room"
@@ -38,7 +37,7 @@ FULL_DISK = "cannot write to the archive: no space left; make room"
 
 def refusal(stage: str) -> RigError | ArchiveError:
     """Return the error of a device for a capture, and that of a full disk for any other stage."""
-    return RigError(NO_REPLY) if stage in CAPTURES else ArchiveError(FULL_DISK)
+    return RigError(NO_REPLY) if stage in ("capture_coarse", "capture_fine") else ArchiveError(FULL_DISK)
 
 
 def altered(stage: str, built: Callable[[], None], tried: Callable[[], None] = lambda: None) -> Stage:
@@ -126,7 +125,8 @@ def command(words: list[Any]) -> Ended:
 @pytest.mark.parametrize("stage", OF_THIS)
 def test_a_failed_stage_gives_one_message(stage: str, walk: Walk) -> None:
     """It is the error, or for a bug the file with the traceback; the archive has the stores of earlier stages."""
-    before, trial = list(OF_THIS)[: list(OF_THIS).index(stage)], walk.trials[stage]
+    before = OF_THIS[: OF_THIS.index(stage)]
+    trial = walk.trials[stage]
     assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
     assert "Traceback" not in trial.ended.err
     assert trial.problems == []
@@ -161,8 +161,7 @@ def test_a_run_without_a_quicklook_is_not_published(
         with pytest.raises(ArchiveError, match="no space left"):
             survey_png(out)
     assert (Archive.open(out).runs(), problems(out)) == (before, [])
-    states = {stage["state"] for stage in survey_png(out).receipt["stages"]}
-    assert states == {"cached"}
+    assert {stage["state"] for stage in survey_png(out).receipt["stages"]} == {"cached"}
     assert (len(Archive.open(out).runs()), problems(out)) == (len(before) + 1, [])
 
 
@@ -183,7 +182,7 @@ def test_a_stage_that_fails_in_prefect_has_a_failed_task(
     prefect_tasks._task.cache_clear()
     with pytest.raises(type(error), match=str(error)[:20]):
         survey_png(tmp_path, engine="prefect", **{"camera.samples": 160})
-    before = list(OF_THIS)[: list(OF_THIS).index(stage)]
+    before = OF_THIS[: OF_THIS.index(stage)]
     run, tasks = newest_run("survey", len(before) + 2)
     assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")
     assert str(error) in run.state.message

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,9 +36,9 @@ from tests.storage.plain_mosaic import KillOnce
 
 def test_a_store_whose_input_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
     """Lines that another survey cleared read as nodata, so the store would hold wrong values."""
-    archive, product = Archive.open(tmp_path / "archive", create=True), Product("rectify", 1)
+    archive = Archive.open(tmp_path / "archive", create=True)
     given, _ = archive.produce("capture", lambda folder: (folder / "a").write_text("a") and None, version=1, params={})
-    one = Stage("rectify", "", product, lambda: None, None, 0, None)  # type: ignore[arg-type, return-value]
+    one = Stage("rectify", "", Product("rectify", 1), lambda: None, None, 0, None)  # type: ignore[arg-type, return-value]
     with pytest.raises(ArchiveError, match="another survey has cleared an input of rectify meanwhile"):
         one.produce(archive, Wanted(lambda folder: archive.clear(given) and None, {}, [given]))
     assert archive.refs("rectify") == []
@@ -52,7 +51,8 @@ def test_few_bands_are_stored_in_steps_of_the_longest_exposure(order: tuple[floa
 
     Bands without light do not count.
     """
-    found, lit = SignalStatistics(4 + dark, 64), np.append(np.ones(4, np.float32), np.full(dark, np.nan, np.float32))
+    found = SignalStatistics(4 + dark, 64)
+    lit = np.append(np.ones(4, np.float32), np.full(dark, np.nan, np.float32))
     found.add(np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 1)).astype(np.float32) * lit, np.ones((8, 8), np.bool_))
     zero = np.zeros((8, 4 + dark), np.float32)
     white = zero + 100 * np.nan_to_num(lit)
@@ -76,24 +76,18 @@ def test_stores_of_another_run_are_not_cleared(tmp_path: Path) -> None:
         other = survey.fn(SurveySettings(**given, policy="mask", mask=str(tmp_path / "nothing.npy"), keep="raw"))
         clear_raw(first, publish(first))
     assert archive.is_there(first.products["capture_coarse"].uri)
-    mosaic = read_run(other.folder).products["mosaic"]
-    assert archive.is_there("/".join(mosaic.split("/")[:3]))
-
-
-def _arrays(root: Path) -> Iterator[tuple[Path, zarr.Array[Any]]]:
-    """Yield the folder of every array of every store, and the array."""
-    for about in sorted((root / "stages").rglob("zarr.json")):
-        if json.loads(about.read_text())["node_type"] == "array":
-            yield about.parent, zarr.open_array(about.parent, mode="r")
+    assert archive.is_there("/".join(read_run(other.folder).products["mosaic"].split("/")[:3]))
 
 
 @pytest.mark.usefixtures("no_effects")
 def test_raw_lines_are_stored_once_and_as_uint16(tmp_path: Path) -> None:
     """Every captured line is in one array, under one name; the spool is empty; derived arrays are smaller."""
     flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
-    bands, root = ",".join(map(str, range(5, 265, 10))), tmp_path / "archive"  # as many as a spectrum of light needs
+    bands = ",".join(map(str, range(5, 265, 10)))  # as many as a spectrum of light needs
+    root = tmp_path / "archive"
     published = run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), QUIET)
-    arrays = list(_arrays(root))
+    nodes = {path.parent: json.loads(path.read_text())["node_type"] for path in root.glob("stages/**/zarr.json")}
+    arrays = [(path, zarr.open_array(path, mode="r")) for path, kind in sorted(nodes.items()) if kind == "array"]
     named = [getattr(array.metadata, "dimension_names", None) or () for _, array in arrays]
     by_line = [one for one, names in zip(arrays, named, strict=True) if {"line", "band"} <= set(names)]
     assert {path.name for path, _ in by_line} == {"dn"}

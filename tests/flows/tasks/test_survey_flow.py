@@ -21,7 +21,7 @@ from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
 from flows.survey import capture, draw_class_map
 from flows.tasks.local_server import ServerUnavailable
-from flows.tasks.open_survey import STAGES, Products
+from flows.tasks.open_survey import Products
 from flows.tasks.run import SurveyRun
 from pipeline.errors import IncompleteStoreError, SettingsError
 from storage.archive.keys import StageRef
@@ -240,21 +240,20 @@ def opened_surveys() -> set[int]:
 def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The server's files are in the archive, and the environment is unchanged afterwards."""
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
-    before, opened = prefect_variables(), opened_surveys()
+    before = prefect_variables()
+    opened = opened_surveys()
     survey_png(tmp_path, engine="prefect", **RASTER)
     assert opened_surveys() <= opened  # no run stays in memory
     assert (tmp_path / ".prefect" / "prefect.db").exists()
     assert prefect_variables() == before
 
 
-def test_without_a_server_the_survey_runs_plain(
-    survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_server_a_survey_runs_plain(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The server cannot start, and every stage runs without it."""
     refuse = Mock(side_effect=ServerUnavailable("the Prefect server did not start (no port)"))
     monkeypatch.setattr(survey_command, "_prefect_server", refuse)
-    found = survey_png(tmp_path, engine="prefect", **RASTER).receipt
-    assert {stage["state"] for stage in found["stages"]} == {"ran"}
+    receipt = survey_png(tmp_path, engine="prefect", **RASTER).receipt
+    assert {stage["state"] for stage in receipt["stages"]} == {"ran"}
 
 
 def test_a_named_server_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,16 +266,16 @@ def test_a_named_server_that_does_not_answer_is_reported(monkeypatch: pytest.Mon
 
 def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.MonkeyPatch, command_line: Any) -> None:
     """SIGTERM gives exit code 143 and one sentence, despite Prefect's own handling; the same command resumes."""
-    real, file = STAGES["segment"], field_file(**RASTER)
+    file = field_file(**RASTER)
 
     def terminated(*given: Any) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    act_instead(monkeypatch, "segment", terminated)
-    ended = command_line("survey", file)
+    with monkeypatch.context() as patch:
+        act_instead(patch, "segment", terminated)
+        ended = command_line("survey", file)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])
     assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"
-    monkeypatch.setitem(STAGES, "segment", real)
     assert command_line("survey", file).code == 0
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -38,7 +38,7 @@ from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
 from tests.conftest import CLASSES, QUIET, RGB_NM, patchy_scene, random_weights
-from tests.flows.conftest import FEW_BANDS, Page
+from tests.flows.conftest import FEW_BANDS, Page, problems
 from tests.models.conftest import coarse_prediction
 from tests.receipts import comparable
 
@@ -73,17 +73,15 @@ class Done:
 def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
     """Return a survey of a small built-in farm with the shipped weights and controls."""
     out = tmp_path_factory.mktemp("farm")
-    size = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS}
-    flags = {**size, "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
-    return Done(run_survey(load_settings(None, flags), QUIET), out)
+    flags = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS, "budget": "0.9", "seed": "1", "engine": "plain"}
+    return Done(run_survey(load_settings(None, {**flags, "out": str(out)}), QUIET), out)
 
 
 def test_receipt_has_every_field(farm: Done) -> None:
     """The stages are in order and all ran; accuracy has controls, and effects stay within the tolerance of 0.1."""
     receipt = check_receipt(farm.receipt)
-    states = {stage["name"]: stage["state"] for stage in receipt["stages"]}
-    assert states == dict.fromkeys(STAGES, "ran")
     ran = receipt["stages"]
+    assert {stage["name"]: stage["state"] for stage in ran} == dict.fromkeys(STAGES, "ran")
     assert all(stage["wall_s"] > 0 and stage["peak_rss_bytes"] > 0 for stage in ran)
     for stage in ran:
         (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
@@ -130,7 +128,8 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
 
 def test_savings_match_the_stored_cubes(farm: Done) -> None:
     """Lines, samples on the scene and bytes come from the cubes; seconds are the cost model's for both passes."""
-    savings, cubes = farm.receipt["savings"], farm.sweeps()
+    savings = farm.receipt["savings"]
+    cubes = farm.sweeps()
     shape = tuple(farm.open("class_map").sizes[axis] for axis in ("y", "x"))
     sweeps = [Sweep(**cube.attrs["sweep"]) for cube in cubes]
     assert savings["lines"]["done"] == sum(cube.sizes["line"] for cube in cubes)
@@ -146,8 +145,7 @@ def test_savings_match_the_stored_cubes(farm: Done) -> None:
 def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any, tmp_path: Path) -> None:
     """The same command runs no stage, gives the same products, and publishes another run."""
     first, second = surveyed_png(tmp_path).receipt, survey_png(tmp_path).receipt
-    states = [stage["state"] for stage in second["stages"] if stage["name"] in STAGES]
-    assert states == ["cached"] * len(STAGES)
+    assert [stage["state"] for stage in second["stages"] if stage["name"] in STAGES] == ["cached"] * len(STAGES)
     assert comparable(first) == comparable(second)
     archive = Archive.open(tmp_path)
     assert len(archive.runs()) == 2
@@ -161,8 +159,7 @@ def test_a_first_mosaic_of_another_run_is_kept(survey_png: Any, tmp_path: Path) 
     alone = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
     survey_png(tmp_path)
     assert np.isfinite(alone.open("mosaic")["scores"].values).all()
-    archive = Archive.open(tmp_path)
-    assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []
+    assert problems(tmp_path) == []
 
 
 @pytest.mark.usefixtures("no_effects")
@@ -175,8 +172,8 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values
     grid = SceneGrid(*drawn.shape, 8)
-    values, capture = mosaic.values(), LineSpec(1.0, 4)
-    seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=capture)
+    values = mosaic.values()
+    seen = coarse_prediction(load_weights(weights), values, mosaic.wavelength_nm, grid, capture=LineSpec(1.0, 4))
     every = grid.every_patch()
     expected = segment(load_weights(weights), seen, seen.patches(every), every).classes
     assert (expected == drawn).mean() > 0.999
@@ -235,8 +232,8 @@ def _scene(folder: Path, fill: float | None, toml: str = "") -> Path:
 
 
 def _survey(survey_png: Any, scene: Path, **flags: Any) -> Any:
-    labels, nm = str(scene.with_name("labels.npy")), ",".join(map(str, RGB_NM))
-    return survey_png(scene.parent / "a", scene=str(scene), labels=labels, wavelengths=nm, **flags)
+    files = {"scene": str(scene), "labels": str(scene.with_name("labels.npy"))}
+    return survey_png(scene.parent / "a", **files, wavelengths=",".join(map(str, RGB_NM)), **flags)
 
 
 def _map(survey: Any, scene: Path) -> ClassMap:

@@ -82,8 +82,7 @@ def coarse_captures(rig: EmulatedRig) -> int:
 
 def class_map_of(published: Published, out: Path) -> np.ndarray[Any, Any]:
     """Return the classes of the survey's map, (y, x)."""
-    classes = load_class_map(out / published.receipt["products"]["class_map"]).classes
-    return np.asarray(classes)
+    return np.asarray(load_class_map(out / published.receipt["products"]["class_map"]).classes)
 
 
 def arrays_of(archive: Path, published: Published, product: str) -> dict[str, bytes]:
@@ -185,8 +184,8 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest
     """Only size and bands of the field are known: the rig's lines are mapped, and no accuracy is computed."""
     told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights), "effects": None}
     settings = small_settings(tmp_path, source="rig", **told)
-    values, nm = patchy_scene((128, 128), 3, 1)[0], np.array([640.0, 550.0, 460.0])
-    scene = raster_from_values(values, settings.camera, name="x", wavelength_nm=nm)
+    values = patchy_scene((128, 128), 3, 1)[0]
+    scene = raster_from_values(values, settings.camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0]))
     with emulated(settings, {}, monkeypatch, scene=scene):
         published = run_survey(settings, QUIET)
     assert len(np.unique(class_map_of(published, tmp_path))) > 1

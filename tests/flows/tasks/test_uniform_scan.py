@@ -61,8 +61,7 @@ def test_a_uniform_scan_covers_the_field_once(scanned: tuple[Path, Any]) -> None
     assert {cube.sizes["sample"] for cube in cubes} == {640}
     lines = sum(cube.sizes["line"] for cube in cubes)
     assert 96 / 2 <= lines <= 96 / 2 + 4
-    seconds = published.receipt["savings"]["capture_s"]
-    assert seconds["done"] == pytest.approx(0.025 * (lines + 2) + 0.25 + 1.6)
+    assert published.receipt["savings"]["capture_s"]["done"] == pytest.approx(0.025 * (lines + 2) + 0.25 + 1.6)
     assert (_store(out, "mosaic")["coverage"].values > 0).all()
     assert published.receipt["savings"]["patches"]["ratio"] == 1
 
@@ -70,15 +69,16 @@ def test_a_uniform_scan_covers_the_field_once(scanned: tuple[Path, Any]) -> None
 def test_receipt_and_page_describe_the_scan(scanned: tuple[Path, Any]) -> None:
     """They give its expected mIoU and the best scan of the same seconds; nothing on the page is about a second pass."""
     _, published = scanned
-    receipt, page = published.receipt, (published.folder / "report.html").read_text(encoding="utf-8")
+    receipt = published.receipt
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
     assert receipt["plan"]["kind"] == "scan"
     taken = receipt["scans"]["taken"]
     assert (taken["step"], taken["exposure_ms"], taken["expected_miou"]) == (2, 25.0, pytest.approx(0.91))
     assert taken["seconds"] == pytest.approx(receipt["savings"]["capture_s"]["done"])
     assert receipt["scans"]["best_in_time"]["expected_miou"] >= taken["expected_miou"]
     assert "captured again" not in page
-    capture, camera_s = receipt["savings"]["capture_s"], receipt["field"]["camera_s"]
-    assert capture["done"] < capture["full"] == pytest.approx(camera_s["full_scan"])
+    capture = receipt["savings"]["capture_s"]
+    assert capture["done"] < capture["full"] == pytest.approx(receipt["field"]["camera_s"]["full_scan"])
     assert "the field was scanned once: every 2nd line, 25 ms" in page
     assert "expected mIoU 91.0 ± 3.0" in page
 
@@ -86,8 +86,8 @@ def test_receipt_and_page_describe_the_scan(scanned: tuple[Path, Any]) -> None:
 def test_seconds_choose_a_scan(survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path) -> None:
     """The scan ends in time and the settings name it; reprocessing with other weights uses the stored lines."""
     published = survey_png(tmp_path, budget=None, seconds="4", weights=str(recorded))
-    settings, done = published.receipt["settings"], published.receipt["savings"]["capture_s"]["done"]
-    assert 3.5 < done <= 4
+    settings = published.receipt["settings"]
+    assert 3.5 < published.receipt["savings"]["capture_s"]["done"] <= 4
     assert settings["seconds"] == 4
     assert settings["scan_step"] in (1, 2, 4)
     flat = {**RECORD, "miou": [[0.5] * 3, [0.5] * 3, [0.9, 0.5, 0.5]]}  # these would have taken every fourth line
@@ -156,8 +156,7 @@ def test_weights_without_scan_performance_scan_by_hand(survey_png: Survey, tmp_p
 
 def test_a_receipt_has_the_fraction_of_saturated_spectra(survey_png: Survey, tmp_path: Path) -> None:
     """The exposure is too long for the bright part of the field; the fraction equals that of the raw lines."""
-    given = BY_HAND | {"scan_exposure_ms": "200", "keep": "raw"}
-    published = survey_png(tmp_path, **given)
+    published = survey_png(tmp_path, **BY_HAND | {"scan_exposure_ms": "200", "keep": "raw"})
     (cube,) = (xr.open_zarr(path, consolidated=False) for path in tmp_path.glob("stages/capture/*/*.zarr"))
     saturated = float((cube["dn"].to_numpy() >= 4095).any(axis=2).mean())
     assert 0.01 < saturated < 0.5
@@ -178,7 +177,8 @@ def _step(out: Path) -> float:
 
 def test_scores_keep_to_a_limit(scanned: tuple[Path, Any], survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """The quantisation step grows only if needed; raw lines are cleared."""
-    every, flags = _scores_bytes(scanned[0]), {**BY_HAND, "weights": str(recorded)}
+    every = _scores_bytes(scanned[0])
+    flags = {**BY_HAND, "weights": str(recorded)}
     with with_effects():  # the other survey has them too
         survey_png(tmp_path / "half", **flags, kept_bytes=str(int(0.6 * every)))
         survey_png(tmp_path / "enough", **flags, kept_bytes=str(2 * every))
@@ -213,7 +213,8 @@ def test_kept_bytes_needs_a_uniform_scan(given: dict[str, str], words: str) -> N
 def test_without_a_flag_the_cheapest_good_scan_is_taken(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """It is the reference, within 0.5 points of the best; the receipt gives its step and seconds."""
     receipt = survey_png(tmp_path, weights=str(recorded), budget=None).receipt
-    taken, capture = receipt["scans"]["taken"], receipt["savings"]["capture_s"]
+    taken = receipt["scans"]["taken"]
+    capture = receipt["savings"]["capture_s"]
     assert taken == receipt["scans"]["reference"]
     assert (receipt["settings"]["scan_step"], receipt["settings"]["budget"]) == (taken["step"], None)
     assert capture["done"] == pytest.approx(taken["seconds"])

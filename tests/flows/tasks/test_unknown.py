@@ -35,8 +35,8 @@ OFF: dict[str, Any] = {**RASTER, "unknown": "off"}
 def add_judgement(weights: Path, path: Path, limit: float, tables: dict[str, Any]) -> Path:
     """Write a copy of weights whose detector accepts squared distances to a limit, with tables; return its path."""
     shutil.copy(weights, path)
-    one, table = np.eye(3), np.full((1, 1, 2), limit)
-    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table)
+    one = np.eye(3)
+    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), np.full((1, 1, 2), limit))
     ood_detector = OodDetector(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
     add_ood(path, ood_detector, SEEN, tables)
     return path
@@ -63,7 +63,8 @@ def both(
     tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, judging: Maker
 ) -> tuple[Path, Path, dict[str, Any]]:
     """Return archives of the same survey with and without the class unknown, and the receipt of the first."""
-    path, out, plain = judging(0.5), tmp_path_factory.mktemp("with"), tmp_path_factory.mktemp("without")
+    path = judging(0.5)
+    out, plain = (tmp_path_factory.mktemp(name) for name in ("with", "without"))
     receipt = survey_png(out, weights=str(path), **RASTER).receipt
     survey_png(plain, weights=str(path), **OFF)
     return out, plain, dict(receipt)
@@ -105,8 +106,8 @@ def test_maps_without_a_detector_keep_every_byte(
 
 def test_unknown_pixels_have_no_class_probabilities(both: tuple[Path, Path, dict[str, Any]]) -> None:
     """Their probabilities are NaN, so a later visit uses its own."""
-    out, _, _ = both
-    probabilities, classes = _stored(out, "class_probabilities"), _stored(out, "class_map")["classes"].values
+    probabilities = _stored(both[0], "class_probabilities")
+    classes = _stored(both[0], "class_map")["classes"].values
     np.testing.assert_array_equal(np.isnan(probabilities["log_probability"].values).all(axis=-1), classes == 3)
 
 

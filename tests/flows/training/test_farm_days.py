@@ -28,7 +28,6 @@ from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 
-LINES = ("track", "water")  # classes that are at the same place on all days
 BANDS = (20, 60, 110, 160, 210, 250)
 
 
@@ -37,9 +36,9 @@ def _settings(**table: Any) -> Settings:
 
 
 def _lines(scene: RasterScene) -> np.ndarray[Any, Any]:
-    """Return the mask of tracks and water."""
+    """Return the mask of tracks and water, which are at the same place on all days."""
     assert scene.labels is not None
-    return np.isin(scene.labels, [CLASSES.index(name) for name in LINES])
+    return np.isin(scene.labels, [CLASSES.index(name) for name in ("track", "water")])
 
 
 def test_two_days_of_a_field_share_one_land() -> None:
@@ -50,8 +49,7 @@ def test_two_days_of_a_field_share_one_land() -> None:
     assert np.mean(june.labels != april.labels) > 0.1
     given: list[dict[str, int]] = [{}, {"day": 173}, {"hour": 9}, {"day": 172, "hour": 11}]
     assert len({open_scene(_settings(**moment))[0].key for moment in given}) == 3
-    key = open_scene(_settings(day=173))[0].key
-    assert key.startswith("farm@2/seed=0/day=173/shape=200x240/hour=11/bands=270")
+    assert open_scene(_settings(day=173))[0].key.startswith("farm@2/seed=0/day=173/shape=200x240/hour=11/bands=270")
 
 
 def test_night_is_refused() -> None:
@@ -69,7 +67,8 @@ def _publish(archive: Archive, key: str, **settings: Any) -> str:
 
 def test_the_default_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
     """Both names of the farm, with the day named or left out, are one field; another day is another field."""
-    archive, key = Archive.open(tmp_path), "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
+    archive = Archive.open(tmp_path)
+    key = "farm@2/seed=0/day=172/shape=8x8/hour=11/bands=9"
     made = [
         _publish(archive, key, scene="farm"),
         _publish(archive, key, scene="farm@2", day=172),
@@ -106,8 +105,7 @@ def test_training_mixes_built_in_scenes() -> None:
     assert data.train[:4] == open_training_data("farm", None, 4, LineCamera()).train
     assert all(136 <= read_farm_name(name)[1] <= 201 for name in scouted)
     assert [data.scene(name).name for name in (data.train[0], scouted[0])] == ["farm", "scouting"]
-    alone = open_training_data("scouting@1", 0, 3, LineCamera())
-    assert alone.train == tuple(scouted)
+    assert open_training_data("scouting@1", 0, 3, LineCamera()).train == tuple(scouted)
     judged = farm_test_data(2, LineCamera(), "scouting").train
     assert not {read_farm_name(name)[0] for name in judged} & {read_farm_name(name)[0] for name in scouted}
 
@@ -115,8 +113,10 @@ def test_training_mixes_built_in_scenes() -> None:
 @pytest.mark.parametrize("bands", [BANDS, tuple(range(0, 270, 5))])
 def test_training_scenes_have_the_effects_of_the_rig(bands: tuple[int, ...]) -> None:
     """Blur and shading change the columns a little beyond footprint and noise; many bands come with a noise model."""
-    scene, camera = open_scene(_settings(seed=5, size="96x64", bands=bands))[0], LineCamera(samples=96)
-    grid, basis = SceneGrid(*scene.shape, 8), SpectralBasis.spanning(scene.wavelength_nm, 6)
+    scene = open_scene(_settings(seed=5, size="96x64", bands=bands))[0]
+    camera = LineCamera(samples=96)
+    grid = SceneGrid(*scene.shape, 8)
+    basis = SpectralBasis.spanning(scene.wavelength_nm, 6)
     seen = observe_scene(scene, camera, grid, basis, np.random.default_rng(3))
     plain = observe(scene, camera, grid, basis, np.random.default_rng(3))
     np.testing.assert_array_equal(seen.labels, plain.labels)
@@ -124,8 +124,8 @@ def test_training_scenes_have_the_effects_of_the_rig(bands: tuple[int, ...]) -> 
     assert 0.01 * plain.columns.std() < np.abs(seen.columns - plain.columns).mean() < 0.2 * plain.columns.std()
     assert (seen.noise.spectra is not None) == (bands != BANDS)
     if seen.noise.spectra is not None:
-        spectra, mean = seen.noise.spectra, seen.columns[:64, :96].mean(axis=(0, 1))
-        np.testing.assert_allclose(spectra.condensing(1.0).mean, mean, rtol=0.02)
+        spectra = seen.noise.spectra
+        np.testing.assert_allclose(spectra.condensing(1.0).mean, seen.columns[:64, :96].mean(axis=(0, 1)), rtol=0.02)
         sigma = np.sqrt(np.sum(spectra.noise(1.0), axis=0))
         power = np.linalg.eigvalsh(spectra.covariance / np.outer(sigma, sigma))
         assert power[-1] > 1000

@@ -61,8 +61,7 @@ def out(tmp_path: Path) -> Path:
 
 
 def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:
-    sizes = {"patch": 8, "width": 4, "settings": SETTINGS, **choices}
-    return TrainRequest(str(folder), out, **sizes)
+    return TrainRequest(str(folder), out, **{"patch": 8, "width": 4, "settings": SETTINGS, **choices})
 
 
 def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path: Path):
@@ -76,9 +75,9 @@ def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path:
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
 
 
-def test_new_weights_have_a_training_record_and_an_ood_detector(tmp_path: Path):
+def test_new_weights_have_a_training_record_and_an_ood_detector(out: Path, tmp_path: Path):
     """Validation scenes fit the detector; without such scenes the weights have none, and a note says so."""
-    field, out = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004")), tmp_path / "w.safetensors"
+    field = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004"))
     record = train_weights(_request(field, out, validation=1))
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
@@ -110,7 +109,8 @@ def test_a_folder_as_output_file_is_refused(out: Path, capsys: pytest.CaptureFix
 
 def test_scenes_of_different_bands_are_not_mixed(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch):
     """One set of weights needs the bands of one camera; the message names the scene that differs."""
-    load, known = flow.open_training_data(str(folder), 0, None, LineCamera()).scene, set[str]()
+    load = flow.open_training_data(str(folder), 0, None, LineCamera()).scene
+    known: set[str] = set()
 
     def scene(data: object, name: str) -> RasterScene:
         found = load(name)
@@ -136,9 +136,9 @@ def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: boo
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
     """The table has a row per policy, the baselines and the readings with their mIoU."""
-    shown, rows = io.StringIO(), {"none", "random", "sobel", "entropy", "gain", "all"}
-    request = _request(folder, out, validation=1)
-    judged = run_train(request, Console(file=shown, width=100))["validation"]
+    shown = io.StringIO()
+    rows = {"none", "random", "sobel", "entropy", "gain", "all"}
+    judged = run_train(_request(folder, out, validation=1), Console(file=shown, width=100))["validation"]
     assert set(judged) - {"scenes", "share_of_seats"} == rows
     for name in rows:
         assert all(0 <= judged[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
@@ -179,7 +179,8 @@ def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_baselines_separate_classes_of_different_spectra() -> None:
     """Distant classes score above 0.95, classes of one distribution near chance; a single class gives none."""
-    rng, labels = np.random.default_rng(0), np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
+    rng = np.random.default_rng(0)
+    labels = np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
     values = rng.normal(0, 1, (40, 40, 3))
 
     def judged(spectra: np.ndarray, truth: np.ndarray) -> dict[str, float] | None:
@@ -212,8 +213,7 @@ def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "labels.npy", labels)
     np.save(tmp_path / "mask.npy", np.where(np.arange(40)[:, None] < 10, labels, 0).astype(np.uint8))
     given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
-    choices = {**given, "train_mask": str(tmp_path / "mask.npy")}
-    train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
+    train_weights(_request(tmp_path / "cube.npy", out, choices={**given, "train_mask": str(tmp_path / "mask.npy")}))
     flags = given | {"scene": str(tmp_path / "cube.npy"), "source": "sim", "weights": str(out), "budget": 1}
     run = open_run(load_settings(None, flags | {"out": str(tmp_path / "a")}))
     assert (run.labels[:10] == 255).all()
@@ -245,8 +245,7 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
 
 def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Path):
     """It holds mIoU and expected scores by step and exposure."""
-    settings = replace(SETTINGS, darkest_ms=6.0)
-    record = train_weights(_request(folder, out, validation=2, settings=settings))
+    record = train_weights(_request(folder, out, validation=2, settings=replace(SETTINGS, darkest_ms=6.0)))
     scans = describe_weights(out).record["scans"]
     assert scans == record["scans"]
     assert (scans["steps"], scans["exposures_ms"], scans["scenes"]) == ([1, 2, 4, 8], [100.0, 50.0, 25.0, 12.0, 6.0], 2)
@@ -261,8 +260,8 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
 @pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
 def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
     """Weights have none without validation scenes; after short exposures training reports that, before any survey."""
-    shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
-    request = _request(folder, out, validation=0, settings=settings)
+    shown = io.StringIO()
+    request = _request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms))
     assert "scans" not in run_train(request, Console(file=shown, width=100))
     assert ("the file has no scan performance" in shown.getvalue()) == said
 
@@ -372,8 +371,7 @@ def test_continued_training_needs_all_first_pixels(out: Path, tmp_path: Path, ro
 @pytest.mark.parametrize("unfit", ["copy", "unlabelled"])
 def test_scenes_that_cannot_validate_are_left_out(folder: Path, out: Path, tmp_path: Path, unfit: str) -> None:
     """A scene without labels cannot judge, and a copy of a training scene scores too high."""
-    field = tmp_path / "field"
-    shutil.copytree(folder, field)
+    field = Path(shutil.copytree(folder, tmp_path / "field"))
     if unfit == "copy":
         shutil.copy(field / "images" / "002_image.png", field / "images" / "001_image.png")
     else:

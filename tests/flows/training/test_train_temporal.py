@@ -32,10 +32,14 @@ def test_reader_learns_to_distrust_a_prior_map() -> None:
 
     The later visit has 60 % of the labels right. Further training without time changes nothing.
     """
-    rng, classes, lands = np.random.default_rng(0), 3, []
-    seen, coarse = np.ones((64, 64), np.bool_), np.zeros((32, 32, 4), np.float32)
+    rng = np.random.default_rng(0)
+    classes = 3
+    lands = []
+    seen = np.ones((64, 64), np.bool_)
+    coarse = np.zeros((32, 32, 4), np.float32)
     for _ in range(4):
-        labels, visits = rng.integers(0, classes, (64, 64), dtype=np.uint8), []
+        labels = rng.integers(0, classes, (64, 64), dtype=np.uint8)
+        visits = []
         for day, right, step in ((1.0, 0.95, 1), (4.0, 0.6, 4)):
             said = np.where(rng.random(labels.shape) < right, labels, rng.integers(0, classes, labels.shape))
             probability = np.full((*labels.shape, classes), 0.1, np.float16)
@@ -75,13 +79,13 @@ def test_the_command_trains_and_writes_its_record(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
     monkeypatch.setattr(remember, "VISITS", 2)
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
-    out, weights = tmp_path / "farm.safetensors", shipped_weights()
+    out = tmp_path / "farm.safetensors"
+    weights = shipped_weights()
     request = TemporalRequest("farm", weights, out, 1, 1, (64, 96), QUICK, "spectralzoom train")
-    record, found = run_remember(request, QUIET), describe_weights(out).reader
+    record = run_remember(request, QUIET)
     assert describe_weights(out).key == describe_weights(weights).key
-    assert dict(found.record) == record
-    started_from = describe_weights(weights).reader
-    assert record["started_from"] == started_from.key
+    assert dict(describe_weights(out).reader.record) == record
+    assert record["started_from"] == describe_weights(weights).reader.key
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
     assert [row["days"] for row in record["validation"]] == [3.0]
     for row in record["validation"]:
