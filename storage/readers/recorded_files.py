@@ -260,6 +260,7 @@ class PointingTable:
     kind: Kind
     columns: Mapping[str, Floats]  # (row,) each
     sweep: tuple[str, ...] | None  # (row,)
+    numbers: tuple[int, ...]  # (row,) of the rows in the file, where some may be blank
 
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
         """Return the pointing of a cube: the rows whose ``sweep`` is its name, or all without that column.
@@ -339,7 +340,7 @@ class PointingTable:
         came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in columns)
         count = int(np.count_nonzero(wrong))
         more = "" if count == 1 else f" (the first of {count} such rows)"
-        raise SceneError(f"{self.path}, row {first + FIRST_ROW}: {came}{more}, {expected}; correct the table")
+        raise SceneError(f"{self.path}, row {self.numbers[first]}: {came}{more}, {expected}; correct the table")
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
@@ -372,28 +373,30 @@ def load_pointing_table(path: Path) -> PointingTable:
     if not cells:
         raise SceneError(f"{path} has no row below its header; give a row for each line")
     columns = {
-        name: _numbers(path, name, [row[at] for row in cells]) for at, name in enumerate(header) if name != "sweep"
+        name: _numbers(path, name, {number: row[at] for number, row in cells.items()})
+        for at, name in enumerate(header)
+        if name != "sweep"
     }
-    sweep = tuple(row[header.index("sweep")] for row in cells) if "sweep" in header else None
-    return PointingTable(path, kinds[0], columns, sweep)
+    sweep = tuple(row[header.index("sweep")] for row in cells.values()) if "sweep" in header else None
+    return PointingTable(path, kinds[0], columns, sweep, tuple(cells))
 
 
-def _numbers(path: Path, name: str, cells: Sequence[str]) -> Floats:
-    """Return the cells of a column as numbers, NaN for empty ones, 1 for True."""
+def _numbers(path: Path, name: str, cells: Mapping[int, str]) -> Floats:
+    """Return the cells of a column, by their rows in the file, as numbers: NaN for empty ones, 1 for True."""
     values = np.empty(len(cells))
-    for number, cell in enumerate(cells):
+    for at, (number, cell) in enumerate(cells.items()):
         try:
-            values[number] = WORDS[cell.lower()] if cell.lower() in WORDS else float(cell)
+            values[at] = WORDS[cell.lower()] if cell.lower() in WORDS else float(cell)
         except ValueError:
             raise SceneError(
-                f"{path}, row {number + FIRST_ROW}: {name} = {cell[:40]!r} is no number; write numbers with a decimal"
+                f"{path}, row {number}: {name} = {cell[:40]!r} is no number; write numbers with a decimal"
                 " point, and 1 or 0 for valid"
             ) from None
     return values
 
 
-def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Return the names of the columns and the cells of all rows, by the delimiter of the header."""
+def _csv_cells(path: Path) -> tuple[list[str], dict[int, list[str]]]:
+    """Return the names of the columns, and the cells of rows that are not blank by their number in the file."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -403,12 +406,13 @@ def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
     if not rows:
         raise SceneError(f"{path} is empty; give a header and a row for each line")
     names = [name.lower() for name in rows[0]]
-    for number, row in enumerate(rows[1:], 2):
-        if any(row) and len(row) != len(names):
+    cells = {number: row for number, row in enumerate(rows[1:], FIRST_ROW) if any(row)}
+    for number, row in cells.items():
+        if len(row) != len(names):
             raise SceneError(
                 f"{path}, row {number} has {len(row)} cells, the header in row 1 has {len(names)}; give each as many"
             )
-    return names, [row for row in rows[1:] if any(row)]
+    return names, cells
 
 
 def find_pointing(folder: Path, stem: str) -> Path | None:

@@ -82,7 +82,7 @@ def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
         ("mirror_x\n0\n", "one kind of pointing, but mirror_y is missing"),
         ("time\n0\n", "one kind of pointing, but it has none"),
         ("angle_deg,position_m\n0,0\n", "one kind of pointing, but it has 2 kinds"),
-        ("angle_deg\nten\n", "row 2: angle_deg = 'ten' is no number"),
+        ("angle_deg\n\nten\n", "row 3: angle_deg = 'ten' is no number"),
         ("angle_deg;time\n1,5;0\n", r"row 2: angle_deg = '1,5' is no number; write numbers with a decimal point"),
         ("angle_deg,time\n1\n", "row 2 has 1 cells, the header in row 1 has 2"),
         ("angle_deg\n0\n1\n", "has 2 rows for cube, fewer than its 3 lines"),
@@ -105,7 +105,7 @@ def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
         ("angle_deg,exposure_ms\n0,1\n1,0\n2,1\n", "row 3: exposure_ms = 0, expected a time above 0 ms"),
         ("angle_deg,valid\n0,1\n1,2\n2,1\n", "row 3: valid = 2, expected 0 or 1"),
         ("angle_deg,valid\n0,0\n1,0\n2,0\n", "calls no line of cube valid"),
-        ("angle_deg,line\n0,0\n1,2\n2,2\n", "row 3: line = 2, expected each of 0 to 2 once"),
+        ("angle_deg,line\n0,0\n\n1,2\n2,2\n", "row 4: line = 2, expected each of 0 to 2 once"),
     ],
 )
 def test_unusable_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
