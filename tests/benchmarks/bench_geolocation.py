@@ -25,7 +25,8 @@ from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from tests.pipeline.geometry.paper_equations import line_rotation
 
 CAMERA = LineCamera()
-SWATH, LINES = 2450.0, 640
+SWATH = 2450.0
+LINES = 640
 GRID: dict[str, Any] = {"origin_px": (90.0, SWATH - 300), "spacing_px": 1.0, "shape": (430, 600)}
 PIXELS = 430 * 600
 TILE_ROWS = 64
@@ -58,7 +59,8 @@ def _samples() -> Floats:
 
 
 def _calls(scan_path: ScanPath) -> dict[str, Callable[[], object]]:
-    samples, pixels = _samples(), _pixels()
+    samples = _samples()
+    pixels = _pixels()
     tree = cKDTree(samples)
     return {
         "tree": lambda: cKDTree(samples).query(pixels, workers=1),
@@ -87,7 +89,9 @@ def _see(at: Floats) -> Floats:
 
 def _by_reflected_rays(start: Floats) -> Floats:
     """Return knots and samples whose reflected rays meet the pixels, by Newton steps on the forward model alone."""
-    at, pixels, h = start.copy(), _pixels(), 0.5
+    at = start.copy()
+    pixels = _pixels()
+    h = 0.5
     for _ in range(2):
         miss = _see(at) - pixels
         by_knot, by_sample = (
@@ -118,7 +122,8 @@ def _against_tree(scan_path: ScanPath, table: TieTable, truth: Floats, clocks: d
     faster, closer = ratio(clocks, "tree", "ties 16"), tree_off / _worst(_whole(table), truth)
     tree, query, ties = (ns_of(clocks[name], PIXELS) for name in ("tree", "query", "ties 16"))
     peer = f"scipy cKDTree, one worker: {tree:.0f} ns/px with building, {query:.0f} without"
-    made, spent = "geolocation grid by ties", f"{ties:.2g} ns/px, 1/{faster:.0f} of the tree"
+    made = "geolocation grid by ties"
+    spent = f"{ties:.2g} ns/px, 1/{faster:.0f} of the tree"
     return [
         Row(f"{made}, made and read: processor time", spent, ">= 10x less", faster >= 10, peer),
         Row(f"{made}: closer than the tree", f"{closer:.0f}x", ">= 100x", closer >= 100, f"{tree_off:.2g} px"),

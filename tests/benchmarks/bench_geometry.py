@@ -118,8 +118,7 @@ def _time() -> Row:
     position = _disk(COUNT)
     given = {name: position.astype(name) for name in ("float64", "float32")}
     calls = {name: lambda one=one: direction_to_position(position_to_direction(one)) for name, one in given.items()}
-    clocks = time_in_turn(calls, rounds=3)
-    spent = {name: 1e9 * clock.cpu_min_s / COUNT for name, clock in clocks.items()}
+    spent = {name: 1e9 * clock.cpu_min_s / COUNT for name, clock in time_in_turn(calls, rounds=3).items()}
     return Row(
         "time of position -> ray -> position", f"{spent['float64']:.3g} ns", peers=f"float32: {spent['float32']:.3g} ns"
     )

@@ -55,7 +55,9 @@ class Flips:
 def flip_bits(count: int, folder: Path, seed: int = 0) -> Flips:
     """Flip ``count`` single bits, half of them in the tensors, each in a fresh copy of a file, and read it."""
     folder.mkdir(parents=True, exist_ok=True)
-    written, rng, found = _written(folder), Random(seed), Flips()
+    written = _written(folder)
+    rng = Random(seed)
+    found = Flips()
     before = {name: read(written[name]) for name, read in READERS.items()}
     for number in range(count):
         name = list(READERS)[number % len(READERS)]
@@ -104,7 +106,8 @@ def _written(folder: Path) -> dict[str, Path]:
 
 
 def rows(quick: bool) -> Sequence[Row]:
-    clock, count = Clock(), 60 if quick else 2000
+    clock = Clock()
+    count = 60 if quick else 2000
     with tempfile.TemporaryDirectory() as place:
         found = flip_bits(count, Path(place))
     words = f"{found.refused} refused in one message, {found.same} as written, {reported_wrong(found.wrong)}"

@@ -60,7 +60,8 @@ def end_before(place: str, number: int, call: int = 1) -> None:
     module, _, path = place.partition(":")
     *outer, name = path.split(".")
     inside = functools.reduce(getattr, outer, importlib.import_module(module))
-    real, calls = getattr(inside, name), count(1)
+    real = getattr(inside, name)
+    calls = count(1)
 
     def ended(*given: Any, **named: Any) -> Any:
         if next(calls) == call:
@@ -96,8 +97,12 @@ class _Watch:
     kind: str | None = None  # of the files whose opening counts; None counts every call
 
     def __init__(self, root: Path, at: int, number: int, lasting: bool, log: str | None) -> None:
-        self._root, self._at, self._number, self._lasting = str(root), at, number, lasting
-        self._lock, self._count = threading.Lock(), 0
+        self._root = str(root)
+        self._at = at
+        self._number = number
+        self._lasting = lasting
+        self._lock = threading.Lock()
+        self._count = 0
         self._write = os.write
         self._log = None if log is None else os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
 

@@ -86,7 +86,9 @@ def record(folder: Path) -> list[Moment]:
     """Capture without a fault, and record the appended and synced data before and after each line and each sync."""
     moments: list[Moment] = []
     path = folder / "lines.lines"
-    real, synced, appended = os.fdatasync, 0, 0
+    real = os.fdatasync
+    synced = 0
+    appended = 0
 
     def note() -> None:
         moments.append(Moment(appended, path.stat().st_size, synced))
@@ -139,12 +141,16 @@ def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> byte
 
 def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
     """Cut the power at random moments of one capture, and resume from each resulting file."""
-    chance, found = random.Random(seed), Losses()
-    moments, truth = record(folder / "whole"), _contents(folder / "whole")
+    chance = random.Random(seed)
+    found = Losses()
+    moments = record(folder / "whole")
+    truth = _contents(folder / "whole")
     for number in range(cuts):
-        moment, place = chance.choice(moments), folder / str(number)
+        moment = chance.choice(moments)
+        place = folder / str(number)
         place.mkdir()
-        fates, wrong = cut_power(folder / "whole", moment, place, chance), list(_go_on(place, moment.appended, found))
+        fates = cut_power(folder / "whole", moment, place, chance)
+        wrong = list(_go_on(place, moment.appended, found))
         if _contents(place) != truth:
             wrong.append("not the undisturbed bytes after going on")
         found.wrong += [f"{moment.appended} lines, {fates}: {one}" for one in wrong]
@@ -164,8 +170,10 @@ def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
 
 def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
     """Kill captures at random moments, and compare the appended lines with the stored ones."""
-    chance, found = random.Random(seed), Losses()
-    command, environment = [sys.executable, "-c", WRITER], {**os.environ, "PYTHONPATH": str(ROOT)}
+    chance = random.Random(seed)
+    found = Losses()
+    command = [sys.executable, "-c", WRITER]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for number in range(kills):
         place = folder / f"killed-{number}"
         with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:
@@ -205,7 +213,8 @@ def rows(quick: bool = False) -> list[Row]:
     found = []
     with tempfile.TemporaryDirectory(prefix="lost-") as name:
         for fault, injected, demanded, tried, counts in cases:
-            clock, count = Clock(), counts[quick]
+            clock = Clock()
+            count = counts[quick]
             losses = tried(count, Path(name))
             found.append(Row(fault, injected, count, demanded, losses.words(), not losses.wrong, clock.seconds))
     return found

@@ -89,7 +89,8 @@ def rows(quick: bool = False) -> list[Row]:
     rounds = 1 if quick else ROUNDS
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
-        both, other = dict(subject.truth), nursery.run(words(subject.folder / "other", *OTHER))
+        both = dict(subject.truth)
+        other = nursery.run(words(subject.folder / "other", *OTHER))
         assert other.code == 0, other.text
         both |= stored(subject.folder / "other")
         cases = [
@@ -105,7 +106,9 @@ def _row(
     subject: Subject, case: tuple[str, str, tuple[tuple[str, ...], ...], Stored, bool], rounds: int, seed: int = 0
 ) -> Row:
     fault, injected, commands, truth, kill = case
-    clock, found, chance = Clock(), Writings(), random.Random(seed)
+    clock = Clock()
+    found = Writings()
+    chance = random.Random(seed)
     for number in range(rounds):
         out = subject.folder / f"{fault.replace(' ', '-')}-{number}"
         write_together(subject, out, commands, truth, found, chance, kill=kill)

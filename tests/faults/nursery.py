@@ -58,7 +58,9 @@ class Child:
 
     def __init__(self, nursery: Nursery, pid: int, log: Path) -> None:
         self.pid = pid
-        self._nursery, self._log, self._began = nursery, log, time.monotonic()
+        self._nursery = nursery
+        self._log = log
+        self._began = time.monotonic()
 
     def kill(self) -> None:
         """Send SIGKILL; it does not harm a child that has ended already, as it is still to be waited for."""
@@ -66,7 +68,8 @@ class Child:
 
     def wait(self) -> Ended:
         """Wait for the end and return the result."""
-        code, place = int(self._nursery.ask({"wait": self.pid})), self._log.with_suffix(".place")
+        code = int(self._nursery.ask({"wait": self.pid}))
+        place = self._log.with_suffix(".place")
         ended = Ended(
             code,
             time.monotonic() - self._began,
@@ -173,10 +176,12 @@ def _live(request: dict[str, Any]) -> None:
 def _keep_place(path: Path) -> None:
     """Record the functions of this project that an error passed when the command line reports it."""
     cli = importlib.import_module("flows.cli.main")
-    say, descriptor = cli.say, os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    say = cli.say
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
 
     def noting(message: str) -> None:
-        error, frames = sys.exc_info()[1], list[traceback.FrameSummary]()
+        error = sys.exc_info()[1]
+        frames: list[traceback.FrameSummary] = []
         while error is not None:
             frames += traceback.extract_tb(error.__traceback__)
             error = error.__cause__

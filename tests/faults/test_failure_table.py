@@ -22,8 +22,7 @@ def test_a_row_without_tries_is_not_met(count: int, code: int) -> None:
 
 def test_a_full_disk_ends_in_one_message_and_a_rerun_completes(subject: Subject) -> None:
     """The disk fills at each kind of file; the archive verifies, and the rerun on a larger disk is bit-identical."""
-    mounted = disk_full.can_mount()
-    found = disk_full.fill_at_places(subject, 1, mounted=mounted)
+    found = disk_full.fill_at_places(subject, 1, mounted=disk_full.can_mount())
     assert found.wrong == []
     assert found.told == len(disk_full.KINDS)
 

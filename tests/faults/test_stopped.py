@@ -91,7 +91,8 @@ def whole(subject: Subject) -> Any:
 @pytest.mark.parametrize("place", PLACES)
 def test_a_rerun_adds_the_accuracy(subject: Subject, whole: Any, mapped: Path, tmp_path: Path, place: str) -> None:
     """A second stop leaves the run valid, with or without its accuracy; the rerun gives the undisturbed receipt."""
-    out, (name, call, number) = tmp_path / "archive", PLACES[place]
+    out = tmp_path / "archive"
+    name, call, number = PLACES[place]
     shutil.copytree(mapped, out)
     (first,) = receipts(out)
     ended = stopped(subject, out, name, call, number)

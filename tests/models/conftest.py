@@ -42,14 +42,15 @@ def coarse_prediction(
     capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Predict from scene values (y, x, band); NaN is no data."""
-    coarse = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture)
-    return read_coarse_prediction(weights, coarse)
+    return read_coarse_prediction(weights, read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture))
 
 
 def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:
     """Return a pass over a scene of noise, and other noise for every patch of its padded grid."""
-    p, columns = weights.config.patch, weights.config.columns
-    grid, rng = SceneGrid(height, width, p), np.random.default_rng(seed)
+    p = weights.config.patch
+    columns = weights.config.columns
+    grid = SceneGrid(height, width, p)
+    rng = np.random.default_rng(seed)
     coarse_pass = CoarsePass(grid, rng.standard_normal((*grid.padded_shape, columns), np.float32))
     return coarse_pass, rng.standard_normal((int(np.prod(grid.patch_shape)), p, p, columns), np.float32)
 

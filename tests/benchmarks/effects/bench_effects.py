@@ -104,9 +104,8 @@ def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]], what: st
 def _of_rig(scene: RasterScene, name: str, rig: Rig) -> list[Row]:
     sweeps = tuple(Sweep(f"strip {swath:g}", "fine", "x", swath, -512.0, 1024) for swath in (-320.0, 320.0))
     clock = time.process_time()
-    probe = probe_scene(scene, rig, sweeps)
     probed = time.process_time() - clock
-    decision = decide(probe, rig, EFFECTS, TOLERANCE)
+    decision = decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE)
     decided = time.process_time() - clock - probed
     white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     told = {"fwhm_nm": scene.fwhm_nm, "white_e": white}

@@ -80,7 +80,8 @@ def test_mixing_two_maps_equals_segmenting_the_patches(tiny: Maker):
     weights = tiny()
     coarse_pass, _ = scene_columns(weights, 30, 45)
     seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
-    scene, some = _scene(weights), np.random.default_rng(4).random(seen.grid.patch_shape) < 0.5
+    scene = _scene(weights)
+    some = np.random.default_rng(4).random(seen.grid.patch_shape) < 0.5
     index = np.flatnonzero(some)
     drawn = segment(weights, seen, seen.patches(index), index)
     expected = confusion(scene.labels, drawn.classes, weights.config.classes)

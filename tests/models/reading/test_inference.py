@@ -85,7 +85,8 @@ def test_a_region_is_segmented_like_a_training_crop(tiny: Maker, patch: int, ori
     """
     weights = tiny(patch=patch)
     coarse_pass, fine = scene_columns(weights, 64, 128)
-    moved, patch_index = replace(coarse_pass, origin=origin, capture=DARK), np.array([1, 0])
+    moved = replace(coarse_pass, origin=origin, capture=DARK)
+    patch_index = np.array([1, 0])
     other = LineSpec(0.5)
     drawn = inference.segment(weights, moved, fine[patch_index], patch_index, capture=other)
     detail = np.zeros((64, 128, 4), np.float32)
@@ -95,7 +96,8 @@ def test_a_region_is_segmented_like_a_training_crop(tiny: Maker, patch: int, ori
         torch.from_numpy(with_planes(*one, fainter=inference.FAINTER)).permute(2, 0, 1)[None]
         for one in ((coarse_pass.columns, DARK), (detail, other))
     )
-    model, numbers = weights.segmenter, torch.from_numpy(patch_index)[None]
+    model = weights.segmenter
+    numbers = torch.from_numpy(patch_index)[None]
     with torch.inference_mode():
         places = torch.tensor([origin]).double() * patch / TOKEN_PX
         logits = model.composite(*model(*images, numbers, places), numbers)
@@ -134,11 +136,11 @@ def test_invalid_patches_are_refused_before_reading(
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
 def test_a_pass_in_row_blocks_equals_the_whole(tiny: Maker, bands: np.ndarray):
     """Rows of the mosaic in several blocks give the very same columns, whether bands reach all of them or not."""
-    weights, grid = tiny(), SceneGrid(37, 53, 8)
+    weights = tiny()
+    grid = SceneGrid(37, 53, 8)
     values = _values(37, 53, len(bands))
     whole = inference.read_coarse_pass(weights, [values], bands, grid)
-    parts = inference.read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid)
-    assert (parts.columns == whole.columns).all()
+    assert (inference.read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid).columns == whole.columns).all()
     assert whole.columns[:37, :53] == pytest.approx(weights.columns(values, bands), abs=1e-6)
     added = len(whole.columns) - 37
     assert (whole.columns[37:] == whole.columns[35 : 35 - added : -1]).all()  # the pad is a mirror image
@@ -161,7 +163,9 @@ def test_map_of_columns_reads_every_patch(tiny: Maker):
 @pytest.mark.parametrize("more", [0, 1])
 def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     """A token with half of its pixels dead is read, with one more it is not; dead pixels take their patch's mean."""
-    weights, grid, values = plain_weights(), SceneGrid(60, 64, 8), _values(60, 64)
+    weights = plain_weights()
+    grid = SceneGrid(60, 64, 8)
+    values = _values(60, 64)
     whole = inference.read_coarse_pass(weights, [values], NM, grid).columns
     values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
     seen = inference.read_coarse_pass(weights, [values], NM, grid)

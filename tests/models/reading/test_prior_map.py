@@ -71,7 +71,8 @@ READERS = pytest.mark.parametrize("reader", [None, a_reader()], ids=["without a 
 
 def test_exposure_of_visits_adds_up_and_fades() -> None:
     """After 30 days 1/e of the earlier exposure is left; lines 2 px apart give a quarter of theirs."""
-    rng, seen = np.random.default_rng(1), np.arange(SHAPE[1]) < np.full(SHAPE, 7)
+    rng = np.random.default_rng(1)
+    seen = np.arange(SHAPE[1]) < np.full(SHAPE, 7)
     visit = replace(an_observation(rng), light=0.4, seen=seen)
     after = fuse(a_prior_map(rng, days=30.0), visit, None)
     np.testing.assert_allclose(after.light, 0.0125 / math.e + np.where(seen, 0.1, 0.0), rtol=1e-5)
@@ -94,7 +95,8 @@ def test_fused_probabilities_sum_to_1(reader: TemporalReader | None, seed: int) 
 def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
     """A captured pixel has age 0; any other is older by the days between."""
     rng = np.random.default_rng(seed)
-    memory, coarse_pass = a_prior_map(rng), an_observation(rng)
+    memory = a_prior_map(rng)
+    coarse_pass = an_observation(rng)
     seen = rng.random(SHAPE) < 0.5
     after = fuse(
         replace(memory, probabilities=replace(memory.probabilities, age_days=np.full(SHAPE, 2.0, np.float32))),
@@ -109,7 +111,8 @@ def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, 
 def test_a_fresh_prior_map_stays_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
     """After 0 days its probabilities are the same but for rounding; captured pixels change."""
     rng = np.random.default_rng(seed)
-    memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
+    memory = a_prior_map(rng, days=0.0)
+    coarse_pass = an_observation(rng)
     seen = rng.random(SHAPE) < 0.5
     after = fuse(memory, replace(coarse_pass, seen=seen), reader).log_probability
     before = memory.probabilities.log_probability
@@ -121,8 +124,8 @@ def test_a_fresh_prior_map_stays_where_pixels_are_not_captured(reader: TemporalR
 @given(seed=seeds, days=st.floats(0, 0.99))
 def test_the_reader_is_phased_in_over_the_first_day(seed: int, days: float) -> None:
     """A pixel that was not captured moves from the prior map to the reader's result in proportion to the time."""
-    rng = np.random.default_rng(seed)
-    reader, memory = a_reader(seed), a_prior_map(rng, days=days)
+    reader = a_reader(seed)
+    memory = a_prior_map(np.random.default_rng(seed), days=days)
     before, after = np.exp(memory.probabilities.log_probability), np.exp(carried(memory, reader).log_probability)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prior_map, "SETTLED_DAYS", 1e-9)
@@ -134,7 +137,8 @@ def test_the_reader_is_phased_in_over_the_first_day(seed: int, days: float) -> N
 def test_unknown_pixels_take_the_other_source(reader: TemporalReader | None) -> None:
     """A visit fills an empty prior map, and the other way round; a pixel that is empty in both stays unknown."""
     rng = np.random.default_rng(4)
-    memory, coarse_pass = a_prior_map(rng), an_observation(rng)
+    memory = a_prior_map(rng)
+    coarse_pass = an_observation(rng)
     before, today = memory.probabilities.log_probability.copy(), coarse_pass.log_probability.copy()
     before[:8], today[4:12] = np.nan, np.nan
     ages = np.where(np.isnan(before[..., 0]), np.nan, 0.0).astype(np.float32)
@@ -154,8 +158,7 @@ def test_a_confident_visit_overrules_the_prior_map() -> None:
     """Without a reader 0.99 for another class wins over 0.9, and 0.6 does not; two that agree are surer together."""
     before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
     today = np.log(np.array([[[0.005, 0.99, 0.005], [0.2, 0.6, 0.2], [0.8, 0.1, 0.1]]], np.float32))
-    coarse = np.zeros((1, 1, COLUMNS), np.float32)
-    coarse_pass = CurrentVisit(today, np.ones((1, 3), np.bool_), coarse, 1.0, 1)
+    coarse_pass = CurrentVisit(today, np.ones((1, 3), np.bool_), np.zeros((1, 1, COLUMNS), np.float32), 1.0, 1)
     after = fuse(
         PriorMap(first_probabilities(replace(coarse_pass, log_probability=before)), None, 0.0), coarse_pass, None
     )
@@ -174,7 +177,9 @@ def test_a_prior_map_fades_to_equal_probabilities() -> None:
 def test_row_blocks_are_fused_like_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
     """The field is read 8 rows at a time, and its border may cut a coarse pixel."""
     rng = np.random.default_rng(7)
-    memory, coarse_pass, reader = a_prior_map(rng, shape), an_observation(rng, shape), a_reader(3)
+    memory = a_prior_map(rng, shape)
+    coarse_pass = an_observation(rng, shape)
+    reader = a_reader(3)
     whole = fuse(memory, coarse_pass, reader)
     monkeypatch.setattr(prior_map, "ROWS", 8)
     np.testing.assert_allclose(fuse(memory, coarse_pass, reader).log_probability, whole.log_probability, atol=2e-5)
@@ -184,15 +189,16 @@ def test_pooled_columns_are_means_of_known_pixels() -> None:
     """Each 2 x 2 block is averaged, also partial ones at the border; a column without a known pixel is NaN."""
     columns = np.arange(30, dtype=np.float32).reshape(3, 5, 2)
     columns[0, 1], columns[1, 2, 0], columns[:2, 2:4, 1] = np.nan, np.inf, np.nan
-    nan = math.nan
-    expected = [[[22 / 3, 25 / 3], [26 / 3, nan], [13, 14]], [[21, 22], [25, 26], [28, 29]]]
+    expected = [[[22 / 3, 25 / 3], [26 / 3, math.nan], [13, 14]], [[21, 22], [25, 26], [28, 29]]]
     np.testing.assert_allclose(pooled(columns), np.array(expected, np.float32), rtol=1e-6)
 
 
 def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
     """Without the earlier coarse columns, or where they are NaN, those of the current visit may be anything."""
     rng = np.random.default_rng(9)
-    memory, coarse_pass, reader = a_prior_map(rng), an_observation(rng), a_reader(5)
+    memory = a_prior_map(rng)
+    coarse_pass = an_observation(rng)
+    reader = a_reader(5)
     other = replace(coarse_pass, coarse=rng.normal(size=coarse_pass.coarse.shape).astype(np.float32))
     blind, nothing = replace(memory, coarse=None), replace(memory, coarse=np.full_like(coarse_pass.coarse, np.nan))
     found = [fuse(one, seen, reader).log_probability for one in (blind, nothing) for seen in (coarse_pass, other)]
@@ -204,13 +210,13 @@ def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
 def test_an_untrained_reader_weighs_both_sources_by_its_gates() -> None:
     """The result is .73 of the prior map, and .27 of its product to the power .9 with the visit to the power .5."""
     rng = np.random.default_rng(2)
-    memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
-    reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()
+    memory = a_prior_map(rng, days=0.0)
+    coarse_pass = an_observation(rng)
     old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.probabilities, coarse_pass))
     old /= old.sum(axis=-1, keepdims=True)
     product, replaced = old ** (1 / (1 + math.exp(-2.2))) * new**0.5, 1 / (1 + math.e)
     expected = (1 - replaced) * old + replaced * product / product.sum(axis=-1, keepdims=True)
-    found = fuse(memory, coarse_pass, reader).log_probability
+    found = fuse(memory, coarse_pass, TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()).log_probability
     np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)
 
 
@@ -282,7 +288,8 @@ def test_a_harvest_overnight_is_detected() -> None:
 
 def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], noise: float) -> TemporalAgreement:
     """Compare maps of two days whose confidences are right: each class's own signal plus noise, and Bayes."""
-    rng, size = np.random.default_rng(seed), 3
+    rng = np.random.default_rng(seed)
+    size = 3
 
     def look(classes: NDArray[np.int64]) -> NDArray[np.float32]:
         blocks = rng.normal(0, noise, (*(side // 4 for side in classes.shape), size)).repeat(4, 0).repeat(4, 1)
@@ -345,10 +352,9 @@ def test_changed_fraction_counts_confident_pixels_only() -> None:
 
 def test_only_captured_pixels_change() -> None:
     """The map of the others is an aged prior map, so another class there is no observation."""
-    rng = np.random.default_rng(3)
     told = [np.log(np.where(np.arange(3) == one, 0.98, 0.01)) * np.ones((*SHAPE, 1)) for one in (0, 1)]
     before, after = (ClassProbabilities(one.astype(np.float32), *np.zeros((2, *SHAPE), np.float32)) for one in told)
-    seen = rng.random(SHAPE) < 0.5
+    seen = np.random.default_rng(3).random(SHAPE) < 0.5
     aged = replace(after, age_days=np.where(seen, 0, 7).astype(np.float32))
     np.testing.assert_array_equal(changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
 
@@ -363,7 +369,8 @@ def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
 def test_visits_elsewhere_do_not_change_a_pixel(reader: TemporalReader | None, seed: int, visits: int) -> None:
     """Probabilities after 28 days are the same, however often other pixels were captured meanwhile."""
     memory = replace(a_prior_map(np.random.default_rng(seed), days=28.0), coarse=None)
-    once, probabilities = carried(memory, reader), memory.probabilities
+    once = carried(memory, reader)
+    probabilities = memory.probabilities
     for _ in range(visits):
         part = PriorMap(probabilities, None, 28.0 / visits)
         shown = carried(part, reader)

@@ -29,7 +29,8 @@ def example(seed: int = 1) -> Example:
 
 def test_killed_training_resumes_to_the_same_weights(tmp_path: Path) -> None:
     """Started again after it was killed at step 5, training takes steps 5 and 6 and ends with the same weights."""
-    file, steps = tmp_path / "c", []
+    file = tmp_path / "c"
+    steps = []
     undisturbed, _ = train(CONFIG, [example()], SHIFT, SETTINGS)
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(5), checkpoint=file, keep_every_s=0)

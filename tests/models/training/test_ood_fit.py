@@ -20,11 +20,11 @@ PLAIN = Normalisation(*(np.zeros(COLUMNS, np.float32), np.ones(COLUMNS, np.float
 
 def scene(seed: int, side: int = 48) -> Example:
     """Return a scene of two classes of Gaussian spectra, one of them rare, with the noise of a camera."""
-    rng, labels = np.random.default_rng(seed), np.zeros((side, side), np.uint8)
+    labels = np.zeros((side, side), np.uint8)
     labels[:, -side // 8 :] = 1
     labels[:2, :2] = 255
     middles = np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0], [50.0, 50.0, 50.0]])
-    columns = middles[np.minimum(labels, 2)] + 0.1 * rng.standard_normal((side, side, COLUMNS))
+    columns = middles[np.minimum(labels, 2)] + 0.1 * np.random.default_rng(seed).standard_normal((side, side, COLUMNS))
     noise = ColumnNoise(np.full(COLUMNS, 1e-5), 1e-6 * np.eye(COLUMNS))
     return Example(f"{seed}", columns.astype(np.float16), labels, labels.shape, noise)
 
@@ -61,8 +61,7 @@ def test_fit_needs_validation_scenes() -> None:
 
 def test_repeated_columns_have_an_invertible_covariance() -> None:
     """The centres are those of the data; a class of one pixel is allowed."""
-    rng = np.random.default_rng(0)
-    one = rng.normal(0, 1, (400, 1))
+    one = np.random.default_rng(0).normal(0, 1, (400, 1))
     pixels = np.concatenate([one, one, np.ones((400, 1))], axis=1).astype(np.float32)
     classes = np.zeros(400, np.uint8)
     classes[-1] = 1

@@ -42,11 +42,12 @@ def saved(tiny: Maker, tmp_path: Path) -> Path:
 
 def test_weights_round_trip_bit_by_bit(tiny: Maker, saved: Path):
     """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
-    before, after, described = tiny(), load_weights(saved), describe_weights(saved)
+    before = tiny()
+    after = load_weights(saved)
     old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
     assert list(old) == list(new)
     assert all(torch.equal(old[name], new[name]) for name in old)
-    for one in (after, described):
+    for one in (after, describe_weights(saved)):
         told = (one.config, one.basis, one.class_names, one.record)
         assert told == (before.config, before.basis, before.class_names, before.record)
     for name in ("centre", "spread", "whitening"):
@@ -180,15 +181,15 @@ def test_a_flipped_bit_of_a_tensor_is_found(saved: Path):
 
 def test_a_changed_description_is_refused(saved: Path):
     """A class is renamed by one bit, which no tensor shows."""
-    raw = saved.read_bytes()
-    saved.write_bytes(raw.replace(b"class 1", b"class 3"))
+    saved.write_bytes(saved.read_bytes().replace(b"class 1", b"class 3"))
     with pytest.raises(WeightsError, match="is damaged: its description is not what was written"):
         describe_weights(saved)
 
 
 def test_a_header_of_petabytes_is_refused(saved: Path):
     """A claimed tensor of 3.6 PB that the file lacks is refused before memory is allocated."""
-    about, size = json.dumps(_about(saved)), 900 * 10**12
+    about = json.dumps(_about(saved))
+    size = 900 * 10**12
     header = {"__metadata__": {"about": about}, "a": {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}}
     text = json.dumps(header).encode()
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))

@@ -92,8 +92,7 @@ def test_a_window_equals_that_part_of_the_whole(tmp_path: Path) -> None:
 
 def test_xarray_unpacks_probabilities(tmp_path: Path) -> None:
     """Probabilities and days are packed by CF's rules; unknown pixels are NaN."""
-    path = stored(tmp_path / "class_probabilities.zarr")
-    opened = xr.open_zarr(path, consolidated=False)
+    opened = xr.open_zarr(stored(tmp_path / "class_probabilities.zarr"), consolidated=False)
     values, ages, light = drawn(0)
     np.testing.assert_array_equal(opened.light.values, light)
     assert opened.log_probability.dims == ("y", "x", "class")
@@ -138,7 +137,8 @@ def test_old_classes_are_stored_with_their_names(tmp_path: Path) -> None:
 
 def test_a_first_visit_has_no_old_classes(tmp_path: Path) -> None:
     """A later visit has none after `drop_changes`; both refuse tiles of old classes."""
-    first, (dropped, old) = stored(tmp_path / "first.zarr"), gone_on(tmp_path / "dropped.zarr")
+    first = stored(tmp_path / "first.zarr")
+    dropped, old = gone_on(tmp_path / "dropped.zarr")
     class_maps.drop_changes(dropped)
     for path in (first, dropped):
         assert class_maps.ProbabilityStore(path).old_class() is None

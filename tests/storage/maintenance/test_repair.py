@@ -69,8 +69,7 @@ def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> N
     runs = archive.runs()
     for run in runs:
         flip(run / "quicklook.png")
-    done = _repair(archive)
-    assert done.complete
+    assert _repair(archive).complete
     assert archive.runs() == runs
     for run in runs:  # its date is that of its name
         assert re.sub(r"\D", "", read_run(run).created).startswith(run.name[:8] + run.name[9:15])
@@ -111,7 +110,8 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
 
 def test_damaged_raw_lines_of_a_rig_stay(archive: Archive) -> None:
     """Raw lines cannot be captured again, and their dependents stay; a broken map of them is made again."""
-    small, before = small_survey(archive, simulated=False), _moments(archive)
+    small = small_survey(archive, simulated=False)
+    before = _moments(archive)
     flip(small.raw.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert not done.complete
@@ -127,7 +127,8 @@ def test_damaged_raw_lines_of_a_rig_stay(archive: Archive) -> None:
 @pytest.mark.parametrize("how", ["flip", "short", "manifest", "gone", "old"])
 def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how: str) -> None:
     """They are the only copy. A broken map is made from them only if a survey finds them; nothing is captured again."""
-    light, asked = {"scene": "farm", "source": "rig"}, settings(source="rig")
+    light = {"scene": "farm", "source": "rig"}
+    asked = settings(source="rig")
     raw = make_store(archive, "capture", light, [])
     signal = make_store(archive, "condense", {}, [raw])
     drawn = make_store(archive, "segment", {}, [signal])
@@ -159,12 +160,10 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
 def test_repair_keeps_a_damaged_ingested_cube(archive: Archive) -> None:
     """Surveys read it and cannot make it, even those of simulated rigs."""
     cube = make_store(archive, "ingest", {}, [])
-    asked = settings(scene=str(cube.path))
-    archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([cube]))
+    archive.new_run("farm").publish(settings=settings(scene=str(cube.path)), rests_on=archive.manifest_hashes([cube]))
     flip(cube.path / "data.bin")
     given = NOW | {"versions": {"ingest": 1}, "can_capture": lambda run: True}
-    done = repair(archive, verify_archive(archive), Mock(), **given)
-    assert list(done.plan.hopeless) == [cube.uri]
+    assert list(repair(archive, verify_archive(archive), Mock(), **given).plan.hopeless) == [cube.uri]
     assert cube.path.exists()
 
 

@@ -181,7 +181,8 @@ def test_workers_that_differ_are_refused(
     elsewhere: WorkerPool, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
 ) -> None:
     """Other code, another numpy or other files would give other bytes; the error names the first difference."""
-    run, true = pool_module.dask_distributed.Client.run, pool_module.about_here([])
+    run = pool_module.dask_distributed.Client.run
+    true = pool_module.about_here([])
     monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, inputs: run(self, _true, true))
     monkeypatch.setattr(pool_module, "about_here", lambda inputs: {**true, **here})
     with pytest.raises(SettingsError, match=rf"worker tcp:.* {words}"):
@@ -293,7 +294,8 @@ if __name__ == "__main__":
 def run_script(folder: Path, text: str, *words: str) -> subprocess.Popen[str]:
     """Start a program in a process and a session of its own."""
     (script := folder / "script.py").write_text(text)
-    command, environment = [sys.executable, str(script), *words], {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(script), *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, start_new_session=True, **said)  # type: ignore[call-overload, no-any-return]
 

@@ -57,8 +57,7 @@ def test_truncated_cubes_keep_their_whole_lines(tmp_path: Path, interleave: str)
 def test_lines_are_counted_from_the_file_size(tmp_path: Path, interleave: str) -> None:
     """The header does not state the number of lines."""
     values = np.arange(60, dtype="f4").reshape(5, 4, 3)
-    path = write_envi(tmp_path / "a.bin", values, interleave)
-    header = path.with_suffix(".hdr")
+    header = write_envi(tmp_path / "a.bin", values, interleave).with_suffix(".hdr")
     header.write_text(header.read_text().replace("lines = 5\n", ""))
     cube = open_envi_cube(header)
     np.testing.assert_array_equal(cube.values, values)

@@ -63,7 +63,8 @@ def test_missing_lines_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) ->
     """A truncated or missing part leaves a gap; the last part's lost lines are at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)
     write_part(tmp_path, "raw_10", lines[10:20], lines=12)
-    source, missing = open_cube(tmp_path), [6, 7, 8, 9, 20, 21]
+    source = open_cube(tmp_path)
+    missing = [6, 7, 8, 9, 20, 21]
     assert source.shape[0] == 22
     assert np.flatnonzero(~source.lines.valid).tolist() == missing
     np.testing.assert_array_equal(source.read(0, 22)[source.lines.valid], lines[[*range(6), *range(10, 20)]])

@@ -21,7 +21,8 @@ REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 
 def test_jpeg_2000_is_read(tmp_path: Path) -> None:
     """Numbers are read as written, whole and by lines; wavelengths have to be stated."""
-    values, path = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16), tmp_path / "a.jp2"
+    values = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16)
+    path = tmp_path / "a.jp2"
     place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
     with rasterio.open(path, "w", "JP2OpenJPEG", 50, 70, 3, dtype="uint16", **place, **REVERSIBLE) as file:
         file.write(values)
