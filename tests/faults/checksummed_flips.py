@@ -19,7 +19,7 @@ from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from models.weights.files import describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
 from tests.conftest import RGB_NM, random_weights
-from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.fault_table import Row, reported_wrong
 
 RUN = "the run's identity"
 Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything except the tensors, and the tensors
@@ -106,7 +106,6 @@ def _written(folder: Path) -> dict[str, Path]:
 
 
 def rows(quick: bool) -> Sequence[Row]:
-    clock = Clock()
     count = 60 if quick else 2000
     with tempfile.TemporaryDirectory() as place:
         found = flip_bits(count, Path(place))
@@ -114,4 +113,4 @@ def rows(quick: bool) -> Sequence[Row]:
     injected = "one bit of weights or of a training run's state"
     demanded = "refused in one message, or the numbers that were written"
     met = not found.wrong and found.tried == count
-    return [Row("a bit flips in weights", injected, count, demanded, words, met, clock.seconds)]
+    return [Row("a bit flips in weights", injected, count, demanded, words, met)]

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.injection import ERRORS, label, logged_calls
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
@@ -111,7 +111,6 @@ def _judge(subject: Subject, out: Path, ended: Ended, name: str, found: Refusals
 
 
 def full_rows(quick: bool = False) -> list[Row]:
-    clock = Clock()
     mounted = can_mount()
     with tempfile.TemporaryDirectory(prefix="full-") as name, Nursery(Path(name)) as nursery:
         found = fill_at_places(prepare(nursery), 1 if quick else EACH, mounted=mounted)
@@ -120,7 +119,7 @@ def full_rows(quick: bool = False) -> list[Row]:
         injected = "ENOSPC refused from the inside (no tmpfs can be mounted here), from each kind of file on"
     demanded = "one message and exit 1, archive verifies, nothing published is lost, rerun bit-identical"
     met = not found.wrong and set(found.met_at) == set(KINDS)
-    return [Row("disk full", injected, found.told, demanded, found.words(), met, clock.seconds)]
+    return [Row("disk full", injected, found.told, demanded, found.words(), met)]
 
 
 # --- calls that are refused -------------------------------------------------------------------------------------------
@@ -157,11 +156,10 @@ def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refu
 
 
 def refused_rows(quick: bool = False) -> list[Row]:
-    clock = Clock()
     count = 12 if quick else PLACES
     with tempfile.TemporaryDirectory(prefix="refused-") as name, Nursery(Path(name)) as nursery:
         found = refuse_places(prepare(nursery), count)
     injected = f"{', '.join(ERRORS)} at a random call that changes the archive, once or from there on"
     demanded = "one message and exit 1, archive verifies, rerun bit-identical"
     met = not found.wrong and found.told > count // 2
-    return [Row("writes refused", injected, count, demanded, found.words(), met, clock.seconds)]
+    return [Row("writes refused", injected, count, demanded, found.words(), met)]
