@@ -45,10 +45,8 @@ class Refusals:
 
     def words(self) -> str:
         """Return the figures as text."""
-        places = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
-        return (
-            f"{self.told} failed with one message, {self.done} ended well; {reported_wrong(self.wrong)} (at: {places})"
-        )
+        at = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
+        return f"{self.told} failed with one message, {self.done} ended well; {reported_wrong(self.wrong)} (at: {at})"
 
 
 # --- full disks -------------------------------------------------------------------------------------------------------

@@ -148,7 +148,9 @@ def try_headers(count: int, seed: int = 0) -> Tally:
     """Mutate ``count`` headers, read each with a data file of a few KB, and return the counts."""
     rng = random.Random(seed)
     tally = Tally()
-    texts = [*HAND_MADE, *(path.read_bytes().decode("latin-1") for path in real_headers())]
+    data_sets = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    real = sorted((data_sets / "envi_headers").glob("*.hdr"))  # that instruments wrote, if they are there
+    texts = [*HAND_MADE, *(path.read_bytes().decode("latin-1") for path in real)]
     with tempfile.TemporaryDirectory() as name:
         header = Path(name) / "a.hdr"
         for text in texts:  # readers are imported before memory is measured
@@ -164,12 +166,6 @@ def try_headers(count: int, seed: int = 0) -> Tally:
             header.write_bytes(made)
             tally.try_one(header, SPARE_OF_HEADERS + 4 * len(data) + TIMES_HEADER * len(made), f"{number}")
     return tally
-
-
-def real_headers() -> list[Path]:
-    """Return the headers that instruments wrote, if they are there."""
-    root = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    return sorted((root / "envi_headers").glob("*.hdr"))
 
 
 def header_rows(quick: bool = False) -> list[Row]:

@@ -92,9 +92,7 @@ def test_the_checks_find_damage(subject: Subject) -> None:
     out = subject.folder / "damaged"
     subject.surveyed(out)
     before = stored(out)
-    first = next(
-        path for path in sorted((out / "stages" / "segment").rglob("*")) if path.is_file() and path.suffix == ""
-    )
+    first = next(path for path in sorted((out / "stages/segment").rglob("*")) if path.is_file() and path.suffix == "")
     first.write_bytes(first.read_bytes()[:-1])
     wrong = small_survey.wrong_after_fault(subject, out, {**before, "stages/segment/gone": {}})
     assert any("bytes, expected" in one for one in wrong)

@@ -24,7 +24,7 @@ from tests.faults.small_survey import Subject, problems, stored, words, wrong_af
 from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
-SYNC = 60  # sync calls before the survey is stopped
+SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
@@ -41,18 +41,14 @@ def told(ended: Ended) -> bool:
     """Return whether a command ended by SIGTERM with its one sentence, and otherwise only progress."""
     lines = ended.text.strip().splitlines()
     return (
-        ended.code == TERMINATED
-        and lines[-1] == GOING_ON
-        and not any("error" in line or "defect" in line for line in lines)
+        ended.code == TERMINATED and lines[-1] == GOING_ON and "error" not in ended.text and "defect" not in ended.text
     )
 
 
 def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tmp_path: Path) -> None:
     """Its published stores verify, and the rerun completes with the stores of an undisturbed survey."""
     out = tmp_path / "archive"
-    ended = subject.nursery.run(
-        words(out), "end_before", place="storage.archive.manifests:sync_path", number=signal.SIGTERM, call=SYNC
-    )
+    ended = subject.nursery.run(words(out), "end_before", number=signal.SIGTERM, **SYNCED)
     assert told(ended), (ended.code, ended.text)
     assert problems(out) == []
     assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []

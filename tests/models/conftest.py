@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -25,7 +24,6 @@ SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "width": 8, "ov
     "heads": 2,
     "layers": 1,
 }
-Maker = Callable[..., Weights]
 
 
 def noise(seed: int, *shape: int) -> Tensor:
@@ -105,9 +103,3 @@ def make_weights(seed: int = 0, **sizes: Any) -> Weights:
         np.arange(3 * model.config.classes, dtype=np.uint8).reshape(-1, 3),
         {"seed": seed},
     )
-
-
-@pytest.fixture
-def tiny() -> Maker:
-    """Return the maker of small random weights: ``tiny(seed, classes=..., patch=...)``."""
-    return make_weights

@@ -141,10 +141,8 @@ def test_the_error_of_passes_is_cross_validated():
 
 
 def _scores() -> MapScores:
-    scan_passes = {
-        (step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)
-    }
-    return MapScores.fitted(scan_passes)
+    maps = {(step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)}
+    return MapScores.fitted(maps)
 
 
 def test_scores_round_trip_through_a_record():

@@ -94,9 +94,8 @@ def test_stem_and_head_keep_the_size_of_an_image(patch: int):
     widths = level_widths(8, patch)
     assert widths[:3] == [8, 16, 24][: len(widths)]
     features = Stem(5, widths)(torch.zeros(3, 5, patch, 2 * patch))
-    assert [tuple(level.shape) for level in features] == [
-        (3, width, patch >> i, 2 * patch >> i) for i, width in enumerate(widths)
-    ]
+    shapes = [(3, width, patch >> i, 2 * patch >> i) for i, width in enumerate(widths)]
+    assert [tuple(level.shape) for level in features] == shapes
     assert features[-1].shape[2] == 4
     assert Head(widths)(features).shape == (3, 8, patch, 2 * patch)
 
@@ -136,11 +135,10 @@ def test_multiply_adds_of_the_temporal_reader_equal_the_counter() -> None:
     fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // CELL_PX, 24 // CELL_PX)
     scores = fine.expand(1, 5, 16, 24)
     one = torch.ones(1)
+    reader = TemporalReader(sizes).eval()
     counter = FlopCounterMode(display=False)
     with torch.inference_mode(), counter:
-        TemporalReader(sizes).eval()(
-            scores, scores, fine, fine, fine, one, one, torch.zeros(1, 2), coarse, coarse, coarse[:, :1]
-        )
+        reader(scores, scores, fine, fine, fine, one, one, torch.zeros(1, 2), coarse, coarse, coarse[:, :1])
     assert sizes.multiply_adds(16 * 24) == counter.get_total_flops() / 2
 
 

@@ -25,10 +25,9 @@ def some_ood(seed: int = 0, components: int = 3, **changed: Any) -> OodDetector:
     """Return a detector of components far from each other, each with its own covariance, and noise."""
     rng = np.random.default_rng(seed)
     mixing = rng.normal(0, 1, (components, COLUMNS, COLUMNS))
-    covariance = mixing @ mixing.swapaxes(1, 2) + 0.1 * np.eye(COLUMNS)
     parts: dict[str, Any] = {
         "centres": rng.normal(0, 100, (components, COLUMNS)),
-        "covariance": covariance,
+        "covariance": mixing @ mixing.swapaxes(1, 2) + 0.1 * np.eye(COLUMNS),
         "shot": np.stack([0.1 * np.eye(COLUMNS)] * components),
         "read": 0.01 * np.eye(COLUMNS),
         "limits": some_limits(),

@@ -57,6 +57,14 @@ def a_prior_map(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: 
     return PriorMap(first_probabilities(coarse_pass), coarse_pass.coarse, days)
 
 
+def a_return(
+    seed: int, shape: tuple[int, int] = SHAPE, days: float = 3.0
+) -> tuple[np.random.Generator, PriorMap, CurrentVisit]:
+    """Return a prior map, the visit some days after it, and the generator that drew both."""
+    rng = np.random.default_rng(seed)
+    return rng, a_prior_map(rng, shape, days), an_observation(rng, shape)
+
+
 def a_reader(seed: int = 0) -> TemporalReader:
     """Return a temporal reader with random weights, none of them idle."""
     with torch.random.fork_rng(devices=[]):
@@ -94,9 +102,7 @@ def test_fused_probabilities_sum_to_1(reader: TemporalReader | None, seed: int) 
 @given(seed=seeds)
 def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
     """A captured pixel has age 0; any other is older by the days between."""
-    rng = np.random.default_rng(seed)
-    memory = a_prior_map(rng)
-    coarse_pass = an_observation(rng)
+    rng, memory, coarse_pass = a_return(seed)
     seen = rng.random(SHAPE) < 0.5
     after = fuse(
         replace(memory, probabilities=replace(memory.probabilities, age_days=np.full(SHAPE, 2.0, np.float32))),
@@ -110,9 +116,7 @@ def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, 
 @given(seed=seeds)
 def test_a_fresh_prior_map_stays_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
     """After 0 days its probabilities are the same but for rounding; captured pixels change."""
-    rng = np.random.default_rng(seed)
-    memory = a_prior_map(rng, days=0.0)
-    coarse_pass = an_observation(rng)
+    rng, memory, coarse_pass = a_return(seed, days=0.0)
     seen = rng.random(SHAPE) < 0.5
     after = fuse(memory, replace(coarse_pass, seen=seen), reader).log_probability
     before = memory.probabilities.log_probability
@@ -136,9 +140,7 @@ def test_the_reader_is_phased_in_over_the_first_day(seed: int, days: float) -> N
 @READERS
 def test_unknown_pixels_take_the_other_source(reader: TemporalReader | None) -> None:
     """A visit fills an empty prior map, and the other way round; a pixel that is empty in both stays unknown."""
-    rng = np.random.default_rng(4)
-    memory = a_prior_map(rng)
-    coarse_pass = an_observation(rng)
+    _, memory, coarse_pass = a_return(4)
     before, today = memory.probabilities.log_probability.copy(), coarse_pass.log_probability.copy()
     before[:8], today[4:12] = np.nan, np.nan
     ages = np.where(np.isnan(before[..., 0]), np.nan, 0.0).astype(np.float32)
@@ -158,10 +160,8 @@ def test_a_confident_visit_overrules_the_prior_map() -> None:
     """Without a reader 0.99 for another class wins over 0.9, and 0.6 does not; two that agree are surer together."""
     before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
     today = np.log(np.array([[[0.005, 0.99, 0.005], [0.2, 0.6, 0.2], [0.8, 0.1, 0.1]]], np.float32))
-    coarse_pass = CurrentVisit(today, np.ones((1, 3), np.bool_), np.zeros((1, 1, COLUMNS), np.float32), 1.0, 1)
-    after = fuse(
-        PriorMap(first_probabilities(replace(coarse_pass, log_probability=before)), None, 0.0), coarse_pass, None
-    )
+    visit = CurrentVisit(today, np.ones((1, 3), np.bool_), np.zeros((1, 1, COLUMNS), np.float32), 1.0, 1)
+    after = fuse(PriorMap(first_probabilities(replace(visit, log_probability=before)), None, 0.0), visit, None)
     assert after.classes()[0].tolist() == [[1, 0, 0]]
     assert after.classes()[1][0, 2] == pytest.approx(0.9 * 0.8 / (0.9 * 0.8 + 2 * 0.05 * 0.1))
 
@@ -176,9 +176,7 @@ def test_a_prior_map_fades_to_equal_probabilities() -> None:
 @pytest.mark.parametrize("shape", [(80, 36), (33, 21), (7, 5)])
 def test_row_blocks_are_fused_like_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
     """The field is read 8 rows at a time, and its border may cut a coarse pixel."""
-    rng = np.random.default_rng(7)
-    memory = a_prior_map(rng, shape)
-    coarse_pass = an_observation(rng, shape)
+    _, memory, coarse_pass = a_return(7, shape)
     reader = a_reader(3)
     whole = fuse(memory, coarse_pass, reader)
     monkeypatch.setattr(prior_map, "ROWS", 8)
@@ -195,9 +193,7 @@ def test_pooled_columns_are_means_of_known_pixels() -> None:
 
 def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
     """Without the earlier coarse columns, or where they are NaN, those of the current visit may be anything."""
-    rng = np.random.default_rng(9)
-    memory = a_prior_map(rng)
-    coarse_pass = an_observation(rng)
+    rng, memory, coarse_pass = a_return(9)
     reader = a_reader(5)
     other = replace(coarse_pass, coarse=rng.normal(size=coarse_pass.coarse.shape).astype(np.float32))
     blind, nothing = replace(memory, coarse=None), replace(memory, coarse=np.full_like(coarse_pass.coarse, np.nan))
@@ -209,9 +205,7 @@ def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
 
 def test_an_untrained_reader_weighs_both_sources_by_its_gates() -> None:
     """The result is .73 of the prior map, and .27 of its product to the power .9 with the visit to the power .5."""
-    rng = np.random.default_rng(2)
-    memory = a_prior_map(rng, days=0.0)
-    coarse_pass = an_observation(rng)
+    _, memory, coarse_pass = a_return(2, days=0.0)
     old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.probabilities, coarse_pass))
     old /= old.sum(axis=-1, keepdims=True)
     product, replaced = old ** (1 / (1 + math.exp(-2.2))) * new**0.5, 1 / (1 + math.e)
@@ -281,9 +275,8 @@ def test_a_harvest_overnight_is_detected() -> None:
     found = compare(memory, today, after, np.s_[:, :])
     assert not found.is_of_another_field  # soil between the rows did not change
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
-    np.testing.assert_array_equal(
-        changed_fractions(changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5)), np.float32(0.4)
-    )
+    fractions = changed_fractions(changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5))
+    np.testing.assert_array_equal(fractions, np.float32(0.4))
 
 
 def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], noise: float) -> TemporalAgreement:
@@ -338,12 +331,10 @@ def test_a_field_under_snow_counts_as_another_field() -> None:
 
 def test_changed_fraction_counts_confident_pixels_only() -> None:
     """In one patch 8 of 64 pixels changed; in the next as many are unsure and do not count."""
-    sure, other, expected_error = (
-        np.log(np.array(one, np.float32)) for one in ([0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1])
-    )
+    sure, other, unsure = np.log(np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1]], np.float32))
     before = np.tile(sure, (8, 16, 1))
     now = before.copy()
-    now[0, :8], now[0, 8:] = other, expected_error
+    now[0, :8], now[0, 8:] = other, unsure
     memory = PriorMap(ClassProbabilities(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
     old = changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
     np.testing.assert_array_equal(old, np.where(now.argmax(axis=-1) == 1, np.where(np.arange(16) < 8, 0, 255), 255))

@@ -50,10 +50,8 @@ def test_whitening_does_not_amplify_noise() -> None:
     """A direction with as much noise as signal is reduced by the root of two; others keep unit variance."""
     sample = np.random.default_rng(1).normal(size=(50_000, 2)) * [1.0, 1.0] @ np.array([[1.0, 1.0], [0.1, -0.1]])
     plain, told = Normalisation.measured(sample), Normalisation.measured(sample, np.diag([0.02, 0.02]))
-    sizes = [
-        (one.apply(sample, np.ones(2, bool)) @ np.array([[1, 1], [1, -1]]) / math.sqrt(2)).std(axis=0)
-        for one in (plain, told)
-    ]
+    axes = np.array([[1, 1], [1, -1]]) / math.sqrt(2)
+    sizes = [(one.apply(sample, np.ones(2, bool)) @ axes).std(axis=0) for one in (plain, told)]
     np.testing.assert_allclose(sizes[0], 1, atol=0.02)
     np.testing.assert_allclose(sizes[1], [1, math.sqrt(0.5)], atol=0.02)
 
@@ -197,13 +195,14 @@ def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.Mon
         np.testing.assert_allclose(values[rows].var(axis=1).max(axis=0), told, rtol=0.15)  # rows of lines have the most
 
 
-def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -> tuple[np.ndarray, SceneSpectra]:
-    """Return noiseless spectra (200, 100, band) about .3, in smooth directions of some times the noise, and moments."""
+def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -> tuple[np.ndarray, ColumnNoise]:
+    """Return spectra (200, 100, band) about .3, in smooth directions of some times the noise, and this noise."""
     bumps = np.exp(-0.5 * ((BANDS - np.linspace(430, 970, len(sizes))[:, None]) / 60) ** 2)
     sigma = np.sqrt(0.3 * light * WHITE_REFERENCE_E + 20.0**2) / (light * WHITE_REFERENCE_E)
     axes = np.linalg.qr(bumps.T)[0].T * np.array(sizes)[:, None] * sigma
     spectra = 0.3 + rng.normal(size=(200, 100, len(sizes))) @ axes
-    return spectra, SceneSpectra(np.full(60, 0.3), axes.T @ axes, MATRIX, 1 / WHITE_REFERENCE_E, 20.0)
+    moments = SceneSpectra(np.full(60, 0.3), axes.T @ axes, MATRIX, 1 / WHITE_REFERENCE_E, 20.0)
+    return spectra, replace(_noise(), spectra=moments)
 
 
 @pytest.mark.parametrize(("light", "rtol"), [(0.1, 0.04), (0.5, 0.25)])
@@ -214,14 +213,15 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
     """
     rng = np.random.default_rng(3)
     augmentation, normalisation = _augmentation()
-    spectra, moments = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
-    sigma = np.sqrt(np.sum(moments.noise(light), axis=0))
-    axes = np.linalg.eigh(moments.covariance / np.outer(sigma, sigma))[1][:, ::-1][:, :4]
-    more = sigma * np.sqrt(1 - np.sum(moments.noise(1.0), axis=0) / sigma**2)  # the crop has noise of the reference
+    spectra, noise = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
+    sigma = np.sqrt(np.sum(noise.spectra.noise(light), axis=0))
+    axes = np.linalg.eigh(noise.spectra.covariance / np.outer(sigma, sigma))[1][:, ::-1][:, :4]
+    more = sigma * np.sqrt(
+        1 - np.sum(noise.spectra.noise(1.0), axis=0) / sigma**2
+    )  # the crop has noise of the reference
     noisy = spectra + more * rng.normal(size=spectra.shape)
     surveyed = 0.3 + (np.rint((noisy - 0.3) / sigma @ axes) @ axes.T) * sigma
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
-    noise = replace(_noise(), spectra=moments)
     seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
     columns = seen @ augmentation.unwhiten * normalisation.spread + normalisation.centre
     added, wanted = (np.cov((one - spectra @ MATRIX).reshape(-1, 12).T) for one in (columns, surveyed @ MATRIX))
@@ -235,9 +235,8 @@ def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, lef
     rng = np.random.default_rng(4)
     light = 0.1
     augmentation, normalisation = _augmentation()
-    spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
+    spectra, noise = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
-    noise = replace(_noise(), spectra=moments)
     seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=least_power)[..., :12]
     power = np.linalg.eigvalsh(np.cov((seen @ augmentation.unwhiten * normalisation.spread).reshape(-1, 12).T))
     assert np.count_nonzero(power > 1e-6 * power[-1]) == left
@@ -248,9 +247,8 @@ def test_later_lines_share_the_components_of_the_first_pass(monkeypatch: pytest.
     monkeypatch.setattr(capture_augmentation, "AREAS", (0.0, 1.0))
     rng = np.random.default_rng(6)
     augmentation, normalisation = _augmentation()
-    spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0), 0.1)
+    spectra, noise = _spectra(rng, (30.0, 5.0, 3.0, 2.0), 0.1)
     crop = normalisation.apply(spectra[:64, :64] @ MATRIX, np.ones(12, bool))
-    noise = replace(_noise(), spectra=moments)
     seen = _seen(augmentation.interlaced, crop, noise, step=4, rng=rng, least_power=0.05)
     assert len(_captures(seen[..., 12:])) > 1
     columns = seen[..., :12] @ augmentation.unwhiten * normalisation.spread

@@ -31,9 +31,8 @@ def scene(seed: int, side: int = 48) -> Example:
 
 def test_known_spectra_are_unknown_at_the_stated_rate() -> None:
     """The scenes were not used for the fit; spectra of no class, also of unlabelled pixels, are unknown."""
-    ood_detector = fit_ood(
-        [scene(i) for i in range(4)], [scene(i) for i in range(10, 13)], PLAIN, darkest_ms=3.0, bands=9, seed=0
-    )
+    fitted, validated = ([scene(i) for i in numbers] for numbers in (range(4), range(10, 13)))
+    ood_detector = fit_ood(fitted, validated, PLAIN, darkest_ms=3.0, bands=9, seed=0)
     fresh = np.concatenate([scene(i).columns[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
     fraction = ood_detector.unknown(fresh, rate=0.01, capture=LineSpec(), bands=9).mean()
     assert 0.004 < fraction < 0.02

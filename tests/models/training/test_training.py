@@ -28,7 +28,7 @@ from models.training.train import (
 )
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, block_example
+from tests.models.conftest import block_example, make_weights
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
@@ -53,12 +53,12 @@ def test_training_reduces_the_loss(monkeypatch: pytest.MonkeyPatch):
     assert not model.training
 
 
-def test_training_at_the_reference_ignores_capture_planes(tiny: Maker):
+def test_training_at_the_reference_ignores_capture_planes():
     """Planes that are 0 in every crop keep kernels of 0, so that every capture gives the same map."""
     scene = block_example()
     model, _ = train(CONFIG, [scene], SHIFT, SETTINGS)
     assert not any(stem.enter.weight[:, 2 : 2 + PLANES].any() for stem in (model.overview_stem, model.full_stem))
-    weights = replace(tiny(columns=2), segmenter=model)
+    weights = replace(make_weights(columns=2), segmenter=model)
     grid = SceneGrid(32, 32, 8)
     usual, dark = (map_of_columns(weights, scene.columns, grid, one)[1] for one in (LineSpec(), LineSpec(0.1, 4, 4)))
     assert (usual == dark).all()
@@ -67,15 +67,13 @@ def test_training_at_the_reference_ignores_capture_planes(tiny: Maker):
 def test_equal_seeds_give_equal_weights():
     """The weights are equal up to rounding; the global random streams of torch and numpy do not change."""
     torch_before, numpy_before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    first, same, other = (
-        train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=3, seed=seed))[0] for seed in (3, 3, 4)
-    )
+    models = [train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=3, seed=seed))[0] for seed in (3, 3, 4)]
     assert torch.equal(torch.random.get_rng_state(), torch_before)
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
-    weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in (first, same, other)]
+    weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in models]
     apart = [(weights[0] - other).norm() for other in weights[1:]]
     assert apart[0] < 1e-3 * apart[1]  # sums differ in the last bit with the memory layout
-    assert not first.training
+    assert not models[0].training
 
 
 @pytest.mark.parametrize(("crop", "first", "last"), [(48, 32, (2, 64)), (64, 64, (4, 64)), (16, 32, (4, 32))])
@@ -91,8 +89,7 @@ def test_batches_halve_where_crops_grow(crop: int, first: int, last: tuple[int, 
     )
     for done in (0.1, 0.9):
         trainer.step(done)
-    sizes = [(count, side) for count, side, _ in sizes]
-    assert sizes == [(4, first), last]
+    assert [(count, side) for count, side, _ in sizes] == [(4, first), last]
 
 
 def test_training_stops_at_its_time_limit(monkeypatch: pytest.MonkeyPatch):

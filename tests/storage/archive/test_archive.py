@@ -250,9 +250,7 @@ def test_releasing_a_lock_twice_keeps_the_next_holders_lock(tmp_path: Path) -> N
 
 def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files that a killed run of the same second and name left are not published with the next run."""
-    monkeypatch.setattr(
-        "storage.archive.archive.datetime", Mock(now=Mock(return_value=datetime(2026, 5, 1, tzinfo=UTC)))
-    )
+    monkeypatch.setattr("storage.archive.archive.datetime", Mock(now=lambda zone: datetime(2026, 5, 1, tzinfo=UTC)))
     left = tmp_path / "runs" / "20260501T000000-a.part"
     left.mkdir(parents=True)
     (left / "torn.bin").write_bytes(b"x")

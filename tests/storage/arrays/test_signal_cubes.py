@@ -39,9 +39,7 @@ def lines_of(bands: int = BANDS, signal: float = 30.0) -> MadeLines:
     return MadeLines.of(raw)
 
 
-def store(
-    path: Path, lines: MadeLines, *, step: float = 1.0, largest: float | None = None
-) -> tuple[signal_cubes.SignalCube, CondensedSweep]:
+def store(path: Path, lines: MadeLines, *, step: float = 1.0) -> tuple[signal_cubes.SignalCube, CondensedSweep]:
     """Condense lines and store them."""
     values, valid = calibrate(lines.raw, lines.references, saturated_dn=4095, position=lines.position)
     found = SignalStatistics(values.shape[2], values[..., 0].size)
@@ -50,10 +48,8 @@ def store(
     bands = np.linspace(400, 1000, values.shape[2])
     header = SweepHeader(lines.sweep, lines.references, bands, np.full(len(bands), 5.0), "sim", "2026-05-01T10:00:00")
     origin = np.zeros(len(bands)) if found.origin is None else found.origin
-    reach = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
-    writer = signal_cubes.SignalCubeWriter(
-        path, header, components, step=step, largest=reach if largest is None else largest
-    )
+    largest = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
+    writer = signal_cubes.SignalCubeWriter(path, header, components, step=step, largest=largest)
     law = ResidualLaw.learned(found.spectra, components)
     done = Condenser(components, law, CAMERA, 1e-3, step).sweep(lines, writer.write)
     x, y = lines.position.T

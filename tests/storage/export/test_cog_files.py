@@ -24,9 +24,7 @@ from storage.arrays.georeference import AngularGrid
 from storage.export.image_files import CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
-LEGEND = ClassNames(
-    ("sugar beet", "soil & stones", "maïs"), np.array([[10, 200, 30], [120, 90, 60], [0, 0, 255]], "u1")
-)
+LEGEND = ClassNames(("sugar beet", "soil & stones", "maïs"), np.array([[9, 200, 30], [120, 90, 60], [0, 0, 255]], "u1"))
 GRID = AngularGrid(1e-4, (1300, 1100))
 FEW = (90, 70)
 

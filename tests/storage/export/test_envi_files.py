@@ -27,7 +27,6 @@ ORDERS = {"little": "<", "big": ">"}
 CODES = sorted(DATA_TYPES)
 SHAPE = (6, 7, 5)
 NM = [401.25, 402.5, 550.0, 800.125, 999.875]
-
 WIDTHS = [5.5, 5.25, 6.0, 7.125, 8.0]
 NAMES = ["blue 1", "blue 2", "green", "edge", "last"]
 

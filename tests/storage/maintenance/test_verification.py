@@ -113,9 +113,7 @@ def test_a_store_removed_during_verify_is_not_damage(archive: Archive) -> None:
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
     def clear(ref: StageRef) -> list[str]:
-        return [
-            one.uri for one in verify_archive(archive, lambda uri, done: archive.discard(ref) and None) if one.problem
-        ]
+        return [one.uri for one in verify_archive(archive, lambda *_: archive.discard(ref) and None) if one.problem]
 
     assert clear(other.map) == []
     assert clear(named.map) == [named.map.uri]

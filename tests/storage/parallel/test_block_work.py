@@ -125,9 +125,8 @@ def test_a_block_that_always_kills_its_worker_raises_an_error() -> None:
     """The error says what to do, and the open pool gets new workers."""
     with WorkerPool("processes", 1).open() as pool:
         (before, _), *_ = run_blocks(threads_here, [0], pool)
-        with pytest.raises(
-            WorkerError, match=r"--scheduler processes: workers died .* in the same block.*--scheduler threads"
-        ):
+        died = r"--scheduler processes: workers died .* in the same block.*--scheduler threads"
+        with pytest.raises(WorkerError, match=died):
             run_blocks(die, range(3), pool)
         (after, _), *_ = run_blocks(threads_here, [0], pool)
         assert before != after
@@ -267,11 +266,11 @@ def nap(number: int) -> int:
 def test_a_lost_scheduler_raises_one_error(tmp_path: Path) -> None:
     """There is one message and no traceback of dask; a restarted scheduler serves the pool again."""
     with socket.create_server(("127.0.0.1", 0)) as free:
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    with run_script(tmp_path, GONE, address) as started:
+        place = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    with run_script(tmp_path, GONE, place) as started:
         printed, said = started.communicate(timeout=60)
     gone = (
-        f"--scheduler {address}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
+        f"--scheduler {place}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
     )
     assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 

@@ -109,10 +109,8 @@ def test_unbalanced_braces_do_not_hide_fields() -> None:
 
 def test_comment_lines_hold_settings() -> None:
     """Lines that begin with a semicolon are no fields, but settings in them are kept, also within braces."""
-    text = (
-        PLAIN + "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
-    )
-    header = parse_envi_header(text)
+    text = "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
+    header = parse_envi_header(PLAIN + text)
     assert header.settings == {"exposure (ms)": "100.25", "post aoi width": "1600", "x": "1"}
     np.testing.assert_array_equal(header.wavelength_nm, [400, 402])
 

@@ -42,11 +42,9 @@ def emit_file(path: Path) -> NDArray[np.float32]:
         "good_wavelengths": (("bands",), np.array([1, 1, 0, 1, 1], np.float32)),
     }
     table = {name: (("ortho_y", "ortho_x"), np.ones((9, 9), np.int32)) for name in ("glt_x", "glt_y")}
-    tree = xr.DataTree.from_dict(
-        {"/": root, "/sensor_band_parameters": xr.Dataset(bands), "/location": xr.Dataset(table)}
-    )
+    groups = {"/": root, "/sensor_band_parameters": xr.Dataset(bands), "/location": xr.Dataset(table)}
     packed = {"/": {"reflectance": {"_FillValue": np.float32(-9999), "zlib": True, "chunksizes": (4, 3, 5)}}}
-    tree.to_netcdf(path, engine="h5netcdf", encoding=packed)
+    xr.DataTree.from_dict(groups).to_netcdf(path, engine="h5netcdf", encoding=packed)
     return values
 
 

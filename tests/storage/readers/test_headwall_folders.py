@@ -120,9 +120,8 @@ def test_parts_that_do_not_fit_are_refused(tmp_path: Path, lines: NDArray[np.uin
 
 def test_folders_without_lines_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A folder without parts and one with only empty parts have different messages."""
-    with pytest.raises(
-        SceneError, match="is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
-    ):
+    expected = "is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
+    with pytest.raises(SceneError, match=expected):
         open_cube(tmp_path)
     write_part(tmp_path, "raw_0", lines[:0])
     with pytest.raises(SceneError, match=r"every part of .* is empty"):

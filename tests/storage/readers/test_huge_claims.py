@@ -130,9 +130,8 @@ def test_matlab_text_and_cells_are_ignored(tmp_path: Path) -> None:
 def png(width: int, height: int, packed: bytes) -> bytes:
     """Return a grey PNG of any claimed size."""
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", packed), (b"IEND", b"")]
-    parts = [
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
-    ]
+    number = struct.Struct(">I").pack
+    parts = [number(len(body)) + kind + body + number(zlib.crc32(kind + body)) for kind, body in chunks]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 

@@ -23,11 +23,10 @@ SIDE = 60
 CLASSES = np.zeros((SIDE, SIDE), np.uint8)  # three stripes and a corner, without any symmetry
 CLASSES[:, 20:], CLASSES[:, 45:], CLASSES[:10, :15] = 1, 2, 3
 NORTH_UP = Affine(1, 0, WEST, 0, -1, NORTH)
+SOUTH_UP = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
 
 
-def write(
-    path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: str | None = "EPSG:32632", **about: Any
-) -> Path:
+def write(path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: Any = 32632, **about: Any) -> Path:
     """Write a GeoTIFF of (y, x) or (y, x, band) values, and return its path."""
     planes = np.moveaxis(np.atleast_3d(values), -1, 0)
     count, height, width = planes.shape
@@ -84,10 +83,9 @@ def test_labels_in_another_crs_are_aligned(tmp_path: Path) -> None:
 @pytest.mark.parametrize("turned", ["labels", "image"])
 def test_labels_align_with_rows_in_opposite_order(tmp_path: Path, turned: str) -> None:
     """Rows from the south up and rows from the north down show the same ground."""
-    south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
     flipped = np.ascontiguousarray(CLASSES[::-1])
-    path = image(tmp_path, south_up, flipped) if turned == "image" else image(tmp_path)
-    labels = (flipped, south_up) if turned == "labels" else (CLASSES, NORTH_UP)
+    path = image(tmp_path, SOUTH_UP, flipped) if turned == "image" else image(tmp_path)
+    labels = (flipped, SOUTH_UP) if turned == "labels" else (CLASSES, NORTH_UP)
     write(tmp_path / "field_labels.tif", *labels)
     scene = load_scene_file(path)
     assert agree(scene) == 1.0
@@ -118,9 +116,8 @@ def test_labels_outside_of_the_image_are_refused(tmp_path: Path) -> None:
 def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:
     """The mask of training pixels is resampled to the scene's pixels as well."""
     path = image(tmp_path)
-    south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
-    labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), south_up)
-    mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), south_up)
+    labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), SOUTH_UP)
+    mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), SOUTH_UP)
     train = load_data_set(path, labels=labels, train_mask=mask).load("field", "train").labels
     assert train is not None
     np.testing.assert_array_equal(train != 255, CLASSES == 1)
@@ -131,7 +128,7 @@ def test_nodata_of_a_label_file_is_unlabelled(tmp_path: Path, turned: bool) -> N
     """The value is found on the scene's grid and on another; a note counts its pixels."""
     path = image(tmp_path)
     codes = np.where(CLASSES == 3, np.uint8(255), CLASSES)
-    grid = (codes[::-1].copy(), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)) if turned else (codes, NORTH_UP)
+    grid = (codes[::-1].copy(), SOUTH_UP) if turned else (codes, NORTH_UP)
     write(tmp_path / "field_labels.tif", *grid, nodata=255)
     scene = load_scene_file(path)
     assert scene.class_names == ("class_0", "class_1", "class_2")

@@ -65,9 +65,7 @@ def test_polygon_labels_equal_rasterios(tmp_path: Path) -> None:
     place = PLACE * Affine.rotation(20)
     shapes = [shapely.Point(400_010, 5_699_995).buffer(6), shapely.Point(400_016, 5_699_990).buffer(5)]
     found = load_scene_file(scene(tmp_path, place=place), labels=written(tmp_path / "a.gpkg", shapes, code=[4, 7]))
-    other = rasterio.features.rasterize(
-        zip(shapes, (0, 1), strict=True), SHAPE, fill=NONE, transform=place, dtype="uint8"
-    )
+    other = rasterio.features.rasterize(zip(shapes, (0, 1), strict=True), SHAPE, NONE, transform=place, dtype="uint8")
     np.testing.assert_array_equal(found.labels, other)
     assert found.class_names == ("class_4", "class_7")
     assert found.class_values == (4, 7)

@@ -29,8 +29,6 @@ from tests.storage.readers.test_recordings import write_raw
 from tests.storage.small_archive import problems, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make
 
-THIRD = "third"
-
 
 def test_gc_restores_a_store_that_a_new_run_names(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another machine publishes a run between gc's listing of the runs and its removal of a store."""
@@ -256,7 +254,7 @@ def test_a_store_cleared_by_one_machine_is_remade_by_another(machine: Machine) -
     assert [name.rpartition("/")[2] for name in first.objects.listing(small.mosaic.uri)] == ["manifest.json"]
     assert problems(first) == []
     assert first.find("rectify", small.mosaic.key) is None
-    third = machine(THIRD)
+    third = machine("third")
     assert third.find("rectify", small.mosaic.key) is None
     again = small_survey(third)
     assert any(name.endswith("/data.bin") for name in third.objects.listing(again.mosaic.uri))
