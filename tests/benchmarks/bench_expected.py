@@ -102,20 +102,16 @@ def present() -> tuple[float, ...]:
     }
 
     def loss(numbers: np.ndarray) -> float:
+        off = []
         with mock.patch.object(expected_scores, "PRESENT", tuple(numbers)):
-            off = [
-                (
-                    100 * (expected_score(one.expected, bias[name, scan], 0.0, *scan).miou - mean_iou(one.counts)),
-                    scan[0],
-                )
-                for name, maps in scenes().items()
-                for scan, one in maps.items()
-            ]
+            for name, maps in scenes().items():
+                for scan, one in maps.items():
+                    told = expected_score(one.expected, bias[name, scan], 0.0, *scan)
+                    off.append((100 * (told.miou - mean_iou(one.counts)), scan[0]))
         error, step = np.transpose(off)
         weight = np.where(step == 8, OF_EIGHT, 1.0)
-        return float(
-            (2 * scipy.special.huber(HUBER, error) * weight).mean() + HELD * np.sum((numbers - LIKELIEST) ** 2)
-        )
+        held = HELD * np.sum((numbers - LIKELIEST) ** 2)
+        return float((2 * scipy.special.huber(HUBER, error) * weight).mean() + held)
 
     return tuple(scipy.optimize.minimize(loss, LIKELIEST, method="Nelder-Mead").x.round(2).tolist())
 

@@ -76,7 +76,6 @@ def rows() -> list[Row]:
         for exposure_ms in EXPOSURES_MS
     }
     found = [(_seconds(one), Row(name, _figure(one))) for name, one in plain.items()]
-
     for seconds in SECONDS:
         scan = chosen_scan(SHAPE, seconds)
         judged = [_plain(seed, scan.step, scan.exposure_ms) for seed in SEEDS]

@@ -154,9 +154,8 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
                 scores = [read.scores(policy, pooling, seed) for seed in draws]
                 cost = 0 if policy in ("random", "ideal") else score_multiply_adds(policy, config, grid)
                 for text, k in rows.items():
-                    spent = multiply_adds(
-                        config, grid, k, len(scene.wavelength_nm), score=cost if 0 < k < every else 0, apart=factor > 1
-                    )
+                    own = cost if 0 < k < every else 0
+                    spent = multiply_adds(config, grid, k, len(scene.wavelength_nm), score=own, apart=factor > 1)
                     row = found.setdefault((factor, label, text), Tally())
                     row.counts.append([read.counts(select_patches(one, k)) for one in scores])
                     row.patches.append(coarse + k)

@@ -287,9 +287,8 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
             drawn = segment(weights, observation, fine[patch_index], patch_index).classes
             spent = time.process_time() - began
             counts = confusion(labels, drawn, weights.config.classes)
-            found.append(
-                Result(f"{source}: segmenter, {100 * fraction:.0f} % of patches", counts, spent, words, fraction == 1)
-            )
+            name = f"{source}: segmenter, {100 * fraction:.0f} % of patches"
+            found.append(Result(name, counts, spent, words, fraction == 1))
     return found
 
 

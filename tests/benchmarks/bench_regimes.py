@@ -143,7 +143,7 @@ def score(seed: int, share: float, light: float, swaths: int, seconds: float, wa
     found = mock.patch.object(scenes, "built_in_scene", return_value=scene)
     with tempfile.TemporaryDirectory() as out, found, known(inside) if way == "ideal" else nullcontext():
         settings = asked(seed, light, swaths, seconds, "never" if way == "never" else "always", out)
-    return 100 * float(run_survey(settings, Console(quiet=True)).receipt["accuracy"]["miou"])
+        return 100 * float(run_survey(settings, Console(quiet=True)).receipt["accuracy"]["miou"])
 
 
 def cells(seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:

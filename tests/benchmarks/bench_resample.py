@@ -159,7 +159,5 @@ def _prepared(others: Sequence[Peer], scene: Turned) -> str:
     before = {f"{peer.name}'s index": peer.prepare for peer in others if peer.prepare}
     if not before:
         return ""
-    clocks = time_in_turn(before, 1)
-    return "; not counted: " + _listed(
-        {name: ns_of(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
-    )
+    spent = {name: ns_of(clock, len(scene.truth)) for name, clock in time_in_turn(before, 1).items()}
+    return "; not counted: " + _listed(spent, "{:.0f} ns/px")

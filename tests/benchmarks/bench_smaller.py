@@ -74,9 +74,8 @@ def trained(asked: TrainRequest, scenes: Scenes, normalisation: Normalisation) -
     start = linear_discriminants(LabelledPixels.drawn(examples, rng).brightened(shift, rng), config.classes)
     model, summary = train(config, examples, shift, asked.settings, start=start, device=choose_device("auto"))
     print(config, summary, flush=True)
-    return read_twice(
-        Weights(model, common.basis, normalisation, common.names, common.colours), scenes.validation.examples
-    )
+    weights = Weights(model, common.basis, normalisation, common.names, common.colours)
+    return read_twice(weights, scenes.validation.examples)
 
 
 def score(judged: list[ReadTwice], classes: int, policy: str, fraction: float = 1.0) -> list[float]:
@@ -157,9 +156,8 @@ def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
         print(config, summary, flush=True)
         peer = score(read_twice(replace(shipped, segmenter=model), scenes.validation.examples), classes, "all")
         fraction = (cost(config) - cost(shipped.config, 0)) / (cost(shipped.config) - cost(shipped.config, 0))
-        found.append(
-            beside(f"widths {overview_width} and {width}", config, score(ours, classes, "gain", fraction), peer)
-        )
+        own = score(ours, classes, "gain", fraction)
+        found.append(beside(f"widths {overview_width} and {width}", config, own, peer))
         print(found[-1], flush=True)
     return found
 
@@ -212,11 +210,8 @@ def cut(model: Segmenter, config: SegmenterConfig) -> dict[str, Tensor]:
 
 def _strongest(old: Mapping[str, Tensor], part: str, level: int, most: int) -> Tensor:
     """Return the channels of a level with the largest weights, in ascending order, at most ``most``."""
-    own = [
-        weight
-        for name, weight in old.items()
-        if re.fullmatch(rf"{part}_(stem|head)\.blocks\.{level}\.conv\.weight", name)
-    ]
+    kernels = rf"{part}_(stem|head)\.blocks\.{level}\.conv\.weight"
+    own = [weight for name, weight in old.items() if re.fullmatch(kernels, name)]
     size = sum((one.abs().sum((0, 2, 3)) + one.abs().sum((1, 2, 3)) for one in own), torch.zeros(len(own[0])))
     way = old.get(f"{part}_stem.down.{level}.weight")
     way = old[f"{part}_head.up.{level - 1}.weight"] if way is None else way

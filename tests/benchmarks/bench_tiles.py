@@ -83,7 +83,7 @@ def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
     out.unlink()
     data = open_training_data(str(tiles), 0, None, LineCamera())
     classes = weights.config.classes
-    found = {"network": np.zeros((weights.config.classes,) * 2, np.int64)}
+    found = {"network": np.zeros((classes, classes), np.int64)}
     for name in held:
         frame = observe_frame(data.scene(name), name, weights, LineCamera(), fold)
         every = np.arange(len(frame.fine))

@@ -102,10 +102,9 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
 def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
     """Return a scene with only the bands nearest to the given wavelengths."""
     at = [int(np.abs(scene.wavelength_nm - one).argmin()) for one in wanted_nm]
-    light = SceneRadiance(scene.electrons[:, at], scene.white_reference_electrons[at])
     return replace(
         scene,
-        light=Once.of(light),
+        light=Once.of(SceneRadiance(scene.electrons[:, at], scene.white_reference_electrons[at])),
         white_reference=scene.white_reference[at],
         wavelength_nm=scene.wavelength_nm[at],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[at],
@@ -129,9 +128,8 @@ def farm_four(steps: int, say: Say, side: int = SIDE, seeds: Sequence[int] = FAR
 
 def farm_all(side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
     """Return the same farms with all bands, and the shipped weights."""
-    weights = load_weights(ROOT / "models" / "shipped" / "farm.safetensors")
     scenes = {f"{seed}": partial(farm_scene, seed, (side, side), camera=CAMERA) for seed in seeds}
-    return DataSet("farm, 270 bands", weights, scenes)
+    return DataSet("farm, 270 bands", load_weights(ROOT / "models" / "shipped" / "farm.safetensors"), scenes)
 
 
 def folder(path: Path, held_out: Sequence[str], steps: int, patch: int, say: Say, given: Path | None) -> DataSet:

@@ -25,8 +25,6 @@ from tests.faults.injection import ERRORS, label, logged_calls
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
-EACH = 5
-PLACES = 150
 LARGE = 64 << 20  # bytes: more than a survey needs
 KINDS = ("spool", "segment", "segment manifest", "run")  # of written files
 FULL = "disk is full"
@@ -111,7 +109,7 @@ def _judge(subject: Subject, out: Path, ended: Ended, name: str, found: Refusals
 def full_rows(quick: bool = False) -> list[Row]:
     mounted = can_mount()
     with tempfile.TemporaryDirectory(prefix="full-") as name, Nursery(Path(name)) as nursery:
-        found = fill_at_places(prepare(nursery), 1 if quick else EACH, mounted=mounted)
+        found = fill_at_places(prepare(nursery), 1 if quick else 5, mounted=mounted)
     injected = "a tmpfs filled up while each kind of file is written; then it grows"
     if not mounted:
         injected = "ENOSPC refused from the inside (no tmpfs can be mounted here), from each kind of file on"
@@ -154,7 +152,7 @@ def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refu
 
 
 def refused_rows(quick: bool = False) -> list[Row]:
-    count = 12 if quick else PLACES
+    count = 12 if quick else 150
     with tempfile.TemporaryDirectory(prefix="refused-") as name, Nursery(Path(name)) as nursery:
         found = refuse_places(prepare(nursery), count)
     injected = f"{', '.join(ERRORS)} at a random call that changes the archive, once or from there on"

@@ -16,7 +16,6 @@ from pipeline.rig.capture_paths import CaptureRecord
 from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
 from tests.faults.fault_table import Row, reported_wrong
 
-FLIPS = 2000
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -7.5, 40)
 
 
@@ -67,6 +66,6 @@ def _held(rotten: bytearray, truth: list[dict[str, Any]], found: Rot) -> list[st
 
 
 def rows(quick: bool = False) -> Sequence[Row]:
-    found = flip_journal(200 if quick else FLIPS)
+    found = flip_journal(200 if quick else 2000)
     injected, demanded = "one bit of a rig's journal", "no other capture, no defect, one capture lost at most"
     return [Row("a bit flips", injected, found.flips, demanded, found.words(), not found.wrong)]

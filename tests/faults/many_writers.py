@@ -19,7 +19,6 @@ from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words
 
-ROUNDS = 10
 OTHER = ("--policy", "sobel")  # shares the coarse pass, the geolocation grid and the mosaic
 
 
@@ -86,7 +85,7 @@ def _left(out: Path, *, killed: bool) -> list[str]:
 
 def rows(quick: bool = False) -> Iterator[Row]:
     """Yield the rows for two and four equal surveys, for common stages, and for a killed writer."""
-    rounds = 1 if quick else ROUNDS
+    rounds = 1 if quick else 10
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
         both = dict(subject.truth)

@@ -26,7 +26,6 @@ from tests.receipts import comparable, receipts
 GOING_ON = "terminated; run the same command to resume"
 SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
-BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGTERM),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
@@ -39,10 +38,8 @@ MOMENTS = (0.28, 0.98, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KIL
 
 def told(ended: Ended) -> bool:
     """Return whether a command ended by SIGTERM with its one sentence, and otherwise only progress."""
-    lines = ended.text.strip().splitlines()
-    return (
-        ended.code == TERMINATED and lines[-1] == GOING_ON and "error" not in ended.text and "defect" not in ended.text
-    )
+    last = ended.text.strip().splitlines()[-1]
+    return ended.code == TERMINATED and last == GOING_ON and "error" not in ended.text and "defect" not in ended.text
 
 
 def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tmp_path: Path) -> None:
@@ -61,7 +58,7 @@ def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tm
 def mapped(subject: Subject) -> Path:
     """Return the archive of a survey that was killed at the start of its evaluation."""
     out = subject.folder / "mapped"
-    ended = stopped(subject, out, *BEGUN, signal.SIGKILL)
+    ended = stopped(subject, out, "flows.tasks.stages.accuracy:load_class_map", 1, signal.SIGKILL)
     assert ended.code == -signal.SIGKILL, ended.text
     return out
 

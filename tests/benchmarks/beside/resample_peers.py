@@ -100,10 +100,8 @@ def _by_pixel(planes: NDArray[np.float32]) -> NDArray[np.float32]:
 def _cv2_remap(scene: Turned, order: int) -> Peer:
     """Split the sweep into groups of bands before the timing; the result is joined, as the other libraries give it."""
     parts = cv2_parts(scene, order)
-    joined = np.empty((EDGE, EDGE, BANDS), np.float32)
-    return Peer(
-        "cv2.remap", lambda: np.concatenate(parts(), axis=2, out=joined), lambda _: joined.reshape(-1, BANDS), BANDS
-    )
+    out = np.empty((EDGE, EDGE, BANDS), np.float32)
+    return Peer("cv2.remap", lambda: np.concatenate(parts(), axis=2, out=out), lambda _: out.reshape(-1, BANDS), BANDS)
 
 
 def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32]]]:
@@ -125,7 +123,6 @@ def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32
 
 
 def _grid_sample(scene: Turned, order: int) -> Peer:
-
     mode = {0: "nearest", 1: "bilinear", 3: "bicubic"}[order]
     grid = (scene.coordinates[:, ::-1] / (SIDE - 1) * 2 - 1).astype(np.float32).reshape(1, EDGE, EDGE, 2)
     image = torch.from_numpy(scene.planes)[None].contiguous(memory_format=torch.channels_last)  # half the time of NCHW

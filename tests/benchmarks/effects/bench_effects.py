@@ -68,14 +68,12 @@ def _bounds(cases: Mapping[int, Case], what: str) -> list[Row]:
         for trial in trials(case, (1, 2 + number % (MOST_BINNING - 1))):
             found[trial.effect, trial.variant].append((number, trial))
     spent = time.process_time() - began
-    kept = [_of_effect(*key, tried, what) for key, tried in found.items()]
     broken = sum(trial.is_broken for tried in found.values() for _, trial in tried)
-    count = sum(map(len, found.values()))
     return [
-        *kept,
+        *(_of_effect(*key, tried, what) for key, tried in found.items()),
         Row(
             f"bounds over {len(cases)} {what}, each as samples and in sums of 2 to {MOST_BINNING}",
-            f"{broken} of {count} broken",
+            f"{broken} of {sum(map(len, found.values()))} broken",
             "0",
             broken == 0,
             f"{spent:.0f} s of processor time",
@@ -104,8 +102,9 @@ def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]], what: st
 def _of_rig(scene: RasterScene, name: str, rig: Rig) -> list[Row]:
     sweeps = tuple(Sweep(f"strip {swath:g}", "fine", "x", swath, -512.0, 1024) for swath in (-320.0, 320.0))
     clock = time.process_time()
+    probe = probe_scene(scene, rig, sweeps)
     probed = time.process_time() - clock
-    decision = decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE)
+    decision = decide(probe, rig, EFFECTS, TOLERANCE)
     decided = time.process_time() - clock - probed
     white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     told = {"fwhm_nm": scene.fwhm_nm, "white_e": white}

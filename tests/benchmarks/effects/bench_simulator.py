@@ -47,12 +47,11 @@ class Survey:
 
     def blocks(self) -> list[SweepBlock]:
         """Return blocks of lines in the middle of one half of an outer sweep."""
+        scene = self.scene
         exposures = self.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
-        white = self.scene.white_reference_electrons.astype(np.float64) * exposures
+        white = scene.white_reference_electrons.astype(np.float64) * exposures
         first = SIZE // 4 - LINES // 2
-        whole = SweepBlock(
-            self.rig, self.sweeps[0], range(SIZE), self.scene.wavelength_nm, self.scene.shape, white_e=white
-        )
+        whole = SweepBlock(self.rig, self.sweeps[0], range(SIZE), scene.wavelength_nm, scene.shape, white_e=white)
         return [replace(whole, lines=range(at, at + AT_ONCE)) for at in range(first, first + LINES, AT_ONCE)]
 
     @property

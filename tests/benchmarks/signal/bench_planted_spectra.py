@@ -44,6 +44,7 @@ LIMITS = 24  # signatures by which the filter's threshold is set
 FARM = ("--scene", "farm", "--seed", "11", "--size", "512x384", "--seconds", "12")
 
 Values = NDArray[np.float32]
+Numbers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -166,15 +167,12 @@ def _trial(
     return np.array(found), np.array(kept), np.array(marked), error
 
 
-def _places(
-    ratio: Values, shape: tuple[int, int], rng: np.random.Generator
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _places(ratio: Values, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Numbers, Numbers]:
     """Return lines and samples (place, px) of shapes that do not touch and lie on usable spectra."""
     top, left = rng.integers(0, APART - max(shape), 2)
     down = np.arange(top, ratio.shape[0] - shape[0], APART)
     across = np.arange(left, ratio.shape[1] - shape[1], APART)
     first = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 1, 2)
     line, sample = np.moveaxis(first + np.array(list(np.ndindex(shape))), -1, 0)
-    usable = np.isfinite(ratio[line, sample]).all(axis=1)
-    order = rng.permutation(np.flatnonzero(usable))
+    order = rng.permutation(np.flatnonzero(np.isfinite(ratio[line, sample]).all(axis=1)))
     return line[order], sample[order]

@@ -15,23 +15,7 @@ from numpy.typing import NDArray
 import models.reading.prior_map as prior_map
 from models.network.sizes import CELL_PX, TemporalSizes
 from models.network.temporal_reader import TemporalReader
-from models.reading.prior_map import (
-    FAINTEST,
-    ClassProbabilities,
-    CurrentVisit,
-    PriorMap,
-    TemporalAgreement,
-    as_captured,
-    carried,
-    changed_fractions,
-    changed_from,
-    compare,
-    faded,
-    first_probabilities,
-    fuse,
-    in_classes,
-    pooled,
-)
+from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, carried, first_probabilities, fuse
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
 CLASSES, COLUMNS = 3, 4
@@ -92,10 +76,10 @@ def test_fused_probabilities_sum_to_1(reader: TemporalReader | None, seed: int) 
     """Only raising the faintest classes to the stored minimum adds to the sum."""
     rng = np.random.default_rng(seed)
     after = fuse(a_prior_map(rng), an_observation(rng), reader)
-    assert after.log_probability.min() >= np.float32(FAINTEST)
+    assert after.log_probability.min() >= np.float32(prior_map.FAINTEST)
     total = np.exp(after.log_probability.astype(np.float64)).sum(axis=-1)
     assert total.min() > 1 - 1e-5
-    assert total.max() < 1 + CLASSES * math.exp(FAINTEST) + 1e-5
+    assert total.max() < 1 + CLASSES * math.exp(prior_map.FAINTEST) + 1e-5
 
 
 @READERS
@@ -149,7 +133,7 @@ def test_unknown_pixels_take_the_other_source(reader: TemporalReader | None) -> 
         replace(coarse_pass, log_probability=today),
         reader,
     )
-    np.testing.assert_array_equal(after.log_probability[:4], np.maximum(today[:4], np.float32(FAINTEST)))
+    np.testing.assert_array_equal(after.log_probability[:4], np.maximum(today[:4], np.float32(prior_map.FAINTEST)))
     assert np.isnan(after.log_probability[4:8]).all()
     assert np.isnan(after.age_days[4:8]).all()
     assert np.isfinite(after.log_probability[8:]).all()
@@ -169,8 +153,10 @@ def test_a_confident_visit_overrules_the_prior_map() -> None:
 def test_a_prior_map_fades_to_equal_probabilities() -> None:
     """After many years all classes are equally likely; after 0 days nothing has faded."""
     told = log_probabilities(np.random.default_rng(1))
-    np.testing.assert_allclose(faded(told, np.full(SHAPE, 1e5, np.float32)), -math.log(CLASSES), atol=1e-6)
-    np.testing.assert_allclose(faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, FAINTEST), atol=1e-5)
+    np.testing.assert_allclose(prior_map.faded(told, np.full(SHAPE, 1e5, np.float32)), -math.log(CLASSES), atol=1e-6)
+    np.testing.assert_allclose(
+        prior_map.faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, prior_map.FAINTEST), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("shape", [(80, 36), (33, 21), (7, 5)])
@@ -188,7 +174,7 @@ def test_pooled_columns_are_means_of_known_pixels() -> None:
     columns = np.arange(30, dtype=np.float32).reshape(3, 5, 2)
     columns[0, 1], columns[1, 2, 0], columns[:2, 2:4, 1] = np.nan, np.inf, np.nan
     expected = [[[22 / 3, 25 / 3], [26 / 3, math.nan], [13, 14]], [[21, 22], [25, 26], [28, 29]]]
-    np.testing.assert_allclose(pooled(columns), np.array(expected, np.float32), rtol=1e-6)
+    np.testing.assert_allclose(prior_map.pooled(columns), np.array(expected, np.float32), rtol=1e-6)
 
 
 def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
@@ -211,7 +197,7 @@ def test_an_untrained_reader_weighs_both_sources_by_its_gates() -> None:
     product, replaced = old ** (1 / (1 + math.exp(-2.2))) * new**0.5, 1 / (1 + math.e)
     expected = (1 - replaced) * old + replaced * product / product.sum(axis=-1, keepdims=True)
     found = fuse(memory, coarse_pass, TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()).log_probability
-    np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)
+    np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(prior_map.FAINTEST)), atol=1e-5)
 
 
 @given(seed=seeds, order=st.permutations(range(CLASSES)))
@@ -219,18 +205,18 @@ def test_reordering_classes_and_back_changes_nothing(seed: int, order: list[int]
     """Probabilities move with their classes, and NaN stays."""
     told = log_probabilities(np.random.default_rng(seed))
     told[0, 0] = np.nan
-    there = in_classes(told, order)
+    there = prior_map.in_classes(told, order)
     np.testing.assert_allclose(there[1:], told[1:][..., order], atol=1e-6)
-    np.testing.assert_allclose(in_classes(there, np.argsort(order).tolist()), told, atol=1e-5)
+    np.testing.assert_allclose(prior_map.in_classes(there, np.argsort(order).tolist()), told, atol=1e-5)
     assert np.isnan(there[0, 0]).all()
 
 
 def test_a_removed_class_leaves_the_others_uncertain() -> None:
     """A removed class of 0.998 does not make another certain; with none removed, a new class starts uniform."""
     before = np.log(np.array([[[0.001, 0.001, 0.998]]], np.float32))
-    np.testing.assert_allclose(np.exp(in_classes(before, (0, 1, -1)))[0, 0], [0.25, 0.25, 0.5], atol=1e-3)
-    np.testing.assert_allclose(np.exp(in_classes(before, (0, 1)))[0, 0], [0.5, 0.5], atol=1e-6)
-    np.testing.assert_allclose(np.exp(in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
+    np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (0, 1, -1)))[0, 0], [0.25, 0.25, 0.5], atol=1e-3)
+    np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (0, 1)))[0, 0], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
 
 
 def test_another_field_is_detected_by_its_agreement() -> None:
@@ -239,11 +225,11 @@ def test_another_field_is_detected_by_its_agreement() -> None:
     memory = a_prior_map(rng)
     same = CurrentVisit(memory.probabilities.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
     whole = np.s_[:, :]
-    found = compare(memory, same, memory.probabilities, whole)
+    found = prior_map.compare(memory, same, memory.probabilities, whole)
     assert found.agreement == 1.0
     assert not found.is_of_another_field
-    assert compare(memory, an_observation(rng), memory.probabilities, whole).is_of_another_field
-    unseen = compare(memory, replace(same, seen=np.zeros(SHAPE, np.bool_)), memory.probabilities, whole)
+    assert prior_map.compare(memory, an_observation(rng), memory.probabilities, whole).is_of_another_field
+    unseen = prior_map.compare(memory, replace(same, seen=np.zeros(SHAPE, np.bool_)), memory.probabilities, whole)
     assert math.isnan(unseen.agreement)
     assert not unseen.is_of_another_field
 
@@ -253,7 +239,7 @@ def test_a_field_of_one_class_is_not_another_field() -> None:
     told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
     coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((12, 10, COLUMNS), np.float32), 1.0, 1)
     memory = PriorMap(first_probabilities(coarse_pass), None, 1.0)
-    assert not compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
+    assert not prior_map.compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
 
 
 def sure_of(classes: NDArray[np.integer], how: float) -> CurrentVisit:
@@ -272,14 +258,14 @@ def test_a_harvest_overnight_is_detected() -> None:
     memory = PriorMap(first_probabilities(before), before.coarse, 1.0)
     after = fuse(memory, today, None)
     assert not after.classes()[0].any()
-    found = compare(memory, today, after, np.s_[:, :])
+    found = prior_map.compare(memory, today, after, np.s_[:, :])
     assert not found.is_of_another_field  # soil between the rows did not change
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
-    fractions = changed_fractions(changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5))
+    fractions = prior_map.changed_fractions(prior_map.changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5))
     np.testing.assert_array_equal(fractions, np.float32(0.4))
 
 
-def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], noise: float) -> TemporalAgreement:
+def two_maps(seed: int, truth: tuple[NDArray[np.int64], ...], noise: float) -> prior_map.TemporalAgreement:
     """Compare maps of two days whose confidences are right: each class's own signal plus noise, and Bayes."""
     rng = np.random.default_rng(seed)
     size = 3
@@ -293,7 +279,7 @@ def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], nois
     nothing = np.zeros((2, *truth[0].shape), np.float32)
     today = CurrentVisit(now, np.ones(truth[0].shape, np.bool_), np.zeros((1, 1, 1), np.float32), 1.0, 1)
     memory = PriorMap(ClassProbabilities(before, *nothing), None, 1.0)
-    return compare(memory, today, ClassProbabilities(now, *nothing), np.s_[:, :])
+    return prior_map.compare(memory, today, ClassProbabilities(now, *nothing), np.s_[:, :])
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.45, 0.6])
@@ -324,7 +310,7 @@ def test_a_field_under_snow_counts_as_another_field() -> None:
     rows = np.arange(SHAPE[1]) % 5 < 2
     before, snow = sure_of(np.broadcast_to(rows, SHAPE), 0.99), sure_of(np.full(SHAPE, 2), 0.9)
     memory = PriorMap(first_probabilities(before), before.coarse, 1.0)
-    found = compare(memory, snow, fuse(memory, snow, None), np.s_[:, :])
+    found = prior_map.compare(memory, snow, fuse(memory, snow, None), np.s_[:, :])
     assert found.agreement == 0
     assert found.is_of_another_field
 
@@ -336,9 +322,9 @@ def test_changed_fraction_counts_confident_pixels_only() -> None:
     now = before.copy()
     now[0, :8], now[0, 8:] = other, unsure
     memory = PriorMap(ClassProbabilities(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
-    old = changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
+    old = prior_map.changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
     np.testing.assert_array_equal(old, np.where(now.argmax(axis=-1) == 1, np.where(np.arange(16) < 8, 0, 255), 255))
-    np.testing.assert_array_equal(changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
+    np.testing.assert_array_equal(prior_map.changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
 
 
 def test_only_captured_pixels_change() -> None:
@@ -347,12 +333,12 @@ def test_only_captured_pixels_change() -> None:
     before, after = (ClassProbabilities(one.astype(np.float32), *np.zeros((2, *SHAPE), np.float32)) for one in told)
     seen = np.random.default_rng(3).random(SHAPE) < 0.5
     aged = replace(after, age_days=np.where(seen, 0, 7).astype(np.float32))
-    np.testing.assert_array_equal(changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
+    np.testing.assert_array_equal(prior_map.changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
 
 
 def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
     """A field of 20 x 20 px that changed everywhere has a changed fraction of 1 in all four patches of 16 px."""
-    assert (changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
+    assert (prior_map.changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
 
 
 @READERS
@@ -365,7 +351,7 @@ def test_visits_elsewhere_do_not_change_a_pixel(reader: TemporalReader | None, s
     for _ in range(visits):
         part = PriorMap(probabilities, None, 28.0 / visits)
         shown = carried(part, reader)
-        probabilities = as_captured(part, shown)
+        probabilities = prior_map.as_captured(part, shown)
     np.testing.assert_allclose(shown.log_probability, once.log_probability, atol=1e-3)
     np.testing.assert_allclose(shown.age_days, once.age_days, rtol=1e-5)
 

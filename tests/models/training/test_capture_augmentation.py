@@ -18,8 +18,7 @@ from models.training.capture_augmentation import CaptureAugmentation, ColumnNois
 from pipeline.geometry.camera import LineCamera, expose
 
 BANDS = np.linspace(400.0, 1000.0, 60)
-BASIS = SpectralBasis(400.0, 1000.0, 12)
-MATRIX, _ = BASIS.matrix(BANDS)
+MATRIX, _ = SpectralBasis(400.0, 1000.0, 12).matrix(BANDS)
 WHITE_REFERENCE_E = np.linspace(9000.0, 16000.0, 60)  # of a white reference of 1 at the reference exposure
 
 
@@ -216,9 +215,8 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
     spectra, noise = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
     sigma = np.sqrt(np.sum(noise.spectra.noise(light), axis=0))
     axes = np.linalg.eigh(noise.spectra.covariance / np.outer(sigma, sigma))[1][:, ::-1][:, :4]
-    more = sigma * np.sqrt(
-        1 - np.sum(noise.spectra.noise(1.0), axis=0) / sigma**2
-    )  # the crop has noise of the reference
+    reference = np.sum(noise.spectra.noise(1.0), axis=0)  # the crop has this noise already
+    more = np.sqrt(sigma**2 - reference)
     noisy = spectra + more * rng.normal(size=spectra.shape)
     surveyed = 0.3 + (np.rint((noisy - 0.3) / sigma @ axes) @ axes.T) * sigma
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))

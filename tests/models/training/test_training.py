@@ -16,16 +16,7 @@ from models.training import train as training
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
-from models.training.train import (
-    LabelledPixels,
-    Progress,
-    TrainingSettings,
-    halfway,
-    linear_discriminants,
-    rate_at,
-    train,
-    with_discriminants,
-)
+from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import block_example, make_weights
@@ -96,7 +87,7 @@ def test_training_stops_at_its_time_limit(monkeypatch: pytest.MonkeyPatch):
     """The summary counts the steps that were taken."""
     clock = iter(range(0, 10_000, 30))
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
-    seen: list[Progress] = []
+    seen: list[training.Progress] = []
     _, summary = train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
     assert len(seen) == summary["steps"] == 3
     assert seen[-1].done == pytest.approx(0.8)
@@ -114,8 +105,8 @@ def test_an_infinite_gradient_is_no_step():
 
 def test_learning_rate_warms_up_and_falls():
     """The rate rises from 5 % to 100 % over the first twentieth, then falls to 1 %."""
-    assert [rate_at(done) for done in (0.0, 0.025, 0.05, 1.0)] == pytest.approx([0.05, 0.525, 1.0, 0.01])
-    falling = [rate_at(done) for done in np.linspace(0.05, 1, 50)]
+    assert [training.rate_at(done) for done in (0.0, 0.025, 0.05, 1.0)] == pytest.approx([0.05, 0.525, 1.0, 0.01])
+    falling = [training.rate_at(done) for done in np.linspace(0.05, 1, 50)]
     assert falling == sorted(falling, reverse=True)
 
 
@@ -234,7 +225,7 @@ def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
     start = {f"spectral.{name}": torch.randn_like(tensor) for name, tensor in own.spectral.named_parameters()}
     flat = torch.randn(1, 4 + PLANES, 1, 1)
     given = flat.expand(-1, -1, 32, 32), torch.randn(1, 4 + PLANES, 32, 32), torch.arange(16)[None]
-    nets = [with_discriminants(own, start, share) for share in (fraction, 0.0)]
+    nets = [training.with_discriminants(own, start, share) for share in (fraction, 0.0)]
     mixed, alone, whole = (net(*given, torch.zeros(1, 2)) for net in (*nets, own))
     for found, plain, full in zip(mixed, alone, whole, strict=True):
         torch.testing.assert_close(found, fraction * full + (1 - fraction) * plain, rtol=1e-4, atol=1e-3)
@@ -246,6 +237,8 @@ def test_halfway_network_has_the_mean_of_each_weight() -> None:
     """Both networks themselves stay as they are."""
     one, other = (Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2)) for _ in range(2))
     before = [parameter.clone() for parameter in (*one.parameters(), *other.parameters())]
-    for middle, first, second in zip(*(net.parameters() for net in (halfway(one, other), one, other)), strict=True):
+    for middle, first, second in zip(
+        *(net.parameters() for net in (training.halfway(one, other), one, other)), strict=True
+    ):
         torch.testing.assert_close(middle, (first + second) / 2)
     assert all(map(torch.equal, before, (*one.parameters(), *other.parameters())))

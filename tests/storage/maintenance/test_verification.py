@@ -16,8 +16,6 @@ from storage.arrays.layout import create_group, open_group, read_array, write_im
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
-FLIPS = 30
-
 
 def _with_cube(archive: Archive) -> StageRef:
     """Make a store with a cube of (130, 700, 3): shards of 64 rows and 640 columns, chunks of 32 x 32."""
@@ -45,7 +43,7 @@ def test_verify_finds_flipped_bits_in_any_file(tmp_path: Path, archive: Archive)
     _with_cube(archive)
     files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file() and path.suffix != ".lock"]
     chance = random.Random(4)
-    for number in range(FLIPS):
+    for number in range(30):
         weights = [path.stat().st_size if number % 2 else 1 for path in files]
         (path,) = chance.choices(files, weights)
         at, bit = chance.randrange(path.stat().st_size), chance.randrange(8)

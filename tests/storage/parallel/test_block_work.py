@@ -22,7 +22,6 @@ from storage.parallel import pool as pool_module
 from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
-PROCESSES = WorkerPool("processes", 2)
 # dask does not close its handshake with a worker that dies
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 
@@ -62,7 +61,7 @@ def threads_here(number: int) -> tuple[int, str | None]:
 @pytest.fixture(scope="module")
 def processes() -> Iterator[WorkerPool]:
     """Yield two worker processes for all tests of this module."""
-    with PROCESSES.open() as pool:
+    with WorkerPool("processes", 2).open() as pool:
         yield pool
 
 
@@ -266,12 +265,10 @@ def nap(number: int) -> int:
 def test_a_lost_scheduler_raises_one_error(tmp_path: Path) -> None:
     """There is one message and no traceback of dask; a restarted scheduler serves the pool again."""
     with socket.create_server(("127.0.0.1", 0)) as free:
-        place = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    with run_script(tmp_path, GONE, place) as started:
+        at = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    with run_script(tmp_path, GONE, at) as started:
         printed, said = started.communicate(timeout=60)
-    gone = (
-        f"--scheduler {place}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
-    )
+    gone = f"--scheduler {at}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
     assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 
 

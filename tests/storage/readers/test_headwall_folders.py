@@ -15,6 +15,7 @@ from pipeline.rig.camera.camera_texts import times_of_lines
 from storage.readers.envi_files import load_frame_index
 from storage.readers.open_cubes import open_cube
 
+DROPPED = "1 frames between the first and the last were dropped by the camera"
 NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
 
 
@@ -166,25 +167,13 @@ def test_an_empty_frame_index_is_refused(tmp_path: Path, text: str) -> None:
             [2000, 2001, -1, 2003, -1],
             ("the frame index has the time of 3 of 5 lines", "the frame index lists 1 frames beyond the lines"),
         ),
-        (
-            # as many frames as lines: they are the lines, whatever their numbers
-            {0: 10, 1: 20, 3: 40},
-            (0, 3),
-            0,
-            [0, 1, 3],
-            ("1 frames between the first and the last were dropped by the camera",),
-        ),
+        # as many frames as lines: they are the lines, whatever their numbers
+        ({0: 10, 1: 20, 3: 40}, (0, 3), 0, [0, 1, 3], (DROPPED,)),
         # the index of a later part may count from the part's own start
         ({0: 10, 1: 20}, (2000, 3), 0, [2000, 2001, -1], ("the frame index has the time of 2 of 3 lines",)),
         ({0: 10, 1: 20, 2: 30}, (2000, 3), 0, [2000, 2001, 2002], ()),
         # a file that lost its last line still has its lines in order, also with dropped frames
-        (
-            {0: 10, 1: 20, 3: 40, 4: 50},
-            (0, 3),
-            1,
-            [0, 1, 3],
-            ("1 frames between the first and the last were dropped by the camera",),
-        ),
+        ({0: 10, 1: 20, 3: 40, 4: 50}, (0, 3), 1, [0, 1, 3], (DROPPED,)),
     ],
 )
 def test_lines_have_the_times_of_their_frames(

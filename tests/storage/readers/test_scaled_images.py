@@ -15,13 +15,12 @@ from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
-RNG = np.random.default_rng(9)
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 
 
 def test_jpeg_2000_is_read(tmp_path: Path) -> None:
     """Numbers are read as written, whole and by lines; wavelengths have to be stated."""
-    values = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16)
+    values = np.random.default_rng(9).integers(1, 60_000, (3, 70, 50)).astype(np.uint16)
     path = tmp_path / "a.jp2"
     place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
     with rasterio.open(path, "w", "JP2OpenJPEG", 50, 70, 3, dtype="uint16", **place, **REVERSIBLE) as file:
