@@ -23,16 +23,21 @@ from models.weights.files import load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 
-FIELDS, LOSS, DARK = 16, 0.003, 0.1  # fields, mean loss of mIoU, short exposure as a fraction of the reference
+FIELDS = 16
+LOSS = 0.003  # mean loss of mIoU
+DARK = 0.1  # short exposure as a fraction of the reference
 THRESHOLDS = 400
 
 
 def fields() -> list[ReadTwice]:
     """Read each field by the overview and in full, in both exposures."""
-    weights, camera, examples = load_weights(shipped_weights()), LineCamera(), list[Example]()
+    weights = load_weights(shipped_weights())
+    camera = LineCamera()
+    examples: list[Example] = []
     augmentation = training_capture(weights.normalisation, 3.0)
     assert augmentation is not None
-    data, grid = farm_test_data(FIELDS, camera, "farm,scouting"), SceneGrid(*FARM_SHAPE, weights.config.patch)
+    data = farm_test_data(FIELDS, camera, "farm,scouting")
+    grid = SceneGrid(*FARM_SHAPE, weights.config.patch)
     for number, name in enumerate(data.train):
         rng = np.random.default_rng([number, 0xC0])
         seen = observe_scene(data.scene(name), camera, grid, weights.basis, rng)
@@ -54,14 +59,14 @@ def losses(scenes: list[ReadTwice], policy: str, least: float) -> tuple[float, l
 
 def rows() -> list[Row]:
     """Return a row for each policy, with the loss of each field."""
-    scenes, found = fields(), list[Row]()
+    scenes = fields()
+    found: list[Row] = []
     for policy in COMPARED:
         every = np.concatenate([scene.scores[policy].ravel() for scene in scenes])
         thresholds = np.quantile(every, np.linspace(1, 0, THRESHOLDS))
         share, lost = next(one for least in thresholds if np.mean((one := losses(scenes, policy, least))[1]) <= LOSS)
-        figure = f"{share:.1%} of the patches"
         spread = f"loss of a field {100 * np.std(lost):.2f} rms of the mean, most {100 * max(lost):.2f}"
-        found.append(Row(f"{policy}, mean loss {100 * LOSS:g} points", figure, peers=spread))
+        found.append(Row(f"{policy}, mean loss {100 * LOSS:g} points", f"{share:.1%} of the patches", peers=spread))
     return found
 
 

@@ -31,25 +31,35 @@ from models.weights.files import MAP_SCORES, add_ood, describe_weights, load_ood
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 
-SCENES, SEED, DARKEST_MS, GOAL = 32, 4, 3.0, 0.85
+SCENES = 32
+SEED = 4
+DARKEST_MS = 3.0
+GOAL = 0.85
 SCANS = [(step, light * REFERENCE_MS) for step in STEPS for light in SCAN_EXPOSURES]
 LIKELIEST = (-3.92, 1.32, 0.89, 0.48, 0.87)  # numbers of `PRESENT` by the likelihood of presence: the start of the fit
-HUBER, HELD, OF_EIGHT = 3.0, 0.02, 0.3  # limit of linear errors [points]; weight of the start, and of lines 8 px apart
+HUBER = 3.0  # limit of linear errors [points]
+HELD = 0.02  # weight of the start
+OF_EIGHT = 0.3  # weight of lines 8 px apart
 Scans = dict[tuple[int, float], ScoredMap]
 
 
 @cache
 def scenes() -> dict[str, Scans]:
     """Segment every scan of every scene."""
-    weights, camera, found = load_weights(shipped_weights()), LineCamera(), dict[str, Scans]()
-    augmentation, reached = training_capture(weights.normalisation, DARKEST_MS), np.ones(weights.basis.columns, bool)
+    weights = load_weights(shipped_weights())
+    camera = LineCamera()
+    found: dict[str, Scans] = {}
+    augmentation = training_capture(weights.normalisation, DARKEST_MS)
+    reached = np.ones(weights.basis.columns, bool)
     assert augmentation is not None
     data = open_training_data("farm@2,scouting@1", SCENES, 2, camera)
     for number, name in enumerate(data.validation):
-        scene, of_kind, kind = data.scene(name), *divmod(number, SCENES // 2)[::-1]
+        scene = data.scene(name)
+        kind, of_kind = divmod(number, SCENES // 2)
         rng = np.random.default_rng([SEED, 0x0B6, of_kind + 1000 * kind])
         seen = observe_scene(scene, camera, SceneGrid(*scene.shape, weights.config.patch), weights.basis, rng)
-        example, found[name] = normalised(seen, weights.normalisation, reached), {}
+        example = normalised(seen, weights.normalisation, reached)
+        found[name] = {}
         for place, (step, exposure_ms) in enumerate(SCANS):
             noise = np.random.default_rng([SEED, 0x5CA, *divmod(place, len(SCAN_EXPOSURES)), of_kind])
             light = exposure_ms / REFERENCE_MS
@@ -75,7 +85,8 @@ def rows() -> list[Row]:
     found = []
     for kind, pairs in off.items():
         error, deviation = np.transpose(pairs)
-        rms, held = float(np.sqrt(np.mean(error**2))), np.mean(np.abs(error) <= 1.645 * deviation)
+        rms = float(np.sqrt(np.mean(error**2)))
+        held = np.mean(np.abs(error) <= 1.645 * deviation)
         figure = f"{rms:.2f} points rms, {error.mean():+.2f} in the mean, {held:.0%} within 90 %"
         found.append(Row(f"{len(pairs)} maps of {kind}, left out in turn", figure, f"<= {GOAL:g} rms", rms <= GOAL))
     return found
@@ -91,20 +102,16 @@ def present() -> tuple[float, ...]:
     }
 
     def loss(numbers: np.ndarray) -> float:
+        off = []
         with mock.patch.object(expected_scores, "PRESENT", tuple(numbers)):
-            off = [
-                (
-                    100 * (expected_score(one.expected, bias[name, scan], 0.0, *scan).miou - mean_iou(one.counts)),
-                    scan[0],
-                )
-                for name, maps in scenes().items()
-                for scan, one in maps.items()
-            ]
+            for name, maps in scenes().items():
+                for scan, one in maps.items():
+                    told = expected_score(one.expected, bias[name, scan], 0.0, *scan)
+                    off.append((100 * (told.miou - mean_iou(one.counts)), scan[0]))
         error, step = np.transpose(off)
         weight = np.where(step == 8, OF_EIGHT, 1.0)
-        return float(
-            (2 * scipy.special.huber(HUBER, error) * weight).mean() + HELD * np.sum((numbers - LIKELIEST) ** 2)
-        )
+        held = HELD * np.sum((numbers - LIKELIEST) ** 2)
+        return float((2 * scipy.special.huber(HUBER, error) * weight).mean() + held)
 
     return tuple(scipy.optimize.minimize(loss, LIKELIEST, method="Nelder-Mead").x.round(2).tolist())
 

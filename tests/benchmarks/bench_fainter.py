@@ -17,7 +17,9 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.reading.inference import FAINTER
 
-SEEDS, SECONDS, FACTORS = (51, 52, 53, 0, 41, 42, 43), (8, 12, 16, 25), (1.0, FAINTER, 1.8)
+SEEDS = (51, 52, 53, 0, 41, 42, 43)
+SECONDS = (8, 12, 16, 25)
+FACTORS = (1.0, FAINTER, 1.8)
 
 
 def scores(seed: int, seconds: float) -> list[float]:

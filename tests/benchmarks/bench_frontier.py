@@ -39,8 +39,10 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 
-SHAPE, SEEDS = (512, 640), (1, 2, 3)
-CAMERA, COST = LineCamera(), CostModel()
+SHAPE = (512, 640)
+SEEDS = (1, 2, 3)
+CAMERA = LineCamera()
+COST = CostModel()
 STEPS = (1, 2, 4)
 EXPOSURES_MS = (100.0, 70.0, 50.0, 35.0, 25.0, 17.0, 14.0, 12.0, 10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 FEWER_MS = (100.0, 25.0, 10.0, 6.0, 3.0)  # of scouting fields
@@ -48,7 +50,9 @@ SECONDS = (3.5, 5.0, 8.0, 15.0, 28.0)  # of surveys that choose their scan
 SLACK = 0.3  # points of mIoU that such a survey may be below the best uniform scan
 LARGE = {107.0: 95.2, 56.0: 95.0, 29.0: 94.3, 20.5: 93.3, 14.0: 91.5, 10.0: 89.0, 8.0: 85.0}  # goals for 1280 x 1024 px
 BANDS = 270
-RMS, WITHIN, HELD = 0.85, 1.645, 0.9  # goals of the expected mIoU; 90 % are within so many standard errors
+RMS = 0.85  # goal of the expected mIoU [points]
+WITHIN = 1.645  # standard errors, within which 90 % are
+HELD = 0.9  # goal of the fraction within them
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,6 @@ def rows() -> list[Row]:
         for exposure_ms in EXPOSURES_MS
     }
     found = [(_seconds(one), Row(name, _figure(one))) for name, one in plain.items()]
-
     for seconds in SECONDS:
         scan = chosen_scan(SHAPE, seconds)
         judged = [_plain(seed, scan.step, scan.exposure_ms) for seed in SEEDS]
@@ -112,8 +115,7 @@ def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weigh
         judged = [
             map_of(farm_scene(seed, shape, camera=CAMERA), seed, scan.step, scan.exposure_ms, weights) for seed in SEEDS
         ]
-        met = _mean(judged) >= goal
-        yield Row(f"--seconds {seconds:g}: {_promise(scan)}", _figure(judged), f">= {goal}", met)
+        yield Row(f"--seconds {seconds:g}: {_promise(scan)}", _figure(judged), f">= {goal}", _mean(judged) >= goal)
 
 
 @cache
@@ -129,8 +131,7 @@ def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None 
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     record = ScanPerformance.read(weights.record["scans"])
     sweeps = {step: uniform_sweeps(grid, CAMERA, along, step=step) for step in record.steps}
-    scans = uniform_scans(record, sweeps, CAMERA, COST, BANDS, seconds=seconds)
-    return choose_scan(scans, seconds)
+    return choose_scan(uniform_scans(record, sweeps, CAMERA, COST, BANDS, seconds=seconds), seconds)
 
 
 def _promise(scan: UniformScan) -> str:
@@ -169,19 +170,21 @@ def scanned(
     scene: RasterScene, weights: Weights, seed: int, step: int, exposure_ms: float
 ) -> tuple[PlannedPass, DrawnMap]:
     """Scan a scene uniformly; return the pass and its map with every patch read in full."""
-    grid, rig = SceneGrid(*scene.shape, weights.config.patch), Rig(CAMERA)
+    grid = SceneGrid(*scene.shape, weights.config.patch)
+    rig = Rig(CAMERA)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = uniform_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
     scan_pass = uniform_pass(weights, source, sweeps, grid, COST, LineSpec(exposure_ms / CAMERA.exposure_ms, step))
-    coarse, index = scan_pass.coarse, scan_pass.patch_index
-    return scan_pass, segment(weights, coarse, coarse.patches(index), index, every_class=True)
+    index = scan_pass.patch_index
+    return scan_pass, segment(weights, scan_pass.coarse, scan_pass.coarse.patches(index), index, every_class=True)
 
 
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
     """Return the results of a uniform scan; the expected mIoU is known only for the shipped weights."""
-    others, weights = weights is not None, weights or shipped()
+    others = weights is not None
+    weights = weights or shipped()
     scan_pass, drawn = scanned(scene, weights, seed, step, exposure_ms)
     assert scene.labels is not None
     judged = 100 * mean_iou(confusion(scene.labels, drawn.classes, weights.config.classes))

@@ -10,14 +10,8 @@ from measure import Row, Timing, ns_of, ratio, time_in_turn
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pipeline.geometry import mirror
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
-    direction_to_position,
-    direction_to_scene,
-    position_to_normal,
-    reflect,
-    scene_to_direction,
-)
 from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.placed import TieTable, tie_table
@@ -25,7 +19,8 @@ from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from tests.pipeline.geometry.paper_equations import line_rotation
 
 CAMERA = LineCamera()
-SWATH, LINES = 2450.0, 640
+SWATH = 2450.0
+LINES = 640
 GRID: dict[str, Any] = {"origin_px": (90.0, SWATH - 300), "spacing_px": 1.0, "shape": (430, 600)}
 PIXELS = 430 * 600
 TILE_ROWS = 64
@@ -36,18 +31,16 @@ Floats = NDArray[np.float64]
 def rows() -> list[Row]:
     """Return the rows for error and time of the tie points."""
     tangents = np.stack(np.broadcast_arrays(SWATH, np.arange(float(LINES))), axis=-1) * CAMERA.ifov_rad
-    (scan_path,) = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA, step_px=1.0)
+    position = mirror.direction_to_position(mirror.scene_to_direction(tangents))
+    (scan_path,) = make_scan_paths(position, CAMERA, step_px=1.0)
     truth = _by_reflected_rays(path_geolocation(scan_path, CAMERA, _pixels(), along="x"))
     clocks = time_in_turn(_calls(scan_path), rounds=5)
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
     return [_error(table, truth), *_against_tree(scan_path, table, truth, clocks)]
 
 
-def _pixels(**grid: Any) -> Floats:
-    grid = GRID | grid
-    y, x = (
-        start + grid["spacing_px"] * np.arange(n) for start, n in zip(grid["origin_px"], grid["shape"], strict=True)
-    )
+def _pixels() -> Floats:
+    y, x = (at + GRID["spacing_px"] * np.arange(n) for at, n in zip(GRID["origin_px"], GRID["shape"], strict=True))
     return np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
 
 
@@ -58,7 +51,8 @@ def _samples() -> Floats:
 
 
 def _calls(scan_path: ScanPath) -> dict[str, Callable[[], object]]:
-    samples, pixels = _samples(), _pixels()
+    samples = _samples()
+    pixels = _pixels()
     tree = cKDTree(samples)
     return {
         "tree": lambda: cKDTree(samples).query(pixels, workers=1),
@@ -79,20 +73,20 @@ def _whole(table: TieTable) -> Floats:
 def _see(at: Floats) -> Floats:
     """Return the points (..., 2) that the camera's rays at knot and sample meet, by mirror, normal and reflection."""
     tangents = np.stack(np.broadcast_arrays(SWATH, at[..., 0]), axis=-1) * CAMERA.ifov_rad
-    normal = position_to_normal(direction_to_position(scene_to_direction(tangents)))
+    normal = mirror.position_to_normal(mirror.direction_to_position(mirror.scene_to_direction(tangents)))
     slope = (at[..., 1] + 0.5 - CAMERA.samples / 2) * CAMERA.ifov_rad
     ray = np.stack([np.zeros_like(slope), slope, np.ones_like(slope)], axis=-1)
-    return direction_to_scene(reflect(ray, normal))[..., ::-1] / CAMERA.ifov_rad
+    return mirror.direction_to_scene(mirror.reflect(ray, normal))[..., ::-1] / CAMERA.ifov_rad
 
 
 def _by_reflected_rays(start: Floats) -> Floats:
     """Return knots and samples whose reflected rays meet the pixels, by Newton steps on the forward model alone."""
-    at, pixels, h = start.copy(), _pixels(), 0.5
+    at = start.copy()
+    pixels = _pixels()
+    h = 0.5
     for _ in range(2):
         miss = _see(at) - pixels
-        by_knot, by_sample = (
-            (_see(at + step) - _see(at - step)) / (2 * h) for step in (np.array([h, 0.0]), np.array([0.0, h]))
-        )
+        by_knot, by_sample = ((_see(at + step) - _see(at - step)) / (2 * h) for step in h * np.eye(2))
         size = by_knot[..., 0] * by_sample[..., 1] - by_knot[..., 1] * by_sample[..., 0]
         at[..., 0] -= (miss[..., 0] * by_sample[..., 1] - miss[..., 1] * by_sample[..., 0]) / size
         at[..., 1] -= (by_knot[..., 0] * miss[..., 1] - by_knot[..., 1] * miss[..., 0]) / size
@@ -107,7 +101,8 @@ def _worst(found: Floats, truth: Floats) -> float:
 
 def _error(table: TieTable, truth: Floats) -> Row:
     off = _worst(_whole(table), truth)
-    turn = np.rad2deg(line_rotation(scene_to_direction(np.array([[SWATH, 0.0], [SWATH, LINES]]) * CAMERA.ifov_rad)))
+    ends = np.array([[SWATH, 0.0], [SWATH, LINES]]) * CAMERA.ifov_rad
+    turn = np.rad2deg(line_rotation(mirror.scene_to_direction(ends)))
     what = f"geolocation grid of {PIXELS} px by ties, lines turned by {turn[0]:.1f}-{turn[1]:.1f} deg: error"
     return Row(what, f"{off:.2g} px (bound {table.bound_px:.2g})", "< 2e-3 px", off < 2e-3 and off <= table.bound_px)
 
@@ -118,7 +113,8 @@ def _against_tree(scan_path: ScanPath, table: TieTable, truth: Floats, clocks: d
     faster, closer = ratio(clocks, "tree", "ties 16"), tree_off / _worst(_whole(table), truth)
     tree, query, ties = (ns_of(clocks[name], PIXELS) for name in ("tree", "query", "ties 16"))
     peer = f"scipy cKDTree, one worker: {tree:.0f} ns/px with building, {query:.0f} without"
-    made, spent = "geolocation grid by ties", f"{ties:.2g} ns/px, 1/{faster:.0f} of the tree"
+    made = "geolocation grid by ties"
+    spent = f"{ties:.2g} ns/px, 1/{faster:.0f} of the tree"
     return [
         Row(f"{made}, made and read: processor time", spent, ">= 10x less", faster >= 10, peer),
         Row(f"{made}: closer than the tree", f"{closer:.0f}x", ">= 100x", closer >= 100, f"{tree_off:.2g} px"),

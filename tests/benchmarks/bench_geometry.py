@@ -6,15 +6,8 @@ import numpy as np
 from measure import Row, time_in_turn
 from numpy.typing import NDArray
 
+from pipeline.geometry import mirror
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
-    direction_to_normal,
-    direction_to_position,
-    direction_to_scene,
-    position_to_direction,
-    position_to_normal,
-    reflect,
-)
 from tests.pipeline.geometry.paper_equations import line_rotation, straight_slope_rotation
 from tests.pipeline.geometry.test_mirror import exact_direction
 from tests.pipeline.geometry.test_paper import paper_position, slope_rotation
@@ -41,9 +34,9 @@ def _angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
 
 def _round_trip(precision: type, goal: float) -> Row:
     position = _disk(COUNT).astype(precision)
-    back = direction_to_position(position_to_direction(position))
+    back = mirror.direction_to_position(mirror.position_to_direction(position))
     # Both ends are scaled by the same factor, as rounding may have put them beyond the rim in float64.
-    ends = [position_to_direction(0.999999 * end.astype(np.float64)) for end in (position, back)]
+    ends = [mirror.position_to_direction(0.999999 * end.astype(np.float64)) for end in (position, back)]
     found = _angle(*ends)
     return Row(
         f"position -> ray -> position, {COUNT} over the disk, {np.dtype(precision).name}",
@@ -56,10 +49,10 @@ def _round_trip(precision: type, goal: float) -> Row:
 
 def _paper_round_trip() -> float:
     """Return the largest angle between the requested direction and that of the paper's position on the device."""
-    asked = position_to_direction(_disk(2000) * 0.95)
-    reached = paper_position(direction_to_normal(asked))
+    asked = mirror.position_to_direction(_disk(2000) * 0.95)
+    reached = paper_position(mirror.direction_to_normal(asked))
     kept = np.hypot(*reached.T) <= 1
-    return _angle(position_to_direction(reached[kept]), asked[kept])
+    return _angle(mirror.position_to_direction(reached[kept]), asked[kept])
 
 
 def _fifty_digits() -> Row:
@@ -68,7 +61,7 @@ def _fifty_digits() -> Row:
     worst = 0.0
     with mpmath.workdps(50):
         for position in _disk(100, seed=1) * (1 - 1e-15):
-            exact, found = exact_direction(position), position_to_direction(position)
+            exact, found = exact_direction(position), mirror.position_to_direction(position)
             worst = max(worst, *(abs(float(e - mpmath.mpf(float(f)))) for e, f in zip(exact, found, strict=True)))
     return Row(
         "ray of 100 random positions against 50 digits, float64", f"{worst:.2g} rad", "< 1e-12 rad", worst < 1e-12
@@ -78,11 +71,12 @@ def _fifty_digits() -> Row:
 def _rotation() -> list[Row]:
     """Compare the line's rotation with finite differences of reflected rays, and with the paper's slope."""
     position = _disk(20_000)
-    psi = line_rotation(position_to_direction(position))
-    ends = reflect(np.array([[[0.0, -1e-5, 1.0]], [[0.0, 1e-5, 1.0]]]), position_to_normal(position)[None])
+    psi = line_rotation(mirror.position_to_direction(position))
+    rays = np.array([[[0.0, -1e-5, 1.0]], [[0.0, 1e-5, 1.0]]])
+    ends = mirror.reflect(rays, mirror.position_to_normal(position)[None])
     moved = np.diff(ends[..., 1:] / ends[..., :1], axis=0)[0]
     off = float(np.abs(np.arctan2(moved[:, 1], moved[:, 0]) - psi).max())
-    xi, eta = direction_to_scene(position_to_direction(position)).T / IFOV
+    xi, eta = mirror.direction_to_scene(mirror.position_to_direction(position)).T / IFOV
     slope = float(np.rad2deg(np.abs(straight_slope_rotation(xi, eta, LineCamera()) - psi)).max())
     noisy_px, noisy_deg = _noise()
     return [
@@ -106,20 +100,22 @@ def _noise() -> tuple[float, float]:
     eta = np.linspace(-640, 640, 1450) * IFOV
     direction = np.stack([np.ones_like(eta), np.full_like(eta, 1000 * IFOV), eta], axis=-1)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    normal = direction_to_normal(direction)
+    normal = mirror.direction_to_normal(direction)
     normal = normal + np.random.default_rng(0).normal(0, 40e-6, normal.shape)
-    noisy = reflect((0.0, 0.0, 1.0), normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+    noisy = mirror.reflect((0.0, 0.0, 1.0), normal / np.linalg.norm(normal, axis=-1, keepdims=True))
     turn = line_rotation(noisy) - line_rotation(direction)
-    slope = slope_rotation(direction_to_position(noisy)) - slope_rotation(direction_to_position(direction))
-    return 320 * float(np.sqrt(np.mean(turn**2))), float(np.rad2deg(np.sqrt(np.mean(slope**2))))
+    slope, exact = (slope_rotation(mirror.direction_to_position(one)) for one in (noisy, direction))
+    return 320 * float(np.sqrt(np.mean(turn**2))), float(np.rad2deg(np.sqrt(np.mean((slope - exact) ** 2))))
 
 
 def _time() -> Row:
     position = _disk(COUNT)
     given = {name: position.astype(name) for name in ("float64", "float32")}
-    calls = {name: lambda one=one: direction_to_position(position_to_direction(one)) for name, one in given.items()}
-    clocks = time_in_turn(calls, rounds=3)
-    spent = {name: 1e9 * clock.cpu_min_s / COUNT for name, clock in clocks.items()}
+    calls = {
+        name: lambda one=one: mirror.direction_to_position(mirror.position_to_direction(one))
+        for name, one in given.items()
+    }
+    spent = {name: 1e9 * clock.cpu_min_s / COUNT for name, clock in time_in_turn(calls, rounds=3).items()}
     return Row(
         "time of position -> ray -> position", f"{spent['float64']:.3g} ns", peers=f"float32: {spent['float32']:.3g} ns"
     )

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
     from pipeline.rig.drivers import RigDevices
 
-PX, MOST_S = 2560, 5.0
+PX = 2560
+MOST_S = 5.0
 
 
 @dataclass
@@ -58,10 +59,9 @@ def measure(px: int) -> Moments:
             **{"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain"},
             **{"controls": False, "rig.white_reference": 0.99, "rig.pulses": "position"},
         }
-        settings = load_settings(None, told)
         moments = Moments()
         stack.enter_context(_watched(moments))
-        _survey(stack, settings, moments)
+        _survey(stack, load_settings(None, told), moments)
         return moments
 
 

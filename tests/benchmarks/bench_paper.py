@@ -95,7 +95,8 @@ def patch_maxima(pixels: Scores, grid: SceneGrid) -> Scores:
 
 def read_scene(weights: Weights, columns: Image, labels: NDArray[np.uint8], grid: SceneGrid, factor: int) -> Readings:
     """Read normalised columns of the padded grid: the overview from coarse pixels, all patches from fine ones."""
-    capture, every = LineSpec(step=factor, binned=factor), grid.every_patch()
+    capture = LineSpec(step=factor, binned=factor)
+    every = grid.every_patch()
     seen = coarse_prediction_of_columns(weights, coarse_image(columns, factor), grid, capture)
     fine = patches_of(columns, grid.patch)[every]
     maps = [segment(weights, seen, fine[:n], every[:n], capture=LineSpec()).classes for n in (0, len(every))]
@@ -153,9 +154,8 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
                 scores = [read.scores(policy, pooling, seed) for seed in draws]
                 cost = 0 if policy in ("random", "ideal") else score_multiply_adds(policy, config, grid)
                 for text, k in rows.items():
-                    spent = multiply_adds(
-                        config, grid, k, len(scene.wavelength_nm), score=cost if 0 < k < every else 0, apart=factor > 1
-                    )
+                    own = cost if 0 < k < every else 0
+                    spent = multiply_adds(config, grid, k, len(scene.wavelength_nm), score=own, apart=factor > 1)
                     row = found.setdefault((factor, label, text), Tally())
                     row.counts.append([read.counts(select_patches(one, k)) for one in scores])
                     row.patches.append(coarse + k)
@@ -173,14 +173,15 @@ def table(data: DataSet, found: Tallies, counts: Sequence[int]) -> str:
     for label in POLICIES:
         for k in (str(k) for k in counts if (INPUTS[0], label, str(k)) in found):
             lines.append(tuple(c for f in INPUTS for c in (f"{label} {k}", *found[f, label, k].cells())))
-    scenes, patch = len(data.scenes), data.weights.config.patch
-    title = f"{data.name}: {scenes} scenes, patches of {patch} x {patch} px"
+    patch = data.weights.config.patch
+    title = f"{data.name}: {len(data.scenes)} scenes, patches of {patch} x {patch} px"
     return "\n".join([title, aligned(lines, (26, 11, 11, 7, 7) * len(INPUTS))])
 
 
 def claims(data: DataSet, found: Tallies) -> list[Row]:
     """Check on each input that 35 % of the patches score at least as much as all of them."""
-    goal, rows = found[1, next(iter(POLICIES)), "all"].figure(mean_iou), []
+    goal = found[1, next(iter(POLICIES)), "all"].figure(mean_iou)
+    rows = []
     for factor in (*INPUTS, 1):
         score = {label: found[factor, label, "35 %"].figure(mean_iou) for label in POLICIES}
         ideal = score.pop("ideal*")

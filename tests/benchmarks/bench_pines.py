@@ -89,7 +89,8 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
 def rows_of_halves() -> list[Row]:
     """Train on one half of each training field and evaluate on the other, in both directions."""
     folder = data_folder("indian_pines")
-    split, found = _open(folder), list[Row]()
+    split = _open(folder)
+    found: list[Row] = []
     half = halves(split.train)
     for one in (0, 1):
         train, test = (np.where(half == part, split.train, UNLABELLED).astype(np.uint8) for part in (one, 1 - one))
@@ -178,14 +179,14 @@ def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
 def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[str, list[Any]]) -> Result:
     from sklearn.model_selection import GridSearchCV
 
-    began, taught = time.process_time(), split.train != UNLABELLED
+    began = time.process_time()
+    taught = split.train != UNLABELLED
     half = halves(split.train)[taught]
     folds = [(np.flatnonzero(half == one), np.flatnonzero(half != one)) for one in (0, 1)]
     search = GridSearchCV(classifier, grid, cv=folds).fit(values[taught], split.train[taught])
     judged = split.test != UNLABELLED
-    drawn = search.predict(values[judged]).astype(np.uint8)
     chosen = ", ".join(f"{key.rpartition('__')[2]} {value}" for key, value in search.best_params_.items())
-    counts = confusion(split.test[judged], drawn, split.classes)
+    counts = confusion(split.test[judged], search.predict(values[judged]).astype(np.uint8), split.classes)
     return Result(name, counts, time.process_time() - began, f"{chosen} chosen on the training halves")
 
 
@@ -227,7 +228,8 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
     from models.weights.files import load_weights
     from pipeline.geometry.camera import LineCamera
 
-    weights, scene = load_weights(path), _scene(folder)
+    weights = load_weights(path)
+    scene = _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
         raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
     scan_pass = observe_frame(scene, scene.name, weights, LineCamera(), 0)
@@ -247,7 +249,8 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
     scene = _scene(folder)
-    (height, width), basis = split.train.shape, SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[False])
+    height, width = split.train.shape
+    basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[False])
     grid = SceneGrid(height, width, patch=8)
     columns = (split.values / np.float32(split.values.max())) @ basis.matrix(scene.wavelength_nm)[0]
     columns = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
@@ -257,8 +260,8 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     normalisation = measured_normalisation([observed])
     example = normalised(observed, normalisation, np.ones(basis.columns, bool))
     config = SegmenterConfig(split.classes, basis.columns, grid.patch)
-    pixels, rng = LabelledPixels.drawn([example], np.random.default_rng(0)), np.random.default_rng(1)
-    start = linear_discriminants(pixels.brightened(normalisation.gain_shift, rng), split.classes)
+    pixels = LabelledPixels.drawn([example], np.random.default_rng(0))
+    start = linear_discriminants(pixels.brightened(normalisation.gain_shift, np.random.default_rng(1)), split.classes)
     network, record = train(config, [example], normalisation.gain_shift, _settings(), start=start)
     network = with_discriminants(network, start, READINGS["mean of both"])
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
@@ -273,7 +276,8 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
     from models.reading.inference import coarse_prediction_of_columns, segment
     from pipeline.planning.coverage import frame_patches
 
-    training, found = weights.record["training"], []
+    training = weights.record["training"]
+    found = []
     words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"
     with one_thread():
         for fraction in FRACTIONS:
@@ -281,10 +285,10 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
             observation = coarse_prediction_of_columns(weights, seen.columns, seen.grid)
             patch_index = frame_patches(score_patches("entropy", observation), fraction)
             drawn = segment(weights, observation, fine[patch_index], patch_index).classes
-            spent, counts = time.process_time() - began, confusion(labels, drawn, weights.config.classes)
-            found.append(
-                Result(f"{source}: segmenter, {100 * fraction:.0f} % of patches", counts, spent, words, fraction == 1)
-            )
+            spent = time.process_time() - began
+            counts = confusion(labels, drawn, weights.config.classes)
+            name = f"{source}: segmenter, {100 * fraction:.0f} % of patches"
+            found.append(Result(name, counts, spent, words, fraction == 1))
     return found
 
 

@@ -42,11 +42,16 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.land import smooth_noise, stream
 from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRaster
 
-SEEDS, SIZE = (61, 62, 63), "640x512"
-LIGHTS, SHARES, SWATHS = (1.0, 0.25), (1.0, 0.25, 0.0625), 8
+SEEDS = (61, 62, 63)
+SIZE = "640x512"
+LIGHTS = (1.0, 0.25)
+SHARES = (1.0, 0.25, 0.0625)
+SWATHS = 8
 EXPOSURES_MS = (1.25, 2.5, 5.0)  # exposure of every line in full light; seconds are stated by it
-LINES, SETUP_S = 515, 2.0  # of one swath of the full scan
-WAYS, PLANNER = ("never", "always", "ideal"), "auto"
+LINES = 515  # of one swath of the full scan
+SETUP_S = 2.0  # of one swath
+WAYS = ("never", "always", "ideal")
+PLANNER = "auto"
 UNSEEN = (71, 72, 73)
 OTHER = (  # light, fraction of interest, swaths, seconds, farms
     *((1.0, share, 8, 27.3, UNSEEN) for share in (1 / 16, 1.0)),
@@ -84,10 +89,12 @@ class Cell:
 
 def land(seed: int, shape: tuple[int, int], share: float, **given: Any) -> tuple[RasterScene, NDArray[np.bool_]]:
     """Return a farm whose rectangle lies in a meadow, and the mask (y, x) of the rectangle's pixels."""
-    farm, inside = farm_scene(seed, shape, **given), np.ones(shape, np.bool_)
+    farm = farm_scene(seed, shape, **given)
+    inside = np.ones(shape, np.bool_)
     if share < 1:
         inside[...] = False
-        side, rng = np.sqrt(share), stream(seed, "rectangle")
+        side = np.sqrt(share)
+        rng = stream(seed, "rectangle")
         size = [max(round(side * whole), 1) for whole in shape]
         top, left = (int(rng.integers(0, whole - part + 1)) for whole, part in zip(shape, size, strict=True))
         inside[top : top + size[0], left : left + size[1]] = True
@@ -133,11 +140,10 @@ def score(seed: int, share: float, light: float, swaths: int, seconds: float, wa
     """Return the mIoU [%] of a survey of a land."""
     width, height = map(int, SIZE.split("x"))
     scene, inside = land(seed, (height, width), share)
-    found, chosen = mock.patch.object(scenes, "built_in_scene", return_value=scene), nullcontext()
-    with tempfile.TemporaryDirectory() as out, found, known(inside) if way == "ideal" else chosen:
+    found = mock.patch.object(scenes, "built_in_scene", return_value=scene)
+    with tempfile.TemporaryDirectory() as out, found, known(inside) if way == "ideal" else nullcontext():
         settings = asked(seed, light, swaths, seconds, "never" if way == "never" else "always", out)
-        accuracy = run_survey(settings, Console(quiet=True)).receipt["accuracy"]
-    return 100 * float(accuracy["miou"])
+        return 100 * float(run_survey(settings, Console(quiet=True)).receipt["accuracy"]["miou"])
 
 
 def cells(seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:
@@ -152,7 +158,8 @@ def cells(seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:
 
 def rows(picture: Path | None = None) -> list[Row]:
     """Return a row for every cell, and the mean of each fraction with its goal."""
-    found, measured = [], list[Cell]()
+    found = []
+    measured: list[Cell] = []
     for cell in cells():
         measured.append(cell)
         mean = {way: float(np.mean(one)) for way, one in cell.scores.items()}
@@ -164,10 +171,11 @@ def rows(picture: Path | None = None) -> list[Row]:
     for share in SHARES:
         each = [cell.gain(PLANNER) for cell in measured if cell.share == share]
         gain = float(np.mean(each))
-        goal, what = GOALS[share], f"share {share:g}, mean of {len(each)} cells"
-        found.append(Row(what, f"{gain:+.1f}", f"{goal:+g}", gain >= goal))
+        goal = GOALS[share]
+        found.append(Row(f"share {share:g}, mean of {len(each)} cells", f"{gain:+.1f}", f"{goal:+g}", gain >= goal))
     missed = [cell.missed for cell in measured]
-    close, worst = np.mean(np.array(missed) <= 0.5), max(missed)
+    close = np.mean(np.array(missed) <= 0.5)
+    worst = max(missed)
     better = Row("planner within 0.5 of the better scan", f"{close:.0%} of the cells", ">= 90 %", close >= 0.9)
     found += [better, Row("planner below the better scan, at most", f"{worst:.1f}", "<= 1.5", worst <= 1.5)]
     if picture is not None:

@@ -67,19 +67,20 @@ def _over_take(scene: Turned) -> list[Row]:
     take = ns_of(clocks["take"], TILES * out.size)
     found = []
     for kernel in KERNELS:
-        times, goal = ratio(clocks, kernel, "take"), 3.0 if kernel == "catmull-rom" else None
-        what = f"{kernel}, {BANDS} bands, over np.take of the same rows"
+        times = ratio(clocks, kernel, "take")
+        goal = 3.0 if kernel == "catmull-rom" else None
         judged = (f"<= {goal:g} x", times <= goal) if goal else ("", None)
         spent = f"{ns_of(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}"
-        found.append(Row(what, f"{times:.2f} x", *judged, spent))
+        found.append(Row(f"{kernel}, {BANDS} bands, over np.take of the same rows", f"{times:.2f} x", *judged, spent))
     return [*found, _over_take_cached(scene)]
 
 
 def _over_take_cached(scene: Turned) -> Row:
     """Repeat a corner of the sweep: np.take then copies from cache to cache, and 16 taps are slower than that."""
-    middle, near = slice(100, 156), (np.abs(scene.coordinates - 127.5) < 20).all(axis=1)
-    samples, coordinates = np.ascontiguousarray(scene.samples[middle, middle]), scene.coordinates[near] - middle.start
-    small = replace(scene, samples=samples, coordinates=coordinates, truth=scene.truth[near])
+    middle = slice(100, 156)
+    near = (np.abs(scene.coordinates - 127.5) < 20).all(axis=1)
+    samples = np.ascontiguousarray(scene.samples[middle, middle])
+    small = replace(scene, samples=samples, coordinates=scene.coordinates[near] - middle.start, truth=scene.truth[near])
     out = np.empty(small.truth.shape, np.float32)
     once = {"take": _take(small, out), "ours": _call(small, "catmull-rom")}
     clocks = time_in_turn({name: _often(call, 20) for name, call in once.items()}, 5)
@@ -112,7 +113,8 @@ def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
     for what, scene, there in (("amplitude as period", natural, others), ("all waves alike", flat, peers(flat, order))):
         error = scene.error(_call(scene, kernel)()[0])
         errors = {peer.name: scene.error(peer.by_pixel(peer.call())) for peer in there}
-        met, listed = all(error <= other * ALIKE for other in errors.values()), _listed(errors, "{:.4f}")
+        met = all(error <= other * ALIKE for other in errors.values())
+        listed = _listed(errors, "{:.4f}")
         found.append(Row(f"{name}: rmse / std, {what}", f"{error:.4f}", "no larger than each", met, listed))
     return found
 
@@ -157,7 +159,5 @@ def _prepared(others: Sequence[Peer], scene: Turned) -> str:
     before = {f"{peer.name}'s index": peer.prepare for peer in others if peer.prepare}
     if not before:
         return ""
-    clocks = time_in_turn(before, 1)
-    return "; not counted: " + _listed(
-        {name: ns_of(clock, len(scene.truth)) for name, clock in clocks.items()}, "{:.0f} ns/px"
-    )
+    spent = {name: ns_of(clock, len(scene.truth)) for name, clock in time_in_turn(before, 1).items()}
+    return "; not counted: " + _listed(spent, "{:.0f} ns/px")

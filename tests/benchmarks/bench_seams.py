@@ -29,8 +29,7 @@ def _waves(name: str, periods: tuple[float, float], snr: float, seeds: int = 20)
     for seed in range(seeds):
         shift = np.random.default_rng(seed).uniform(-8, 8, 2)
         views = wave_views(seed, SHAPE, shift, snr, periods)
-        found = pair_shift(*views, prior_px=9)
-        ours.append(np.hypot(*(found.shift - shift)))
+        ours.append(np.hypot(*(pair_shift(*views, prior_px=9).shift - shift)))
         for peer, method in PEERS.items():
             peers[peer].append(np.hypot(*(method(*views) - shift)))
     found_fraction = np.isfinite(ours).mean()
@@ -71,7 +70,8 @@ def _rows_without(seeds: int = 40) -> Row:
 
 
 def _row_results(seeds: int, gaps: float) -> tuple[list[tuple[PairShift, Floats]], dict[str, int]]:
-    results, peers = [], dict.fromkeys(PEERS, 0)
+    results = []
+    peers = dict.fromkeys(PEERS, 0)
     for seed in range(seeds):
         shift = np.random.default_rng(seed).uniform(-25, 25, 2)
         views = row_views(seed, SHAPE, shift, 50, gaps)

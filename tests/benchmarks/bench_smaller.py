@@ -41,7 +41,9 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 
-STEPS, TRAINED_ON, JUDGED = 3000, 24, 6  # steps, farms for training, farms for testing
+STEPS = 3000
+TRAINED_ON = 24  # farms
+JUDGED = 6  # farms
 Sizes = tuple[int, int, int]
 OURS: Sizes = (8, 20, 64)  # channels of the overview and of the full network, and the token width
 SMALLER: tuple[Sizes, ...] = ((8, 16, 64), (10, 10, 64), (6, 12, 64), (12, 12, 64), (6, 8, 48), (4, 8, 32))
@@ -64,14 +66,16 @@ def request(sizes: Sizes, settings: TrainingSettings) -> TrainRequest:
 
 def trained(asked: TrainRequest, scenes: Scenes, normalisation: Normalisation) -> list[ReadTwice]:
     """Train a network; return the test farms, read by its overview and in full."""
-    common, examples, rng = scenes.common, scenes.train.examples, np.random.default_rng([0x1DA])
-    config, shift = network_config(asked, common), normalisation.gain_shift
+    common = scenes.common
+    examples = scenes.train.examples
+    rng = np.random.default_rng([0x1DA])
+    config = network_config(asked, common)
+    shift = normalisation.gain_shift
     start = linear_discriminants(LabelledPixels.drawn(examples, rng).brightened(shift, rng), config.classes)
     model, summary = train(config, examples, shift, asked.settings, start=start, device=choose_device("auto"))
     print(config, summary, flush=True)
-    return read_twice(
-        Weights(model, common.basis, normalisation, common.names, common.colours), scenes.validation.examples
-    )
+    weights = Weights(model, common.basis, normalisation, common.names, common.colours)
+    return read_twice(weights, scenes.validation.examples)
 
 
 def score(judged: list[ReadTwice], classes: int, policy: str, fraction: float = 1.0) -> list[float]:
@@ -91,12 +95,16 @@ def beside(smaller: str, config: SegmenterConfig, own: list[float], peer: list[f
 def rows(steps: int = STEPS) -> list[Row]:
     """Return a row for each smaller network: our lead at its multiply-adds."""
     settings = TrainingSettings(steps=steps, minutes=600.0)
-    asked, data = request(OURS, settings), open_training_data("farm", JUDGED, TRAINED_ON, LineCamera())
+    asked = request(OURS, settings)
+    data = open_training_data("farm", JUDGED, TRAINED_ON, LineCamera())
     scenes = observe_all(asked, data, lambda what, done, figure: None)
     normalisation = measured_normalisation(scenes.train.examples, REFERENCE_MS)
     scenes = scenes.normalised(normalisation)
-    ours, config = trained(asked, scenes, normalisation), network_config(asked, scenes.common)
-    classes, least, most = config.classes, cost(config, 0), cost(config)
+    ours = trained(asked, scenes, normalisation)
+    config = network_config(asked, scenes.common)
+    classes = config.classes
+    least = cost(config, 0)
+    most = cost(config)
     found = [
         Row(f"{of:.0f} a pixel: ours, {policy} of the patches", f"{score(ours, classes, policy)[0]:.1f}")
         for policy, of in (("none", least), ("all", most))
@@ -115,12 +123,15 @@ def rows(steps: int = STEPS) -> list[Row]:
 
 
 CUT: tuple[Sizes, ...] = ((8, 12, 64), (12, 12, 64))
-CUT_ON, CUT_RATE, DARKEST_MS = 176, 6e-4, 3.0  # scenes, learning rate, shortest exposure of crops [ms]
+CUT_ON = 176  # scenes
+CUT_RATE = 6e-4  # learning rate
+DARKEST_MS = 3.0  # shortest exposure of crops [ms]
 
 
 def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
     """Return a row for each network that is cut out of the shipped weights and trained further: our lead over it."""
-    shipped, camera = load_weights(shipped_weights()), LineCamera()
+    shipped = load_weights(shipped_weights())
+    camera = LineCamera()
     settings = TrainingSettings(steps=steps, minutes=600.0, learning_rate=CUT_RATE, seed=5, darkest_ms=DARKEST_MS)
     laws = f"{FARM_LAW},{SCOUTING_LAW}"
     data = open_training_data(laws, 0, trained_on, camera)
@@ -128,25 +139,25 @@ def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
     data = replace(data, validation=tuple(name for names in held_out for name in names))
     asked = TrainRequest(laws, Path(), settings=settings)
     scenes = observe_all(asked, data, lambda what, done, figure: None).normalised(shipped.normalisation)
-    ours, classes = read_twice(shipped, scenes.validation.examples), shipped.config.classes
-    augmentation, found = training_capture(shipped.normalisation, DARKEST_MS), list[Row]()
+    ours = read_twice(shipped, scenes.validation.examples)
+    classes = shipped.config.classes
+    augmentation = training_capture(shipped.normalisation, DARKEST_MS)
+    found: list[Row] = []
     for overview_width, width, _ in CUT:
         config = replace(shipped.config, overview_width=overview_width, width=width)
-        start = cut(shipped.segmenter, config)
         model, summary = train(
             config,
             scenes.train.examples,
             shipped.normalisation.gain_shift,
             settings,
-            start=start,
+            start=cut(shipped.segmenter, config),
             augmentation=augmentation,
         )
         print(config, summary, flush=True)
         peer = score(read_twice(replace(shipped, segmenter=model), scenes.validation.examples), classes, "all")
         fraction = (cost(config) - cost(shipped.config, 0)) / (cost(shipped.config) - cost(shipped.config, 0))
-        found.append(
-            beside(f"widths {overview_width} and {width}", config, score(ours, classes, "gain", fraction), peer)
-        )
+        own = score(ours, classes, "gain", fraction)
+        found.append(beside(f"widths {overview_width} and {width}", config, own, peer))
         print(found[-1], flush=True)
     return found
 
@@ -156,8 +167,10 @@ def cut(model: Segmenter, config: SegmenterConfig) -> dict[str, Tensor]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(7)
         made = Segmenter(config).state_dict()
-    old, classes = model.state_dict(), torch.arange(config.classes)
-    inputs, dim = torch.arange(config.columns + PLANES), torch.arange(config.dim)
+    old = model.state_dict()
+    classes = torch.arange(config.classes)
+    inputs = torch.arange(config.columns + PLANES)
+    dim = torch.arange(config.dim)
 
     def put(name: str, outputs: Tensor, taken: Tensor | None = None) -> None:
         """Copy the kept channels of a weight, which become the first ones, and of its bias."""
@@ -197,11 +210,8 @@ def cut(model: Segmenter, config: SegmenterConfig) -> dict[str, Tensor]:
 
 def _strongest(old: Mapping[str, Tensor], part: str, level: int, most: int) -> Tensor:
     """Return the channels of a level with the largest weights, in ascending order, at most ``most``."""
-    own = [
-        weight
-        for name, weight in old.items()
-        if re.fullmatch(rf"{part}_(stem|head)\.blocks\.{level}\.conv\.weight", name)
-    ]
+    kernels = rf"{part}_(stem|head)\.blocks\.{level}\.conv\.weight"
+    own = [weight for name, weight in old.items() if re.fullmatch(kernels, name)]
     size = sum((one.abs().sum((0, 2, 3)) + one.abs().sum((1, 2, 3)) for one in own), torch.zeros(len(own[0])))
     way = old.get(f"{part}_stem.down.{level}.weight")
     way = old[f"{part}_head.up.{level - 1}.weight"] if way is None else way

@@ -20,13 +20,15 @@ from storage.arrays.layout import SHARD_ROWS, image_spec
 from storage.arrays.spool import Spool
 
 LINES, SAMPLES, BANDS = 256, 640, 270
-SPOOLED, RATE_HZ = 640, 100.0
+SPOOLED = 640
+RATE_HZ = 100.0
 ROUNDS = 3
 
 
 def rows() -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
-        folder, raw = Path(name), _raw()
+        folder = Path(name)
+        raw = _raw()
         return [*_against_zarr(folder, raw), _spool(folder, raw), _warm(folder)]
 
 

@@ -28,7 +28,9 @@ from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 
-DOWN, ACROSS, FOLDS = 5, 4, 3
+DOWN = 5
+ACROSS = 4
+FOLDS = 3
 Counts = NDArray[np.int64]
 
 
@@ -80,7 +82,8 @@ def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
     weights = load_weights(out)
     out.unlink()
     data = open_training_data(str(tiles), 0, None, LineCamera())
-    classes, found = weights.config.classes, {"network": np.zeros((weights.config.classes,) * 2, np.int64)}
+    classes = weights.config.classes
+    found = {"network": np.zeros((classes, classes), np.int64)}
     for name in held:
         frame = observe_frame(data.scene(name), name, weights, LineCamera(), fold)
         every = np.arange(len(frame.fine))

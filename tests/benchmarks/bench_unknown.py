@@ -24,7 +24,9 @@ from flows.tasks.survey_model import shipped_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
-SEEDS, DAYS, SIZE = (21, 22, 23), (120, 172, 250), "640x512"
+SEEDS = (21, 22, 23)
+DAYS = (120, 172, 250)
+SIZE = "640x512"
 PROBES: dict[str, dict[str, Any]] = {
     "every line, 100 ms": {"scan_step": 1},
     "survey --seconds 25": {"seconds": 25},
@@ -78,12 +80,11 @@ def _survey(given: dict[str, Any], unknown: str) -> Judged:
     with tempfile.TemporaryDirectory() as out:
         plain = {"engine": "plain", "controls": False, "unknown": unknown, "out": out, **given}
         receipt = run_survey(load_settings(None, plain), Console(quiet=True)).receipt
-    spent = next(stage["cpu_s"] for stage in receipt["stages"] if stage["name"] == "segment")
     miou = receipt.get("accuracy", {}).get("miou")
     return {
         "fraction": float(receipt.get("unknown", {}).get("fraction", 0)),
         "miou": float("nan") if miou is None else miou,
-        "cpu_s": spent,
+        "cpu_s": next(stage["cpu_s"] for stage in receipt["stages"] if stage["name"] == "segment"),
     }
 
 
@@ -121,8 +122,7 @@ def _pines(source: Path, folder: Path) -> Path:
     lines = (source / "92AV3C.spc").read_text().splitlines()
     head = next(number for number, line in enumerate(lines) if line.split()[:1] and line.split()[0][0].isdigit())
     nm = np.loadtxt(lines, usecols=0, skiprows=head)
-    dropped = np.r_[103:108, 149:163, 219]
-    nm = np.delete(nm, dropped)
+    nm = np.delete(nm, np.r_[103:108, 149:163, 219])
     seen = (nm >= 400) & (nm <= 1000)
     return _written(folder, values * (BRIGHTNESS / values[..., seen].mean()), nm)
 

@@ -59,12 +59,6 @@ def alone(call: Callable[..., T], *given: object) -> T:
         return pool.submit(call, *given).result()
 
 
-def peak_bytes() -> int:
-    """Return the peak resident memory of this process; ``getrusage`` would include its parent's."""
-    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
-
-
 def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
     """Return rows of texts, the first of them headings, in aligned columns; longer texts are wrapped."""
     widths = [min(width, max(len(line[column]) for line in cells)) for column, width in enumerate(most)]

@@ -32,8 +32,10 @@ from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
 
-SIDE, INPUTS = 1024, (4, 2)  # px; fine pixels a side of a coarse one
-FARM_SEEDS, TAUGHT_FARMS = (51, 52, 53), 12
+SIDE = 1024  # px
+INPUTS = (4, 2)  # fine pixels a side of a coarse one
+FARM_SEEDS = (51, 52, 53)
+TAUGHT_FARMS = 12
 FOUR_NM = (450.0, 550.0, 650.0, 850.0)  # near the centres of the paper's RGB and near-infrared bands
 PATCH = 16
 CAMERA = LineCamera()
@@ -52,15 +54,15 @@ class DataSet:
 
 def coarse_image(columns: Image, factor: int) -> Image:
     """Return area means of ``factor`` x ``factor`` px, each repeated over its pixels."""
-    means = block_means(columns, factor)
-    return means.repeat(factor, 0).repeat(factor, 1)
+    return block_means(columns, factor).repeat(factor, 0).repeat(factor, 1)
 
 
 class PaperCaptures(CaptureAugmentation):
     """Train with the images of the paper: area means for the overview, fine pixels for the full network."""
 
     def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        factor, fine = int(rng.choice((1, *INPUTS))), with_capture(columns, LineSpec().planes)
+        factor = int(rng.choice((1, *INPUTS)))
+        fine = with_capture(columns, LineSpec().planes)
         coarse = torch.from_numpy(coarse_image(columns.numpy(), factor))
         return with_capture(coarse, LineSpec(step=factor, binned=factor).planes), fine
 
@@ -74,7 +76,8 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     except WeightsError:
         say(f"{name}: {len(scenes)} scenes to train on, {steps} steps")
     made = [make() for make in scenes.values()]
-    first, rng = made[0], np.random.default_rng(0)
+    first = made[0]
+    rng = np.random.default_rng(0)
     basis = SpectralBasis.spanning(first.wavelength_nm)
     seen = [observe(scene, CAMERA, SceneGrid(*scene.shape, patch), basis, rng) for scene in made]
     normalisation = measured_normalisation(seen)
@@ -86,7 +89,8 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
         if now.step % 50 == 0:
             say(f"{name}: step {now.step} of {steps}, loss {now.loss:.3f}")
 
-    asked, seen = TrainingSettings(steps=steps, minutes=1e6), PaperCaptures(normalisation)
+    asked = TrainingSettings(steps=steps, minutes=1e6)
+    seen = PaperCaptures(normalisation)
     model, summary = train(config, examples, normalisation.gain_shift, asked, progress, start=start, augmentation=seen)
     record = {"training": summary, "split": {"train": dict.fromkeys(scenes, "")}}
     weights = Weights(model, basis, normalisation, first.class_names, first.class_colours, record)
@@ -98,10 +102,9 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
 def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
     """Return a scene with only the bands nearest to the given wavelengths."""
     at = [int(np.abs(scene.wavelength_nm - one).argmin()) for one in wanted_nm]
-    light = SceneRadiance(scene.electrons[:, at], scene.white_reference_electrons[at])
     return replace(
         scene,
-        light=Once.of(light),
+        light=Once.of(SceneRadiance(scene.electrons[:, at], scene.white_reference_electrons[at])),
         white_reference=scene.white_reference[at],
         wavelength_nm=scene.wavelength_nm[at],
         fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[at],
@@ -125,9 +128,8 @@ def farm_four(steps: int, say: Say, side: int = SIDE, seeds: Sequence[int] = FAR
 
 def farm_all(side: int = SIDE, seeds: Sequence[int] = FARM_SEEDS) -> DataSet:
     """Return the same farms with all bands, and the shipped weights."""
-    weights = load_weights(ROOT / "models" / "shipped" / "farm.safetensors")
     scenes = {f"{seed}": partial(farm_scene, seed, (side, side), camera=CAMERA) for seed in seeds}
-    return DataSet("farm, 270 bands", weights, scenes)
+    return DataSet("farm, 270 bands", load_weights(ROOT / "models" / "shipped" / "farm.safetensors"), scenes)
 
 
 def folder(path: Path, held_out: Sequence[str], steps: int, patch: int, say: Say, given: Path | None) -> DataSet:

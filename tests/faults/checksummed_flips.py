@@ -19,7 +19,7 @@ from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from models.weights.files import describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
 from tests.conftest import RGB_NM, random_weights
-from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.fault_table import Row, reported_wrong
 
 RUN = "the run's identity"
 Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything except the tensors, and the tensors
@@ -55,7 +55,9 @@ class Flips:
 def flip_bits(count: int, folder: Path, seed: int = 0) -> Flips:
     """Flip ``count`` single bits, half of them in the tensors, each in a fresh copy of a file, and read it."""
     folder.mkdir(parents=True, exist_ok=True)
-    written, rng, found = _written(folder), Random(seed), Flips()
+    written = _written(folder)
+    rng = Random(seed)
+    found = Flips()
     before = {name: read(written[name]) for name, read in READERS.items()}
     for number in range(count):
         name = list(READERS)[number % len(READERS)]
@@ -104,11 +106,11 @@ def _written(folder: Path) -> dict[str, Path]:
 
 
 def rows(quick: bool) -> Sequence[Row]:
-    clock, count = Clock(), 60 if quick else 2000
+    count = 60 if quick else 2000
     with tempfile.TemporaryDirectory() as place:
         found = flip_bits(count, Path(place))
     words = f"{found.refused} refused in one message, {found.same} as written, {reported_wrong(found.wrong)}"
     injected = "one bit of weights or of a training run's state"
     demanded = "refused in one message, or the numbers that were written"
     met = not found.wrong and found.tried == count
-    return [Row("a bit flips in weights", injected, count, demanded, words, met, clock.seconds)]
+    return [Row("a bit flips in weights", injected, count, demanded, words, met)]

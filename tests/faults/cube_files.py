@@ -31,8 +31,7 @@ def _cube() -> Any:
 
 
 def _envi(folder: Path) -> str:
-    wavelengths = np.linspace(400, 800, SHAPE[2])
-    write_envi(folder / "a.hdr", EnviFile(SHAPE, "u2", wavelengths), [(0, _cube())])
+    write_envi(folder / "a.hdr", EnviFile(SHAPE, "u2", np.linspace(400, 800, SHAPE[2])), [(0, _cube())])
     return "a.hdr"
 
 
@@ -178,7 +177,9 @@ class Reading:
 def try_reading(address: Path) -> Reading:
     """Open a source, and read its first and last lines."""
     tracemalloc.start()
-    begun, refused, wrong = time.monotonic(), None, None
+    begun = time.monotonic()
+    refused = None
+    wrong = None
     try:
         with at_most(LONGEST_S):
             source = open_cube(address)
@@ -190,6 +191,7 @@ def try_reading(address: Path) -> Reading:
         wrong = "an error without words" if not str(error) or "Traceback" in str(error) else None
     except BaseException as error:
         wrong = f"{type(error).__name__}: {str(error)[:200]}"
-    seconds, peak = time.monotonic() - begun, tracemalloc.get_traced_memory()[1]
+    seconds = time.monotonic() - begun
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return Reading(refused, wrong, seconds, peak)

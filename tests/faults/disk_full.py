@@ -20,12 +20,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.injection import ERRORS, label, logged_calls
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
-EACH, PLACES = 5, 150
 LARGE = 64 << 20  # bytes: more than a survey needs
 KINDS = ("spool", "segment", "segment manifest", "run")  # of written files
 FULL = "disk is full"
@@ -44,10 +43,8 @@ class Refusals:
 
     def words(self) -> str:
         """Return the figures as text."""
-        places = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
-        return (
-            f"{self.told} failed with one message, {self.done} ended well; {reported_wrong(self.wrong)} (at: {places})"
-        )
+        at = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
+        return f"{self.told} failed with one message, {self.done} ended well; {reported_wrong(self.wrong)} (at: {at})"
 
 
 # --- full disks -------------------------------------------------------------------------------------------------------
@@ -76,7 +73,8 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 def fill_at_places(subject: Subject, each: int, *, mounted: bool, seed: int = 0) -> Refusals:
     """Fill the disk ``each`` times while each kind of file is written, and rerun the survey on a larger disk."""
-    found, chance = Refusals(), random.Random(seed)
+    found = Refusals()
+    chance = random.Random(seed)
     counts = Counter(label(path) for _, call, path in subject.changing_calls if call == "open")
     for name in KINDS:
         for at in sorted(chance.sample(range(1, counts[name] + 1), min(each, counts[name]))):
@@ -109,15 +107,15 @@ def _judge(subject: Subject, out: Path, ended: Ended, name: str, found: Refusals
 
 
 def full_rows(quick: bool = False) -> list[Row]:
-    clock, mounted = Clock(), can_mount()
+    mounted = can_mount()
     with tempfile.TemporaryDirectory(prefix="full-") as name, Nursery(Path(name)) as nursery:
-        found = fill_at_places(prepare(nursery), 1 if quick else EACH, mounted=mounted)
+        found = fill_at_places(prepare(nursery), 1 if quick else 5, mounted=mounted)
     injected = "a tmpfs filled up while each kind of file is written; then it grows"
     if not mounted:
         injected = "ENOSPC refused from the inside (no tmpfs can be mounted here), from each kind of file on"
     demanded = "one message and exit 1, archive verifies, nothing published is lost, rerun bit-identical"
     met = not found.wrong and set(found.met_at) == set(KINDS)
-    return [Row("disk full", injected, found.told, demanded, found.words(), met, clock.seconds)]
+    return [Row("disk full", injected, found.told, demanded, found.words(), met)]
 
 
 # --- calls that are refused -------------------------------------------------------------------------------------------
@@ -125,7 +123,8 @@ def full_rows(quick: bool = False) -> list[Row]:
 
 def refuse_places(subject: Subject, count: int, seed: int = 0) -> Refusals:
     """Refuse one random call in each of ``count`` parts of a survey, and rerun each survey without the fault."""
-    chance, found = random.Random(seed), Refusals()
+    chance = random.Random(seed)
+    found = Refusals()
     for part in range(count):
         at = 1 + int((part + chance.random()) * len(subject.changing_calls) / count)
         _refuse_one(subject, at, chance.choice(list(ERRORS)), chance.random() < 0.5, found)
@@ -135,7 +134,8 @@ def refuse_places(subject: Subject, count: int, seed: int = 0) -> Refusals:
 def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refusals) -> None:
     out, log = subject.folder / f"refused-{at}", subject.folder / f"refused-{at}.calls"
     about = {"root": str(out), "at": at, "number": ERRORS[name], "lasting": lasting, "log": str(log)}
-    ended, hit = subject.nursery.run(words(out), "refuse", **about), logged_calls(log)
+    ended = subject.nursery.run(words(out), "refuse", **about)
+    hit = logged_calls(log)
     call, path = hit[0][1:] if hit else ("none", "")
     found.met_at.update((call, name))
     found.told += ended.told
@@ -145,18 +145,17 @@ def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refu
         wrong.append(f"exit {ended.code}, {ended.message[-300:]}")
     # One run after the rerun, unless the run was already published at the refusal.
     published = ended.code == 0 or not hit or Path(path).name == "runs" or "runs-" in path or "use.lock" in path
-    again = subject.nursery.run(words(out))
-    wrong += wrong_after_rerun(subject, out, again, runs=None if published else 1)
+    wrong += wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=None if published else 1)
     found.wrong += [f"{name} at {at} ({call}, {ended.place[-60:]}): {one}" for one in wrong]
     shutil.rmtree(out, ignore_errors=True)
     log.unlink(missing_ok=True)
 
 
 def refused_rows(quick: bool = False) -> list[Row]:
-    clock, count = Clock(), 12 if quick else PLACES
+    count = 12 if quick else 150
     with tempfile.TemporaryDirectory(prefix="refused-") as name, Nursery(Path(name)) as nursery:
         found = refuse_places(prepare(nursery), count)
     injected = f"{', '.join(ERRORS)} at a random call that changes the archive, once or from there on"
     demanded = "one message and exit 1, archive verifies, rerun bit-identical"
     met = not found.wrong and found.told > count // 2
-    return [Row("writes refused", injected, count, demanded, found.words(), met, clock.seconds)]
+    return [Row("writes refused", injected, count, demanded, found.words(), met)]

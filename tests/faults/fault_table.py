@@ -6,7 +6,7 @@ import argparse
 import importlib
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ class Row:
     demanded: str
     found: str
     met: bool
-    seconds: float
+    seconds: float = 0.0  # since the row before; set by `run_table`
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -35,19 +35,7 @@ class Row:
         return (*map(str, words), "yes" if met else "NO", f"{seconds:.0f}")
 
 
-class Clock:
-    """Seconds since the clock was made."""
-
-    def __init__(self) -> None:
-        self._began = time.monotonic()
-
-    @property
-    def seconds(self) -> float:
-        """Return the seconds until now."""
-        return time.monotonic() - self._began
-
-
-Rows = Callable[[bool], Sequence[Row]]  # quick or in full
+Rows = Callable[[bool], Iterable[Row]]  # quick or in full
 
 
 def reported_wrong(wrong: Sequence[str]) -> str:
@@ -77,14 +65,9 @@ def run_table(
         parser.error(f"no {what} {', '.join(unknown)}; there are: {', '.join(tables)}")
     found: list[Row] = []
     for name in asked.names or usual:
-        clock = Clock()
-        try:
-            rows = list(tables[name](asked.quick))
-        except Exception:
-            traceback.print_exc()
-            rows = [Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, clock.seconds)]
-        found += [replace(row, met=row.met and row.count > 0) for row in rows]  # a row without a try shows nothing
-        print("\n".join(f"{row.fault}: {row.found}" for row in rows), flush=True)
+        for row in _tried(name, tables[name], asked.quick):
+            found.append(row)
+            print(f"{row.fault}: {row.found}", flush=True)
     cells = [headings, *(row.cells for row in found)]
     print(f"\n{aligned(cells, WIDTHS)}")
     missed = [row.fault for row in found if not row.met]
@@ -94,12 +77,25 @@ def run_table(
     return 1 if missed else 0
 
 
+def _tried(name: str, rows: Rows, quick: bool) -> Iterator[Row]:
+    """Yield the rows of one table with their seconds, and one more if it crashes; a row without a try is not met."""
+    began = time.monotonic()
+    try:
+        for row in rows(quick):
+            yield replace(row, met=row.met and row.count > 0, seconds=time.monotonic() - began)
+            began = time.monotonic()
+    except Exception:
+        traceback.print_exc()
+        spent = time.monotonic() - began
+        yield Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, spent)
+
+
 def rows_of(place: str) -> Rows:
     """Return the rows of ``module`` or ``module:function``, which is imported at the first call."""
     module, _, name = place.partition(":")
 
-    def rows(quick: bool) -> Sequence[Row]:
-        found: Sequence[Row] = getattr(importlib.import_module(module), name or "rows")(quick)
+    def rows(quick: bool) -> Iterable[Row]:
+        found: Iterable[Row] = getattr(importlib.import_module(module), name or "rows")(quick)
         return found
 
     return rows

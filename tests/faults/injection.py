@@ -14,6 +14,7 @@ import io
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -32,17 +33,12 @@ def refuse(
     ``log`` gets each refused call, or with ``at`` 0 every call: its number, name and path.
     With a ``kind``, only calls count that open a file of this kind, see `label`.
     """
-    watch = _Watch(Path(root).absolute(), at, number, lasting, log)
-    watch.kind = kind
-    _install(watch)
+    _install(_Watch(root, at, number, lasting=lasting, log=log, kind=kind))
 
 
 def fill_disk(root: str, at: int, kind: str) -> None:
     """Fill the disk of ``root`` just before the ``at``-th file of a ``kind`` is opened for writing."""
-    watch = _Watch(Path(root).absolute(), at, 0, False, None)
-    watch.kind = kind
-    watch.fill = Path(root).absolute().parent / "ballast"
-    _install(watch)
+    _install(_Watch(root, at, kind=kind, fill=Path(root).absolute().parent / "ballast"))
 
 
 def end_at(root: str, at: int, number: int, log: str | None = None) -> None:
@@ -50,9 +46,7 @@ def end_at(root: str, at: int, number: int, log: str | None = None) -> None:
 
     ``log`` is that of `refuse`.
     """
-    watch = _Watch(Path(root).absolute(), at, 0, False, log)
-    watch.ending = number
-    _install(watch)
+    _install(_Watch(root, at, log=log, ending=number))
 
 
 def end_before(place: str, number: int, call: int = 1) -> None:
@@ -60,7 +54,8 @@ def end_before(place: str, number: int, call: int = 1) -> None:
     module, _, path = place.partition(":")
     *outer, name = path.split(".")
     inside = functools.reduce(getattr, outer, importlib.import_module(module))
-    real, calls = getattr(inside, name), count(1)
+    real = getattr(inside, name)
+    calls = count(1)
 
     def ended(*given: Any, **named: Any) -> Any:
         if next(calls) == call:
@@ -88,18 +83,25 @@ def _install(watch: _Watch) -> None:
     builtins.open = io.open = _pyio.open
 
 
+@dataclass
 class _Watch:
     """Count calls of all threads."""
 
+    root: str
+    at: int
+    number: int = 0  # of the error
+    lasting: bool = False
+    log: str | None = None
+    kind: str | None = None  # of the files whose opening counts; None counts every call
     fill: Path | None = None  # file to fill the disk with, instead of refusing
     ending: int | None = None  # signal to send this process, instead of refusing
-    kind: str | None = None  # of the files whose opening counts; None counts every call
 
-    def __init__(self, root: Path, at: int, number: int, lasting: bool, log: str | None) -> None:
-        self._root, self._at, self._number, self._lasting = str(root), at, number, lasting
-        self._lock, self._count = threading.Lock(), 0
+    def __post_init__(self) -> None:
+        self.root = str(Path(self.root).absolute())
+        self._lock = threading.Lock()
+        self._count = 0
         self._write = os.write
-        self._log = None if log is None else os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        self._log = None if self.log is None else os.open(self.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
 
     def around(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
         """Return the call with the fault before it."""
@@ -114,7 +116,7 @@ class _Watch:
             elif due:
                 if name == "write" and len(given[1]) > 1:
                     call(given[0], memoryview(given[1])[: len(given[1]) // 2])
-                raise OSError(self._number, os.strerror(self._number), *(() if name in _ON_FILES else (path,)))
+                raise OSError(self.number, os.strerror(self.number), *(() if name in _ON_FILES else (path,)))
             return call(*given, **named)
 
         return guarded
@@ -134,15 +136,15 @@ class _Watch:
             return None
         if name == "mkdir" and Path(path).is_dir():
             return None  # fails before any change
-        return path if path.startswith(self._root) else None
+        return path if path.startswith(self.root) else None
 
     def _due(self, name: str, path: str) -> bool:
         with self._lock:
-            begun = self._lasting and 0 < self._at <= self._count
-            counts = self.kind is None or (name == "open" and label(Path(path).relative_to(self._root)) == self.kind)
+            begun = self.lasting and 0 < self.at <= self._count
+            counts = self.kind is None or (name == "open" and label(Path(path).relative_to(self.root)) == self.kind)
             self._count += counts
-            due = begun or (counts and self._count == self._at)
-            if self._log is not None and (due or self._at == 0):
+            due = begun or (counts and self._count == self.at)
+            if self._log is not None and (due or self.at == 0):
                 self._write(self._log, f"{self._count} {name} {path}\n".encode())
         return due
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.source import Line
 from storage.arrays.spool import SYNC_LINES, Spool
-from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import ROOT
 
 SAMPLES, BANDS = 20, 7
@@ -76,17 +76,13 @@ def line(number: int) -> Line:
     return Line(number, data, 0.0, 1e-3 * number, 0.01 * number, 10.0)
 
 
-def fill(spool: Spool, upto: int) -> None:
-    """Continue a capture up to so many lines."""
-    while spool.count < upto:
-        spool.append(line(spool.count))
-
-
 def record(folder: Path) -> list[Moment]:
     """Capture without a fault, and record the appended and synced data before and after each line and each sync."""
     moments: list[Moment] = []
     path = folder / "lines.lines"
-    real, synced, appended = os.fdatasync, 0, 0
+    real = os.fdatasync
+    synced = 0
+    appended = 0
 
     def note() -> None:
         moments.append(Moment(appended, path.stat().st_size, synced))
@@ -139,12 +135,16 @@ def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> byte
 
 def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
     """Cut the power at random moments of one capture, and resume from each resulting file."""
-    chance, found = random.Random(seed), Losses()
-    moments, truth = record(folder / "whole"), _contents(folder / "whole")
+    chance = random.Random(seed)
+    found = Losses()
+    moments = record(folder / "whole")
+    truth = _contents(folder / "whole")
     for number in range(cuts):
-        moment, place = chance.choice(moments), folder / str(number)
+        moment = chance.choice(moments)
+        place = folder / str(number)
         place.mkdir()
-        fates, wrong = cut_power(folder / "whole", moment, place, chance), list(_go_on(place, moment.appended, found))
+        fates = cut_power(folder / "whole", moment, place, chance)
+        wrong = list(_go_on(place, moment.appended, found))
         if _contents(place) != truth:
             wrong.append("not the undisturbed bytes after going on")
         found.wrong += [f"{moment.appended} lines, {fates}: {one}" for one in wrong]
@@ -159,13 +159,16 @@ def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
             yield f"{lost} lines lost"
         kept = [one for block in spool.blocks() for one in block]
         yield from (f"line {one.number} is another" for one in kept if not same(one, line(one.number)))
-        fill(spool, LINES)
+        while spool.count < LINES:
+            spool.append(line(spool.count))
 
 
 def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
     """Kill captures at random moments, and compare the appended lines with the stored ones."""
-    chance, found = random.Random(seed), Losses()
-    command, environment = [sys.executable, "-c", WRITER], {**os.environ, "PYTHONPATH": str(ROOT)}
+    chance = random.Random(seed)
+    found = Losses()
+    command = [sys.executable, "-c", WRITER]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for number in range(kills):
         place = folder / f"killed-{number}"
         with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:
@@ -195,17 +198,15 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def rows(quick: bool = False) -> list[Row]:
+def rows(quick: bool = False) -> Iterator[Row]:
     demanded = f"at most {SYNC_LINES} lines lost, the capture goes on to the same bytes"
     garbled = "the file as of the last fdatasync, what came later cut off, zeroed, garbled or kept"
     cases = (
         ("capture killed", "SIGKILL of the process that appends lines", "no appended line lost", try_kills, (KILLS, 3)),
         ("power fails in a capture", garbled, demanded, try_power, (CUTS, 40)),
     )
-    found = []
     with tempfile.TemporaryDirectory(prefix="lost-") as name:
         for fault, injected, demanded, tried, counts in cases:
-            clock, count = Clock(), counts[quick]
+            count = counts[quick]
             losses = tried(count, Path(name))
-            found.append(Row(fault, injected, count, demanded, losses.words(), not losses.wrong, clock.seconds))
-    return found
+            yield Row(fault, injected, count, demanded, losses.words(), not losses.wrong)

@@ -10,16 +10,15 @@ import random
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from storage.archive.archive import Archive
-from tests.faults.fault_table import Clock, Row, reported_wrong
+from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words
 
-ROUNDS = 10
 OTHER = ("--policy", "sobel")  # shares the coarse pass, the geolocation grid and the mosaic
 
 
@@ -84,33 +83,27 @@ def _left(out: Path, *, killed: bool) -> list[str]:
     return [f"{name} was left" for name in (*parts, *spools)]
 
 
-def rows(quick: bool = False) -> list[Row]:
-    """Return the rows for two and four equal surveys, for common stages, and for a killed writer."""
-    rounds = 1 if quick else ROUNDS
+def rows(quick: bool = False) -> Iterator[Row]:
+    """Yield the rows for two and four equal surveys, for common stages, and for a killed writer."""
+    rounds = 1 if quick else 10
     with tempfile.TemporaryDirectory(prefix="writers-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
-        both, other = dict(subject.truth), nursery.run(words(subject.folder / "other", *OTHER))
+        both = dict(subject.truth)
+        other = nursery.run(words(subject.folder / "other", *OTHER))
         assert other.code == 0, other.text
         both |= stored(subject.folder / "other")
-        cases = [
+        cases: list[tuple[str, str, Sequence[tuple[str, ...]], Stored, bool]] = [
             ("two writers", "the same survey twice at once", ((), ()), subject.truth, False),
             ("four writers", "the same survey four times at once", ((), (), (), ()), subject.truth, False),
             ("shared stages", "two surveys that begin alike at once, each twice", ((), OTHER, (), OTHER), both, False),
             ("a writer killed", "SIGKILL of the first of three at a random moment", ((), (), ()), subject.truth, True),
         ]
-        return [_row(subject, case, rounds) for case in (cases[::3] if quick else cases)]
-
-
-def _row(
-    subject: Subject, case: tuple[str, str, tuple[tuple[str, ...], ...], Stored, bool], rounds: int, seed: int = 0
-) -> Row:
-    fault, injected, commands, truth, kill = case
-    clock, found, chance = Clock(), Writings(), random.Random(seed)
-    for number in range(rounds):
-        out = subject.folder / f"{fault.replace(' ', '-')}-{number}"
-        write_together(subject, out, commands, truth, found, chance, kill=kill)
-    demanded = (
-        f"{'every other one exit 0' if kill else 'exit 0 each'}, one copy of each store, same bytes, a run listed for "
-        "each, nothing left"
-    )
-    return Row(fault, injected, rounds, demanded, found.words(rounds), not found.wrong, clock.seconds)
+        for fault, injected, commands, truth, kill in cases[::3] if quick else cases:
+            found = Writings()
+            chance = random.Random(0)
+            for number in range(rounds):
+                out = subject.folder / f"{fault.replace(' ', '-')}-{number}"
+                write_together(subject, out, commands, truth, found, chance, kill=kill)
+            ended = "every other one exit 0" if kill else "exit 0 each"
+            demanded = f"{ended}, one copy of each store, same bytes, a run listed for each, nothing left"
+            yield Row(fault, injected, rounds, demanded, found.words(rounds), not found.wrong)

@@ -18,7 +18,6 @@ import traceback
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +57,9 @@ class Child:
 
     def __init__(self, nursery: Nursery, pid: int, log: Path) -> None:
         self.pid = pid
-        self._nursery, self._log, self._began = nursery, log, time.monotonic()
+        self._nursery = nursery
+        self._log = log
+        self._began = time.monotonic()
 
     def kill(self) -> None:
         """Send SIGKILL; it does not harm a child that has ended already, as it is still to be waited for."""
@@ -66,7 +67,8 @@ class Child:
 
     def wait(self) -> Ended:
         """Wait for the end and return the result."""
-        code, place = int(self._nursery.ask({"wait": self.pid})), self._log.with_suffix(".place")
+        code = int(self._nursery.ask({"wait": self.pid}))
+        place = self._log.with_suffix(".place")
         ended = Ended(
             code,
             time.monotonic() - self._began,
@@ -86,16 +88,13 @@ class Nursery:
         self._number = 0
         command = [sys.executable, "-m", "tests.faults.nursery", str(folder / "choices")]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(
-            command, cwd=ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, cwd=ROOT, env=environment, stdin=pipe, stdout=pipe, text=True)
 
     def __enter__(self) -> Nursery:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.close()
@@ -173,10 +172,12 @@ def _live(request: dict[str, Any]) -> None:
 def _keep_place(path: Path) -> None:
     """Record the functions of this project that an error passed when the command line reports it."""
     cli = importlib.import_module("flows.cli.main")
-    say, descriptor = cli.say, os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
+    say = cli.say
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
 
     def noting(message: str) -> None:
-        error, frames = sys.exc_info()[1], list[traceback.FrameSummary]()
+        error = sys.exc_info()[1]
+        frames: list[traceback.FrameSummary] = []
         while error is not None:
             frames += traceback.extract_tb(error.__traceback__)
             error = error.__cause__

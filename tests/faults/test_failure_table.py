@@ -16,14 +16,13 @@ from tests.faults.small_survey import Subject, stored
 @pytest.mark.parametrize(("count", "code"), [(0, 1), (1, 0)])
 def test_a_row_without_tries_is_not_met(count: int, code: int) -> None:
     """A comparison of 0 items finds no difference and proves nothing, so the exit code is 1."""
-    row = Row("lines", "compared", count, "equal", f"0 of {count} differ", True, 0.0)
+    row = Row("lines", "compared", count, "equal", f"0 of {count} differ", True)
     assert run_table(["lines"], "", "", {"lines": lambda quick: [row]}, (), HEADINGS) == code
 
 
 def test_a_full_disk_ends_in_one_message_and_a_rerun_completes(subject: Subject) -> None:
     """The disk fills at each kind of file; the archive verifies, and the rerun on a larger disk is bit-identical."""
-    mounted = disk_full.can_mount()
-    found = disk_full.fill_at_places(subject, 1, mounted=mounted)
+    found = disk_full.fill_at_places(subject, 1, mounted=disk_full.can_mount())
     assert found.wrong == []
     assert found.told == len(disk_full.KINDS)
 
@@ -72,7 +71,7 @@ def test_flipped_bits_in_weights_and_checkpoints_are_refused(tmp_path: Path) -> 
 
 def test_mutated_headers_give_a_cube_or_one_error() -> None:
     """Each reading ends within 30 s, in memory bounded by the size of its files."""
-    found = mutated_files.try_headers(300, mutated_files.real_headers(), seed=1)
+    found = mutated_files.try_headers(300, seed=1)
     assert found.wrong == []
     assert found.read > 20  # else only the first check was tested
     assert found.refused > 20
@@ -93,9 +92,7 @@ def test_the_checks_find_damage(subject: Subject) -> None:
     out = subject.folder / "damaged"
     subject.surveyed(out)
     before = stored(out)
-    first = next(
-        path for path in sorted((out / "stages" / "segment").rglob("*")) if path.is_file() and path.suffix == ""
-    )
+    first = next(path for path in sorted((out / "stages/segment").rglob("*")) if path.is_file() and path.suffix == "")
     first.write_bytes(first.read_bytes()[:-1])
     wrong = small_survey.wrong_after_fault(subject, out, {**before, "stages/segment/gone": {}})
     assert any("bytes, expected" in one for one in wrong)

@@ -24,9 +24,8 @@ from tests.faults.small_survey import Subject, problems, stored, words, wrong_af
 from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
-SYNC = 60  # sync calls before the survey is stopped
+SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
-BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGTERM),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
@@ -39,20 +38,14 @@ MOMENTS = (0.28, 0.98, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KIL
 
 def told(ended: Ended) -> bool:
     """Return whether a command ended by SIGTERM with its one sentence, and otherwise only progress."""
-    lines = ended.text.strip().splitlines()
-    return (
-        ended.code == TERMINATED
-        and lines[-1] == GOING_ON
-        and not any("error" in line or "defect" in line for line in lines)
-    )
+    last = ended.text.strip().splitlines()[-1]
+    return ended.code == TERMINATED and last == GOING_ON and "error" not in ended.text and "defect" not in ended.text
 
 
 def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tmp_path: Path) -> None:
     """Its published stores verify, and the rerun completes with the stores of an undisturbed survey."""
     out = tmp_path / "archive"
-    ended = subject.nursery.run(
-        words(out), "end_before", place="storage.archive.manifests:sync_path", number=signal.SIGTERM, call=SYNC
-    )
+    ended = subject.nursery.run(words(out), "end_before", number=signal.SIGTERM, **SYNCED)
     assert told(ended), (ended.code, ended.text)
     assert problems(out) == []
     assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []
@@ -65,7 +58,7 @@ def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tm
 def mapped(subject: Subject) -> Path:
     """Return the archive of a survey that was killed at the start of its evaluation."""
     out = subject.folder / "mapped"
-    ended = stopped(subject, out, *BEGUN, signal.SIGKILL)
+    ended = stopped(subject, out, "flows.tasks.stages.accuracy:load_class_map", 1, signal.SIGKILL)
     assert ended.code == -signal.SIGKILL, ended.text
     return out
 
@@ -91,7 +84,8 @@ def whole(subject: Subject) -> Any:
 @pytest.mark.parametrize("place", PLACES)
 def test_a_rerun_adds_the_accuracy(subject: Subject, whole: Any, mapped: Path, tmp_path: Path, place: str) -> None:
     """A second stop leaves the run valid, with or without its accuracy; the rerun gives the undisturbed receipt."""
-    out, (name, call, number) = tmp_path / "archive", PLACES[place]
+    out = tmp_path / "archive"
+    name, call, number = PLACES[place]
     shutil.copytree(mapped, out)
     (first,) = receipts(out)
     ended = stopped(subject, out, name, call, number)

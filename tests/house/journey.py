@@ -37,7 +37,8 @@ def has_pixels(value: Any, deep: bool = True) -> bool:
     """Return whether a value is, contains or has as a field an array with as many numbers as a line."""
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple) and hasattr(value, "dtype"):
-        sizes, count = [size for size in shape if isinstance(size, int)], 1
+        sizes = [size for size in shape if isinstance(size, int)]
+        count = 1
         for size in sizes:
             count *= size
         return len(sizes) > 1 and count >= LINE

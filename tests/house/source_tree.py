@@ -39,9 +39,7 @@ def late_packages() -> dict[str, str]:
     """Return the packages that `pipeline.lazy` defers, and those of its types, by their names there."""
     tree = ast.parse((ROOT / LAZY).read_text(encoding="utf-8"))
     inner = [node for block in tree.body if isinstance(block, ast.If) for node in block.body]
-    types = {
-        alias.name: node.module or "" for node in inner if isinstance(node, ast.ImportFrom) for alias in node.names
-    }
+    types = {one.name: node.module or "" for node in inner if isinstance(node, ast.ImportFrom) for one in node.names}
     found = [alias for node in inner if isinstance(node, ast.Import) for alias in node.names]
     return types | {alias.asname or alias.name: alias.name for alias in found}
 

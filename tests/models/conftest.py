@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -25,7 +24,6 @@ SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "width": 8, "ov
     "heads": 2,
     "layers": 1,
 }
-Maker = Callable[..., Weights]
 
 
 def noise(seed: int, *shape: int) -> Tensor:
@@ -42,14 +40,15 @@ def coarse_prediction(
     capture: Capture = LineSpec(),  # noqa: B008 - a value
 ) -> CoarsePrediction:
     """Predict from scene values (y, x, band); NaN is no data."""
-    coarse = read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture)
-    return read_coarse_prediction(weights, coarse)
+    return read_coarse_prediction(weights, read_coarse_pass(weights, [values], wavelength_nm, grid, capture=capture))
 
 
 def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarsePass, np.ndarray]:
     """Return a pass over a scene of noise, and other noise for every patch of its padded grid."""
-    p, columns = weights.config.patch, weights.config.columns
-    grid, rng = SceneGrid(height, width, p), np.random.default_rng(seed)
+    p = weights.config.patch
+    columns = weights.config.columns
+    grid = SceneGrid(height, width, p)
+    rng = np.random.default_rng(seed)
     coarse_pass = CoarsePass(grid, rng.standard_normal((*grid.padded_shape, columns), np.float32))
     return coarse_pass, rng.standard_normal((int(np.prod(grid.patch_shape)), p, p, columns), np.float32)
 
@@ -104,9 +103,3 @@ def make_weights(seed: int = 0, **sizes: Any) -> Weights:
         np.arange(3 * model.config.classes, dtype=np.uint8).reshape(-1, 3),
         {"seed": seed},
     )
-
-
-@pytest.fixture
-def tiny() -> Maker:
-    """Return the maker of small random weights: ``tiny(seed, classes=..., patch=...)``."""
-    return make_weights

@@ -57,10 +57,10 @@ def write_plain_sweep(path: Path, header: SweepHeader, values: NDArray[np.floati
     for first in range(0, len(values), 64):
         part = values[first : first + 64]
         writer.write(first, part, np.zeros(part.shape[:2], np.uint8))
-    count, x_y = len(values), line_positions(header.sweep, LineCamera())
+    count = len(values)
+    x_y = line_positions(header.sweep, LineCamera())
     facts = LineRows(np.arange(count) * 0.1, *x_y.T, np.full(count, 100.0), np.ones(count, np.bool_))
-    none = np.zeros((0, values.shape[2]), np.int16)
-    writer.close(facts, np.zeros((0, 2), np.intp), none)
+    writer.close(facts, np.zeros((0, 2), np.intp), np.zeros((0, values.shape[2]), np.int16))
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,6 @@ from storage.archive.manifests import manifest_text
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
 from storage.remote.opening import verify_archive
 
-DAY_S = 86400
-
 
 @dataclass(frozen=True)
 class Small:
@@ -80,7 +78,7 @@ def grow_old(ref: StageRef, days: float) -> None:
     """Set a store's date back, in its manifest and on its file."""
     path = ref.path / "manifest.json"
     rewrite(path, created="2020-01-01T00:00:00+00:00")
-    moment = path.stat().st_mtime - days * DAY_S
+    moment = path.stat().st_mtime - days * 86_400
     os.utime(path, (moment, moment))
 
 

@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 
 from flows.tradeoff.stages import draw_waves
 
-SIDE, BANDS, EDGE = 256, 270, 176  # px of the sweep; bands; px of the output grid, which stays inside when rotated
+SIDE = 256  # px of the sweep
+BANDS = 270
+EDGE = 176  # px of the output grid, which stays inside when rotated
 TURN_DEG = 14.0
-CRS, ORIGIN_M = "EPSG:32631", (500_000.0, 5_000_000.0)  # one metre a pixel, for libraries that need georeferenced data
+CRS = "EPSG:32631"
+ORIGIN_M = (500_000.0, 5_000_000.0)  # one metre a pixel, for libraries that need georeferenced data
 FEW = 18  # bands for slow libraries that take one band at a time
 
 
@@ -58,10 +61,10 @@ def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
     size = np.linalg.norm(waves.frequency, axis=1)[:, None] ** -falloff
     waves = replace(waves, cosine=waves.cosine * size, sine=waves.sine * size)
     cos, sin = np.cos(np.deg2rad(TURN_DEG)), np.sin(np.deg2rad(TURN_DEG))
-    turn, middle = np.array([[cos, -sin], [sin, cos]]), np.array([SIDE / 2 + 0.2, SIDE / 2 - 0.3])
+    turn = np.array([[cos, -sin], [sin, cos]])
+    middle = np.array([SIDE / 2 + 0.2, SIDE / 2 - 0.3])
     affine = np.column_stack([turn, middle - turn @ np.full(2, (EDGE - 1) / 2)])
-    grid = np.argwhere(np.ones((EDGE, EDGE), bool))
-    coordinates = grid @ turn.T + affine[:, 2]
+    coordinates = np.argwhere(np.ones((EDGE, EDGE), bool)) @ turn.T + affine[:, 2]
     lines = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
     samples = waves.at(lines).astype(np.float32).reshape(SIDE, SIDE, bands)
     return Turned(samples, coordinates, affine, waves.at(coordinates))
@@ -96,10 +99,9 @@ def _by_pixel(planes: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _cv2_remap(scene: Turned, order: int) -> Peer:
     """Split the sweep into groups of bands before the timing; the result is joined, as the other libraries give it."""
-    parts, joined = cv2_parts(scene, order), np.empty((EDGE, EDGE, BANDS), np.float32)
-    return Peer(
-        "cv2.remap", lambda: np.concatenate(parts(), axis=2, out=joined), lambda _: joined.reshape(-1, BANDS), BANDS
-    )
+    parts = cv2_parts(scene, order)
+    out = np.empty((EDGE, EDGE, BANDS), np.float32)
+    return Peer("cv2.remap", lambda: np.concatenate(parts(), axis=2, out=out), lambda _: out.reshape(-1, BANDS), BANDS)
 
 
 def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32]]]:
@@ -121,7 +123,6 @@ def cv2_parts(scene: Turned, order: int) -> Callable[[], list[NDArray[np.float32
 
 
 def _grid_sample(scene: Turned, order: int) -> Peer:
-
     mode = {0: "nearest", 1: "bilinear", 3: "bicubic"}[order]
     grid = (scene.coordinates[:, ::-1] / (SIDE - 1) * 2 - 1).astype(np.float32).reshape(1, EDGE, EDGE, 2)
     image = torch.from_numpy(scene.planes)[None].contiguous(memory_format=torch.channels_last)  # half the time of NCHW
@@ -136,7 +137,8 @@ def _grid_sample(scene: Turned, order: int) -> Peer:
 def _map_coordinates(scene: Turned, order: int) -> Peer:
     from scipy.ndimage import map_coordinates
 
-    planes, at = scene.planes[:FEW], scene.coordinates.T
+    planes = scene.planes[:FEW]
+    at = scene.coordinates.T
     return Peer(
         "scipy map_coordinates" if order < 3 else "scipy spline",
         lambda: [map_coordinates(plane, at, order=order, mode="mirror") for plane in planes],
@@ -151,10 +153,9 @@ def _skimage_warp(scene: Turned, order: int) -> Peer:
     planes = scene.planes[:FEW]
     (yy, yx, y0), (xy, xx, x0) = scene.affine  # skimage's matrix takes (x, y)
     turn = AffineTransform(matrix=np.array([[xx, xy, x0], [yx, yy, y0], [0, 0, 1]]))
-    shape = (EDGE, EDGE)
     return Peer(
         "skimage warp",
-        lambda: [warp(plane, turn, output_shape=shape, order=order, preserve_range=True) for plane in planes],
+        lambda: [warp(plane, turn, output_shape=(EDGE, EDGE), order=order, preserve_range=True) for plane in planes],
         lambda out: _by_pixel(np.stack(out)),
         FEW,
     )
@@ -165,7 +166,8 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
     from rasterio.warp import Resampling, reproject
 
     kernel = {0: Resampling.nearest, 1: Resampling.bilinear, 3: Resampling.cubic}[order]
-    planes, out = scene.planes, np.zeros((BANDS, EDGE, EDGE), np.float32)
+    planes = scene.planes
+    out = np.zeros((BANDS, EDGE, EDGE), np.float32)
     (yy, yx, y0), (xy, xx, x0) = scene.affine
     # Its coordinates start at the corner of the first pixel, with y upwards.
     grid = Affine(xx, xy, x0 + 0.5 - (xx + xy) / 2, -yx, -yy, -(y0 + 0.5 - (yx + yy) / 2))

@@ -68,14 +68,12 @@ def _bounds(cases: Mapping[int, Case], what: str) -> list[Row]:
         for trial in trials(case, (1, 2 + number % (MOST_BINNING - 1))):
             found[trial.effect, trial.variant].append((number, trial))
     spent = time.process_time() - began
-    kept = [_of_effect(*key, tried, what) for key, tried in found.items()]
     broken = sum(trial.is_broken for tried in found.values() for _, trial in tried)
-    count = sum(map(len, found.values()))
     return [
-        *kept,
+        *(_of_effect(*key, tried, what) for key, tried in found.items()),
         Row(
             f"bounds over {len(cases)} {what}, each as samples and in sums of 2 to {MOST_BINNING}",
-            f"{broken} of {count} broken",
+            f"{broken} of {sum(map(len, found.values()))} broken",
             "0",
             broken == 0,
             f"{spent:.0f} s of processor time",

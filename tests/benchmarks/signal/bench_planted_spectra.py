@@ -36,12 +36,15 @@ from storage.arrays.cubes import open_raw_cubes
 
 SHAPES = {"1 px": (1, 1), "2 x 2 px": (2, 2), "line of 8 px": (1, 8)}
 STRENGTHS = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # standard deviations of the noise a band; the goal holds from 1 on
-PLANTED, APART, SMOOTH = 1000, 16, 8  # of each kind; px between places; bands over which a signature is smooth
+PLANTED = 1000  # of each kind
+APART = 16  # px between places
+SMOOTH = 8  # bands over which a signature is smooth
 ALARMS = 1.0  # false alarms in a field
 LIMITS = 24  # signatures by which the filter's threshold is set
 FARM = ("--scene", "farm", "--seed", "11", "--size", "512x384", "--seconds", "12")
 
 Values = NDArray[np.float32]
+Numbers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -130,15 +133,17 @@ def _limit(field: Condensed, shape: tuple[int, int], rng: np.random.Generator) -
     filters = _filters(field, _signatures(LIMITS, field.components.noise, rng)).astype(np.float32)
     clean = np.nan_to_num(field.values - np.nan_to_num(field.components.mean).astype(np.float32))
     maps = clean @ filters.T
-    size = shape[0] * shape[1]
-    return float(np.median(uniform_filter(maps, (*shape, 1)).max(axis=(0, 1)) * np.sqrt(size)))
+    return float(np.median(uniform_filter(maps, (*shape, 1)).max(axis=(0, 1)) * np.sqrt(shape[0] * shape[1])))
 
 
 def _trial(
     field: Condensed, shape: tuple[int, int], strength: float, limit: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], float]:
     """Return for each planted place: found in raw lines, in restored ones, all px rare; and the largest rare error."""
-    found, kept, marked, error = list[bool](), list[bool](), list[bool](), 0.0
+    found: list[bool] = []
+    kept: list[bool] = []
+    marked: list[bool] = []
+    error = 0.0
     mean = np.nan_to_num(field.components.mean)
     while len(found) < PLANTED:
         line, sample = _places(field.ratio, shape, rng)
@@ -162,15 +167,12 @@ def _trial(
     return np.array(found), np.array(kept), np.array(marked), error
 
 
-def _places(
-    ratio: Values, shape: tuple[int, int], rng: np.random.Generator
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _places(ratio: Values, shape: tuple[int, int], rng: np.random.Generator) -> tuple[Numbers, Numbers]:
     """Return lines and samples (place, px) of shapes that do not touch and lie on usable spectra."""
     top, left = rng.integers(0, APART - max(shape), 2)
     down = np.arange(top, ratio.shape[0] - shape[0], APART)
     across = np.arange(left, ratio.shape[1] - shape[1], APART)
     first = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 1, 2)
     line, sample = np.moveaxis(first + np.array(list(np.ndindex(shape))), -1, 0)
-    usable = np.isfinite(ratio[line, sample]).all(axis=1)
-    order = rng.permutation(np.flatnonzero(usable))
+    order = rng.permutation(np.flatnonzero(np.isfinite(ratio[line, sample]).all(axis=1)))
     return line[order], sample[order]

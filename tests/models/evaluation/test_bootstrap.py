@@ -54,7 +54,8 @@ def test_differing_seeds_widen_the_interval():
     """Equal frames alone give no width; unequal seeds do, and both rows share their draw of seeds."""
     good, bad = np.eye(3, dtype=np.int64) * 9, np.eye(3, dtype=np.int64) + 2
     first = np.stack([np.stack([good] * 4), np.stack([bad] * 4)])
-    second, two = np.stack([np.stack([good] * 4)] * 2), np.arange(2)
+    second = np.stack([np.stack([good] * 4)] * 2)
+    two = np.arange(2)
     assert paired_interval(first, second, draws=50).low == pytest.approx(paired_interval(first, second).high)
     wide = paired_interval(first, second, seeds=(two, two), draws=50)
     assert wide.low == pytest.approx(mean_iou(4 * bad) - 1)

@@ -18,7 +18,8 @@ from models.evaluation.expected_scores import (
 )
 from models.evaluation.metrics import confusion, iou_per_class, mean_iou
 
-CLASSES, PLAIN = 4, (LEAST_ERROR, 1, 100.0)
+CLASSES = 4
+PLAIN = (LEAST_ERROR, 1, 100.0)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -34,8 +35,7 @@ def _map(seed: int, pixels: int = 4000, *, hotter: float = 1.0) -> tuple[np.ndar
 
 def _scored(seed: int, hotter: float = 1.0) -> ScoredMap:
     said, labels = _map(seed, hotter=hotter)
-    counts = confusion(labels, said.argmax(axis=1).astype(np.uint8), CLASSES)
-    return ScoredMap(counts, expected_counts([said], CLASSES))
+    return ScoredMap(confusion(labels, said.argmax(axis=1).astype(np.uint8), CLASSES), expected_counts([said], CLASSES))
 
 
 @given(SEEDS, st.integers(0, 200))
@@ -71,15 +71,15 @@ def test_a_calibrated_map_expects_its_true_score(seed: int):
     """If labels are drawn by the probabilities, IoU is within 0.06 of the expected IoU, and mIoU within 0.04."""
     one = _scored(seed)
     assert np.abs(iou_per_class(one.expected) - iou_per_class(one.counts)).max() < 0.06
-    told = expected_score(one.expected, np.zeros(CLASSES), *PLAIN)
-    assert abs(told.miou - mean_iou(one.counts)) < 0.04
+    assert abs(expected_score(one.expected, np.zeros(CLASSES), *PLAIN).miou - mean_iou(one.counts)) < 0.04
 
 
 @pytest.mark.parametrize("hotter", [0.5, 2.0])
 def test_fitted_bias_corrects_miscalibrated_maps(hotter: float):
     """The bias of other maps of the same kind leaves a third of the error at most."""
-    maps, other = [_scored(seed, hotter) for seed in range(6)], _scored(77, hotter)
-    bias, truth = fitted_bias(maps), mean_iou(other.counts)
+    other = _scored(77, hotter)
+    bias = fitted_bias([_scored(seed, hotter) for seed in range(6)])
+    truth = mean_iou(other.counts)
     off = expected_score(other.expected, np.zeros(CLASSES), *PLAIN).miou - truth
     assert abs(off) > 0.03
     assert abs(expected_score(other.expected, bias, *PLAIN).miou - truth) < abs(off) / 3
@@ -141,10 +141,8 @@ def test_the_error_of_passes_is_cross_validated():
 
 
 def _scores() -> MapScores:
-    scan_passes = {
-        (step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)
-    }
-    return MapScores.fitted(scan_passes)
+    maps = {(step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)}
+    return MapScores.fitted(maps)
 
 
 def test_scores_round_trip_through_a_record():
@@ -158,7 +156,8 @@ def test_scores_round_trip_through_a_record():
 
 def test_scores_are_interpolated_by_the_logarithm_of_exposure():
     """16 ms lies halfway between 4 and 64 ms; the scores at the ends are those measured."""
-    scores, counts = _scores(), _scored(50).expected
+    scores = _scores()
+    counts = _scored(50).expected
     first, middle, last = (scores.expected(counts, 2, ms) for ms in (4.0, 16.0, 64.0))
     assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0], 2, 4.0).miou
     assert middle.miou == pytest.approx((first.miou + last.miou) / 2, abs=0.005)

@@ -66,8 +66,7 @@ def test_scores_of_six_pixels_are_those_worked_out_by_hand():
 
 def test_kappa_is_0_for_agreement_by_chance():
     """A perfect map has kappa 1, and a single class has none."""
-    chance = np.outer([30, 70], [40, 60])
-    assert metrics.kappa(chance) == pytest.approx(0)
+    assert metrics.kappa(np.outer([30, 70], [40, 60])) == pytest.approx(0)
     assert metrics.kappa(np.diag([3, 4])) == 1
     assert np.isnan(metrics.kappa(np.array([[5, 0], [0, 0]])))
 
@@ -134,7 +133,8 @@ def test_gap_closed_needs_a_gap_of_one_point():
 
 def test_calibration_error_compares_confidence_with_accuracy():
     """An error of 0.8 in 10 of 40 pixels gives 0.2; counts of two maps add up; without a pixel the error is NaN."""
-    nine, right = np.full(10, 0.9), np.arange(10) < 9
+    nine = np.full(10, 0.9)
+    right = np.arange(10) < 9
     assert metrics.calibration_error(metrics.confidence_counts(nine, right)) == pytest.approx(0, abs=1e-12)
     assert metrics.calibration_error(metrics.confidence_counts(nine, ~right)) == pytest.approx(0.8)
     assert metrics.calibration_error(metrics.confidence_counts(np.array([0.0, 1.0]), np.array([False, True]))) == 0

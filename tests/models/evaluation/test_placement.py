@@ -14,20 +14,20 @@ from models.evaluation.metrics import agreement, confusion, mean_iou
 from models.reading.inference import coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, scene_columns
+from tests.models.conftest import make_weights, scene_columns
 
 
-def _two_classes(tiny: Maker, height: int = 24, width: int = 32):
-    weights = tiny(classes=2)
+def _two_classes(height: int = 24, width: int = 32):
+    weights = make_weights(classes=2)
     coarse_pass, fine = scene_columns(weights, height, width)
     seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
     labels = np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8)
     return weights, coarse_pass.grid, seen, fine, labels
 
 
-def test_oracle_gain_is_the_loss_that_patches_remove(tiny: Maker):
+def test_oracle_gain_is_the_loss_that_patches_remove():
     """With two classes a map's confidence gives its loss: the gain is the overview's loss less the full map's."""
-    weights, grid, seen, fine, labels = _two_classes(tiny)
+    weights, grid, seen, fine, labels = _two_classes()
 
     def loss(patch_index: np.ndarray) -> np.ndarray:
         drawn = segment(weights, seen, fine[patch_index], patch_index)
@@ -41,9 +41,9 @@ def test_oracle_gain_is_the_loss_that_patches_remove(tiny: Maker):
     assert placement.oracle_gain(weights, seen, fine, labels) == pytest.approx(expected, abs=1e-4)
 
 
-def test_an_unlabelled_patch_has_no_gain(tiny: Maker):
+def test_an_unlabelled_patch_has_no_gain():
     """A patch without a labelled pixel has a gain of exactly 0, and no gain exceeds 5."""
-    weights, _, seen, fine, labels = _two_classes(tiny, 20, 30)
+    weights, _, seen, fine, labels = _two_classes(20, 30)
     labels[:8, :8] = 255
     gain = placement.oracle_gain(weights, seen, fine, labels)
     assert gain[0] == 0
@@ -66,21 +66,21 @@ def _scene(weights: Weights) -> placement.ReadTwice:
     coarse_pass, _ = scene_columns(weights, 30, 45)
     labels = np.random.default_rng(2).integers(0, 3, (30, 45)).astype(np.uint8)
     labels[:3] = 255
-    return placement.ReadTwice.of(
-        weights, coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid), labels
-    )
+    seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
+    return placement.ReadTwice.of(weights, seen, labels)
 
 
 def _run(weights: Weights, fraction: float = 0.35, seed: int = 0) -> placement.Placements:
     return placement.run_controls(_scene(weights), weights.config.classes, fraction=fraction, seed=seed)
 
 
-def test_mixing_two_maps_equals_segmenting_the_patches(tiny: Maker):
+def test_mixing_two_maps_equals_segmenting_the_patches():
     """A patch's pixels do not depend on which other patches are read, so both give the same counts."""
-    weights = tiny()
+    weights = make_weights()
     coarse_pass, _ = scene_columns(weights, 30, 45)
     seen = coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid)
-    scene, some = _scene(weights), np.random.default_rng(4).random(seen.grid.patch_shape) < 0.5
+    scene = _scene(weights)
+    some = np.random.default_rng(4).random(seen.grid.patch_shape) < 0.5
     index = np.flatnonzero(some)
     drawn = segment(weights, seen, seen.patches(index), index)
     expected = confusion(scene.labels, drawn.classes, weights.config.classes)
@@ -88,17 +88,17 @@ def test_mixing_two_maps_equals_segmenting_the_patches(tiny: Maker):
     np.testing.assert_array_equal(scene.counts(some, weights.config.classes), expected)
 
 
-def test_every_row_counts_every_labelled_pixel(tiny: Maker):
+def test_every_row_counts_every_labelled_pixel():
     """Each placement segments the whole scene; the random one does so several times."""
-    rows = _run(tiny())
+    rows = _run(make_weights())
     assert {int(counts.sum()) for draws in rows.values() for counts in draws} == {27 * 45}
     assert list(rows) == ["none", "all", "gain", "entropy", "sobel", "random"]
     assert len(rows["random"]) == placement.RANDOM_DRAWS
 
 
-def test_random_rows_follow_the_seed(tiny: Maker):
+def test_random_rows_follow_the_seed():
     """Equal seeds draw equal placements, other seeds others, and the draws of one run differ."""
-    weights = tiny()
+    weights = make_weights()
     first, same, other = (np.array(_run(weights, seed=seed)["random"]) for seed in (1, 1, 2))
     assert (first == same).all()
     assert (first != other).any()
@@ -112,16 +112,15 @@ def _counts(right: int) -> np.ndarray:
 def test_placement_figures_are_those_worked_out_by_hand():
     """The figures are mIoU, accuracy, the closed fraction of the gap, and mean and spread of the random draws."""
     draws = [_counts(62), _counts(66), _counts(64)]
-    rows = placement.placement_figures(
-        {"none": [_counts(60)], "all": [_counts(90)], "entropy": [_counts(80)], "random": draws}
-    )
+    rows = {"none": [_counts(60)], "all": [_counts(90)], "entropy": [_counts(80)], "random": draws}
+    figures = placement.placement_figures(rows)
     none, every, entropy = (mean_iou(_counts(right)) for right in (60, 90, 80))
     closed = (entropy - none) / (every - none)
-    assert rows["entropy"] == {**agreement(_counts(80)), "spread": None, "gap_closed": closed}
+    assert figures["entropy"] == {**agreement(_counts(80)), "spread": None, "gap_closed": closed}
     drawn = [mean_iou(one) for one in draws]
-    figures = {"miou": np.mean(drawn), "overall_accuracy": 0.64}
     closed = (np.mean(drawn) - none) / (every - none)
-    assert rows["random"] == pytest.approx({**figures, "spread": np.std(drawn, ddof=1), "gap_closed": closed})
+    expected = {"miou": np.mean(drawn), "overall_accuracy": 0.64, "spread": np.std(drawn, ddof=1), "gap_closed": closed}
+    assert figures["random"] == pytest.approx(expected)
 
 
 def test_one_draw_has_no_spread_and_a_small_gap_no_fraction():

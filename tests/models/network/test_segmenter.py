@@ -24,7 +24,8 @@ IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 @pytest.mark.parametrize("size", [(1, 1), (37, 53), (64, 65)])
 def test_partial_tokens_are_read_with_a_repeated_border(size: tuple[int, int]):
     """An image of any size has the overview of the same image padded with its border to whole tokens."""
-    model, image = make_network(), IMAGE[..., : size[0], : size[1]]
+    model = make_network()
+    image = IMAGE[..., : size[0], : size[1]]
     whole = F.pad(image, (0, -size[1] % 32, 0, -size[0] % 32), mode="replicate")
     own, expected = model.read_overview(image), model.read_overview(whole)
     assert own.logits.shape[2:] == own.features.shape[2:] == size
@@ -34,7 +35,8 @@ def test_partial_tokens_are_read_with_a_repeated_border(size: tuple[int, int]):
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (40, 7)])
 def test_means_around_a_pixel_ignore_what_is_beyond_the_border(size: tuple[int, int]):
-    image, reach = noise(1, 1, 3, *size), AROUND_PX // 2
+    image = noise(1, 1, 3, *size)
+    reach = AROUND_PX // 2
     for y, x in np.ndindex(size):
         around = image[..., max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1]
         assert (mean_around(image)[..., y, x] - around.mean(dim=(2, 3))).abs().max() <= 1e-5
@@ -43,12 +45,15 @@ def test_means_around_a_pixel_ignore_what_is_beyond_the_border(size: tuple[int, 
 @torch.inference_mode()
 def test_a_patch_depends_on_its_own_pixels_and_overview_only():
     """Other patches, their order and the overview elsewhere do not change it."""
-    model, numbers = make_network(), torch.tensor([[5, 95, 13]])
-    overview, patches = model.read_overview(IMAGE), cut(IMAGE.flip(2), 8)[:, numbers[0]]
+    model = make_network()
+    numbers = torch.tensor([[5, 95, 13]])
+    overview = model.read_overview(IMAGE)
+    patches = cut(IMAGE.flip(2), 8)[:, numbers[0]]
     read = model.read_patches(overview, patches, numbers)
     alone = model.read_patches(overview, patches[:, 2:], numbers[:, 2:])
     assert (alone - read[:, 2:]).abs().max() <= 1e-5
-    moved, other = model.read_overview(IMAGE), patches.clone()
+    moved = model.read_overview(IMAGE)
+    other = patches.clone()
     moved.features[..., 8:16, 8:16] += 1  # under patch 13
     other[:, 1] += 1
     for seen, which in (((moved, patches), 2), ((overview, other), 1)):
@@ -59,8 +64,11 @@ def test_a_patch_depends_on_its_own_pixels_and_overview_only():
 @torch.inference_mode()
 def test_composite_places_patches_by_their_numbers():
     """All other pixels have the overview's logits; each scene has its own patches, and there may be none."""
-    model, overview, fine = make_network(), noise(0, 2, 3, 16, 32), noise(1, 2, 3, 3, 8, 8)
-    patch_index, expected = torch.tensor([[0, 5, 7], [6, 1, 2]]), overview.clone()
+    model = make_network()
+    overview = noise(0, 2, 3, 16, 32)
+    fine = noise(1, 2, 3, 3, 8, 8)
+    patch_index = torch.tensor([[0, 5, 7], [6, 1, 2]])
+    expected = overview.clone()
     for scene in range(2):
         for place, number in enumerate(patch_index[scene].tolist()):
             y, x = number // 4 * 8, number % 4 * 8
@@ -71,7 +79,8 @@ def test_composite_places_patches_by_their_numbers():
 
 def test_every_parameter_has_a_gradient():
     """The loss is that of a map with some patches."""
-    model, numbers = make_network(layers=2), torch.tensor([[3, 0, 9]])
+    model = make_network(layers=2)
+    numbers = torch.tensor([[3, 0, 9]])
     logits, patches = model(IMAGE, IMAGE, numbers, torch.zeros(1, 2))
     model.composite(logits, patches, numbers).square().mean().backward()
     idle = [name for name, value in model.named_parameters() if value.grad is None or not value.grad.any()]
@@ -85,9 +94,8 @@ def test_stem_and_head_keep_the_size_of_an_image(patch: int):
     widths = level_widths(8, patch)
     assert widths[:3] == [8, 16, 24][: len(widths)]
     features = Stem(5, widths)(torch.zeros(3, 5, patch, 2 * patch))
-    assert [tuple(level.shape) for level in features] == [
-        (3, width, patch >> i, 2 * patch >> i) for i, width in enumerate(widths)
-    ]
+    shapes = [(3, width, patch >> i, 2 * patch >> i) for i, width in enumerate(widths)]
+    assert [tuple(level.shape) for level in features] == shapes
     assert features[-1].shape[2] == 4
     assert Head(widths)(features).shape == (3, 8, patch, 2 * patch)
 
@@ -111,7 +119,8 @@ def test_multiply_adds_equal_the_counter(sizes: dict[str, int], patch_index: int
     """The closed form counts just what torch counts while the model runs."""
     config = SegmenterConfig(classes=5, columns=6, **sizes)
     grid = SceneGrid(64, width, config.patch)
-    model, image = Segmenter(config).eval(), torch.zeros(1, 6 + PLANES, *grid.padded_shape)
+    model = Segmenter(config).eval()
+    image = torch.zeros(1, 6 + PLANES, *grid.padded_shape)
     attention = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
     flops = {attention: lambda q, k, v, *args, out_shape=None, **kwargs: sdpa_flop_count(q, k, v)}
     counter = FlopCounterMode(display=False, custom_mapping=flops)
@@ -124,22 +133,23 @@ def test_multiply_adds_of_the_temporal_reader_equal_the_counter() -> None:
     """The closed form covers fine and coarse pixels."""
     sizes = TemporalSizes(classes=5, columns=6)
     fine, coarse = torch.zeros(1, 1, 16, 24), torch.zeros(1, 6, 16 // CELL_PX, 24 // CELL_PX)
-    scores, one, counter = fine.expand(1, 5, 16, 24), torch.ones(1), FlopCounterMode(display=False)
+    scores = fine.expand(1, 5, 16, 24)
+    one = torch.ones(1)
+    reader = TemporalReader(sizes).eval()
+    counter = FlopCounterMode(display=False)
     with torch.inference_mode(), counter:
-        TemporalReader(sizes).eval()(
-            scores, scores, fine, fine, fine, one, one, torch.zeros(1, 2), coarse, coarse, coarse[:, :1]
-        )
+        reader(scores, scores, fine, fine, fine, one, one, torch.zeros(1, 2), coarse, coarse, coarse[:, :1])
     assert sizes.multiply_adds(16 * 24) == counter.get_total_flops() / 2
 
 
 def test_multiply_adds_are_proportional_to_patches() -> None:
     """Columns are computed from each band, again for patches captured separately; those of the policy are added."""
-    config, grid = SegmenterConfig(classes=5), SceneGrid(250, 256, 16)
+    config = SegmenterConfig(classes=5)
+    grid = SceneGrid(250, 256, 16)
     one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
     assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
     assert 20 * one.detail == many.detail == bare.detail
-    apart = multiply_adds(config, grid, 20, 270, apart=True)
-    assert apart.detail == bare.detail + 20 * 16**2 * 270 * config.columns
+    assert multiply_adds(config, grid, 20, 270, apart=True).detail == bare.detail + 20 * 16**2 * 270 * config.columns
     assert many.total == many.overview + many.detail + 9
 
 

@@ -18,7 +18,8 @@ def test_bands_in_any_order_give_the_same_columns(nanometres: list[int], random)
     """Permuting bands together with their wavelengths, also repeated ones, changes no column."""
     order = list(range(len(nanometres)))
     random.shuffle(order)
-    wavelength, values = np.array(nanometres, float), np.cos(np.arange(len(nanometres)))
+    wavelength = np.array(nanometres, float)
+    values = np.cos(np.arange(len(nanometres)))
     matrix, reached = BASIS.matrix(wavelength)
     shuffled, same = BASIS.matrix(wavelength[order])
     assert (reached == same).all()
@@ -65,16 +66,17 @@ def test_normalised_columns_are_uncorrelated():
 
 def test_more_light_is_a_gain_and_a_shift():
     """A fraction e more light multiplies normalised columns by 1 + e and adds e times the gain shift."""
-    normalisation, reached = Normalisation.measured(_sample()), np.ones(5, bool)
-    bright = normalisation.apply(_sample() * 1.1, reached)
+    normalisation = Normalisation.measured(_sample())
+    reached = np.ones(5, bool)
     expected = normalisation.apply(_sample(), reached) * 1.1 + 0.1 * normalisation.gain_shift
-    assert bright == pytest.approx(expected, abs=1e-3)
+    assert normalisation.apply(_sample() * 1.1, reached) == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_missing_values_are_predicted_from_the_others(bad: float):
     """A value that is not finite counts as a column that no band reaches; without any value the median is taken."""
-    normalisation, known = Normalisation.measured(_sample()), np.array([True, True, False, False, True])
+    normalisation = Normalisation.measured(_sample())
+    known = np.array([True, True, False, False, True])
     broken = np.stack([np.full(5, 0.4), np.where(known, 0.5, bad), np.full(5, bad)])
     found = normalisation.apply(broken, np.ones(5, bool))
     assert found[0] == pytest.approx(normalisation.apply(broken[0], np.ones(5, bool)), abs=1e-5)
@@ -84,7 +86,8 @@ def test_missing_values_are_predicted_from_the_others(bad: float):
 
 def test_unreached_columns_are_predicted_by_regression():
     """The error of a column that nearly repeats its neighbours is that of a least-squares fit, within 2 %."""
-    sample, reached = _sample(), np.array([True, True, False, True, True])
+    sample = _sample()
+    reached = np.array([True, True, False, True, True])
     normalisation = Normalisation.measured(sample)
     normal = (sample - normalisation.centre) / normalisation.spread
     fitted, *_ = np.linalg.lstsq(normal[:, reached], normal[:, 2], rcond=None)
@@ -98,7 +101,8 @@ def test_unreached_columns_are_predicted_by_regression():
 @given(st.floats(0.01, 1), st.floats(1, 16), st.floats(1, 16), st.integers(0, 2))
 def test_capture_planes_are_0_at_the_reference(light: float, step: float, binned: float, at: int):
     """Half the exposure adds a quarter, twice the spacing or binning a half, each to its own plane alone."""
-    here, factor = LineSpec(light, step, binned), [1.0, 1.0, 1.0]
+    here = LineSpec(light, step, binned)
+    factor = [1.0, 1.0, 1.0]
     factor[at] = 0.5 if at == 0 else 2.0
     more = LineSpec(light * factor[0], step * factor[1], binned * factor[2])
     assert more.planes - here.planes == pytest.approx(np.eye(3)[at] * [0.25, 0.5, 0.5], abs=1e-5)

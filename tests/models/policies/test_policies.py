@@ -32,8 +32,8 @@ def test_entropy_ranges_from_0_to_the_log_of_classes(classes: int):
 
 def _of_classes(*probability: tuple[float, ...], filled: NDArray[np.bool_] | None = None) -> CoarsePrediction:
     """Return patches of one pixel in a row, each with its own probabilities."""
-    grid, shown = SceneGrid(1, len(probability), 1), np.array([probability], np.float32)
-    return CoarsePrediction(grid, shown, shown, filled=filled)
+    shown = np.array([probability], np.float32)
+    return CoarsePrediction(SceneGrid(1, len(probability), 1), shown, shown, filled=filled)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6))
@@ -65,8 +65,7 @@ def test_pixels_without_data_do_not_count_in_fractions():
     alone, every = (_of_classes(*shown, filled=np.array([[False, False, lost]])) for lost in (True, False))
     assert score_patches("gain", alone)[0] == pytest.approx(0.5)
     assert score_patches("gain", every)[0] == pytest.approx((0.25 * 3 / 2 + 0.25 * 3) / 2)
-    nothing = _of_classes(*shown, filled=np.ones((1, 3), np.bool_))
-    assert score_patches("gain", nothing) == pytest.approx([0.5, 0.5, 0])
+    assert score_patches("gain", _of_classes(*shown, filled=np.ones((1, 3), np.bool_))) == pytest.approx([0.5, 0.5, 0])
 
 
 def test_entropy_scores_unsure_pixels():
@@ -132,7 +131,8 @@ def test_a_border_patch_scores_by_its_fraction(policy: str):
 def test_class_fractions_are_those_of_the_field():
     """Parts of a field score as they do together; a class that is rare in one may be frequent in another."""
     shown = np.random.default_rng(1).dirichlet((8, 1, 1), 12)
-    field, parts = _of_classes(*shown), [class_errors(_of_classes(*some)) for some in (shown[:4], shown[4:])]
+    field = _of_classes(*shown)
+    parts = [class_errors(_of_classes(*some)) for some in (shown[:4], shown[4:])]
     pixels = np.concatenate(parts)[:, 1].sum(axis=0)
     scores = np.concatenate([gain_of(part[:, 0], pixels) for part in parts])
     assert scores == pytest.approx(score_patches("gain", field))

@@ -82,7 +82,8 @@ def test_row_blocks_equal_the_whole_field(high: int, seed: int) -> None:
     """Read in some rows of patches at a time, counts, ages and expected errors are those of the field at once."""
     rng = np.random.default_rng(seed)
     probabilities = np.log(rng.dirichlet(np.ones(3), (8, 12))).astype(np.float32)
-    age, rows = np.where(rng.random((8, 12)) < 0.1, np.nan, rng.random((8, 12)) * 30), 4 * high
+    age = np.where(rng.random((8, 12)) < 0.1, np.nan, rng.random((8, 12)) * 30)
+    rows = 4 * high
     swaths = [(probabilities[top : top + rows], age[top : top + rows]) for top in range(0, 8, rows)]
     whole, parts = (PatchExpectedErrors.of(one, GRID, 3) for one in ([(probabilities, age)], swaths))
     assert np.array_equal(whole.pixels, parts.pixels)
@@ -94,8 +95,12 @@ def test_row_blocks_equal_the_whole_field(high: int, seed: int) -> None:
 
 def test_left_out_pixels_do_not_count() -> None:
     """Left-out pixels add neither errors nor ages; a patch of them alone has an infinite age."""
-    probabilities, age, left_out = believed(0.9), np.ones((8, 12)), np.zeros((8, 12), np.bool_)
-    left_out[:4, :5], probabilities[:, :6], age[0, 4] = True, np.nan, 50.0
+    probabilities = believed(0.9)
+    age = np.ones((8, 12))
+    left_out = np.zeros((8, 12), np.bool_)
+    left_out[:4, :5] = True
+    probabilities[:, :6] = np.nan
+    age[0, 4] = 50.0
     asked = PatchExpectedErrors.of([(probabilities, age)], GRID, 3, left_out=left_out)
     assert asked.pixels.sum(axis=(1, 2)).tolist() == [0, 12, 16, 16, 16, 16]
     assert asked.age_days.tolist() == [np.inf, 1, 1, 1, 1, 1]

@@ -14,7 +14,7 @@ from models.reading import inference
 from models.weights.files import Weights, with_record
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, noise, plain_weights, scene_columns
+from tests.models.conftest import make_weights, noise, plain_weights, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
@@ -25,16 +25,16 @@ def _values(height: int, width: int, bands: int = len(NM)) -> np.ndarray:
     return np.random.default_rng(0).uniform(0.1, 0.5, (height, width, bands)).astype(np.float32)
 
 
-def _seen(weights: Weights, height: int = 32, width: int = 48) -> tuple[inference.CoarsePrediction, np.ndarray]:
-    """Return the overview of a scene of noise, and other noise for every patch."""
+def _seen(height: int = 32, width: int = 48) -> tuple[Weights, inference.CoarsePrediction, np.ndarray]:
+    """Return weights, their overview of a scene of noise, and other noise for every patch."""
+    weights = make_weights()
     coarse_pass, fine = scene_columns(weights, height, width)
-    return inference.read_coarse_prediction(weights, coarse_pass), fine
+    return weights, inference.read_coarse_prediction(weights, coarse_pass), fine
 
 
-def test_a_map_without_patches_equals_the_overview(tiny: Maker):
+def test_a_map_without_patches_equals_the_overview():
     """Confidence and classes are those of its probabilities, softened by the weights' temperature."""
-    weights = tiny()
-    seen, fine = _seen(weights, 37, 53)
+    weights, seen, fine = _seen(37, 53)
     expected = seen.probability[:37, :53]
     drawn = inference.segment(weights, seen, fine[:0], NONE, every_class=True)
     assert drawn.confidence == pytest.approx(expected.max(axis=-1), abs=1e-6)
@@ -47,10 +47,9 @@ def test_a_map_without_patches_equals_the_overview(tiny: Maker):
     assert (softer.classes == drawn.classes).all()
 
 
-def test_a_patch_changes_only_its_own_pixels(tiny: Maker):
+def test_a_patch_changes_only_its_own_pixels():
     """All others are the overview's, bit by bit; exchanged patches both change, and their order does not matter."""
-    weights = tiny()
-    seen, fine = _seen(weights)
+    weights, seen, fine = _seen()
     patch_index = np.array([15, 3])
     without, drawn, moved, again = (
         inference.segment(weights, seen, fine[which], numbers).confidence
@@ -63,10 +62,9 @@ def test_a_patch_changes_only_its_own_pixels(tiny: Maker):
 
 
 @pytest.mark.parametrize("most", [1, 7])
-def test_patches_read_at_a_time_do_not_change_the_map(tiny: Maker, most: int, monkeypatch: pytest.MonkeyPatch):
+def test_patches_read_at_a_time_do_not_change_the_map(most: int, monkeypatch: pytest.MonkeyPatch):
     """Classes are the same, and confidence differs by 1e-6 at most."""
-    weights = tiny()
-    seen, fine = _seen(weights)
+    weights, seen, fine = _seen()
     patch_index = np.random.default_rng(1).permutation(24)[:15]
     whole = inference.segment(weights, seen, fine[patch_index], patch_index)
     monkeypatch.setattr(inference, "PATCHES_AT_ONCE", most)
@@ -78,14 +76,15 @@ def test_patches_read_at_a_time_do_not_change_the_map(tiny: Maker, most: int, mo
 
 @pytest.mark.parametrize("patch", [8, 32, 64])
 @pytest.mark.parametrize("origin", [(0, 0), (8, 40)])
-def test_a_region_is_segmented_like_a_training_crop(tiny: Maker, patch: int, origin: tuple[int, int]):
+def test_a_region_is_segmented_like_a_training_crop(patch: int, origin: tuple[int, int]):
     """The map is the composite that the training loss uses, at the same places, with both captures.
 
     Only exposures are stated as fainter.
     """
-    weights = tiny(patch=patch)
+    weights = make_weights(patch=patch)
     coarse_pass, fine = scene_columns(weights, 64, 128)
-    moved, patch_index = replace(coarse_pass, origin=origin, capture=DARK), np.array([1, 0])
+    moved = replace(coarse_pass, origin=origin, capture=DARK)
+    patch_index = np.array([1, 0])
     other = LineSpec(0.5)
     drawn = inference.segment(weights, moved, fine[patch_index], patch_index, capture=other)
     detail = np.zeros((64, 128, 4), np.float32)
@@ -95,7 +94,8 @@ def test_a_region_is_segmented_like_a_training_crop(tiny: Maker, patch: int, ori
         torch.from_numpy(with_planes(*one, fainter=inference.FAINTER)).permute(2, 0, 1)[None]
         for one in ((coarse_pass.columns, DARK), (detail, other))
     )
-    model, numbers = weights.segmenter, torch.from_numpy(patch_index)[None]
+    model = weights.segmenter
+    numbers = torch.from_numpy(patch_index)[None]
     with torch.inference_mode():
         places = torch.tensor([origin]).double() * patch / TOKEN_PX
         logits = model.composite(*model(*images, numbers, places), numbers)
@@ -104,10 +104,9 @@ def test_a_region_is_segmented_like_a_training_crop(tiny: Maker, patch: int, ori
     assert (drawn.confidence == here.confidence).all() == (origin == (0, 0))
 
 
-def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
+def test_a_prediction_keeps_its_overview(monkeypatch: pytest.MonkeyPatch):
     """Segmenting a prediction does not read the scene again."""
-    weights = tiny()
-    seen, fine = _seen(weights)
+    weights, seen, fine = _seen()
     monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
     inference.segment(weights, seen, fine[:1], np.array([0]))
 
@@ -120,11 +119,9 @@ def test_a_prediction_keeps_its_overview(tiny: Maker, monkeypatch: pytest.Monkey
         ([4, 1, 4], "patch 4 is given more"),
     ],
 )
-def test_invalid_patches_are_refused_before_reading(
-    tiny: Maker, numbers: list[int], words: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_invalid_patches_are_refused_before_reading(numbers: list[int], words: str, monkeypatch: pytest.MonkeyPatch):
     """The error names a patch outside of the scene, or one that is given twice."""
-    weights = tiny()
+    weights = make_weights()
     coarse_pass, fine = scene_columns(weights, 32, 48)
     monkeypatch.setattr(weights.segmenter, "read_overview", lambda *given: pytest.fail("read"))
     with pytest.raises(ShapeError, match=words):
@@ -132,21 +129,21 @@ def test_invalid_patches_are_refused_before_reading(
 
 
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
-def test_a_pass_in_row_blocks_equals_the_whole(tiny: Maker, bands: np.ndarray):
+def test_a_pass_in_row_blocks_equals_the_whole(bands: np.ndarray):
     """Rows of the mosaic in several blocks give the very same columns, whether bands reach all of them or not."""
-    weights, grid = tiny(), SceneGrid(37, 53, 8)
+    weights = make_weights()
+    grid = SceneGrid(37, 53, 8)
     values = _values(37, 53, len(bands))
     whole = inference.read_coarse_pass(weights, [values], bands, grid)
-    parts = inference.read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid)
-    assert (parts.columns == whole.columns).all()
+    assert (inference.read_coarse_pass(weights, np.split(values, [1, 9]), bands, grid).columns == whole.columns).all()
     assert whole.columns[:37, :53] == pytest.approx(weights.columns(values, bands), abs=1e-6)
     added = len(whole.columns) - 37
     assert (whole.columns[37:] == whole.columns[35 : 35 - added : -1]).all()  # the pad is a mirror image
 
 
-def test_map_of_columns_reads_every_patch(tiny: Maker):
+def test_map_of_columns_reads_every_patch():
     """The map equals a segmentation with all patches; a capture of other light gives another map."""
-    weights = tiny()
+    weights = make_weights()
     coarse_pass, _ = scene_columns(weights, 32, 48)
     every = coarse_pass.grid.every_patch()
     image = inference.coarse_prediction_of_columns(weights, coarse_pass.columns, coarse_pass.grid, DARK)
@@ -161,7 +158,9 @@ def test_map_of_columns_reads_every_patch(tiny: Maker):
 @pytest.mark.parametrize("more", [0, 1])
 def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     """A token with half of its pixels dead is read, with one more it is not; dead pixels take their patch's mean."""
-    weights, grid, values = plain_weights(), SceneGrid(60, 64, 8), _values(60, 64)
+    weights = plain_weights()
+    grid = SceneGrid(60, 64, 8)
+    values = _values(60, 64)
     whole = inference.read_coarse_pass(weights, [values], NM, grid).columns
     values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
     seen = inference.read_coarse_pass(weights, [values], NM, grid)
@@ -178,10 +177,9 @@ def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
 
 
 @pytest.mark.parametrize(("dead", "counts"), [(32, True), (33, False), (64, False)])
-def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(tiny: Maker, dead: int, counts: bool):
+def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(dead: int, counts: bool):
     """The map is then that without the patch; a patch with half of its pixels dead is read."""
-    weights = tiny()
-    seen, fine = _seen(weights)
+    weights, seen, fine = _seen()
     fine[5].reshape(64, 4)[:dead] = np.nan
     drawn, without = (
         inference.segment(weights, seen, fine[which], np.array(which)).confidence for which in ([4, 5, 6], [4, 6])
@@ -204,9 +202,9 @@ def test_logits_that_are_not_finite_give_no_class(value: float):
     assert (drawn.confidence[beside] == whole.confidence[beside]).all()
 
 
-def test_a_pass_without_dead_pixels_has_no_mask(tiny: Maker):
+def test_a_pass_without_dead_pixels_has_no_mask():
     """No token is left out, and no pixel is filled."""
-    seen = inference.read_coarse_pass(tiny(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
+    seen = inference.read_coarse_pass(make_weights(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
     assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
     assert seen.seen_columns is seen.columns
     assert inference.CoarsePass(seen.grid, seen.columns).capture == LineSpec()

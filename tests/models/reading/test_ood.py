@@ -25,10 +25,9 @@ def some_ood(seed: int = 0, components: int = 3, **changed: Any) -> OodDetector:
     """Return a detector of components far from each other, each with its own covariance, and noise."""
     rng = np.random.default_rng(seed)
     mixing = rng.normal(0, 1, (components, COLUMNS, COLUMNS))
-    covariance = mixing @ mixing.swapaxes(1, 2) + 0.1 * np.eye(COLUMNS)
     parts: dict[str, Any] = {
         "centres": rng.normal(0, 100, (components, COLUMNS)),
-        "covariance": covariance,
+        "covariance": mixing @ mixing.swapaxes(1, 2) + 0.1 * np.eye(COLUMNS),
         "shot": np.stack([0.1 * np.eye(COLUMNS)] * components),
         "read": 0.01 * np.eye(COLUMNS),
         "limits": some_limits(),
@@ -39,7 +38,8 @@ def some_ood(seed: int = 0, components: int = 3, **changed: Any) -> OodDetector:
 
 def spectra_of(ood_detector: OodDetector, count: int, seed: int = 1, light: float = 1.0) -> np.ndarray:
     """Return spectra drawn from the components, in their order, with the noise of the light."""
-    rng, noise = np.random.default_rng(seed), ood_detector.shot / light + ood_detector.read / light**2
+    rng = np.random.default_rng(seed)
+    noise = ood_detector.shot / light + ood_detector.read / light**2
     drawn = [
         rng.multivariate_normal(m, c + n, count)
         for m, c, n in zip(ood_detector.centres, ood_detector.covariance, noise, strict=True)
@@ -53,7 +53,8 @@ def test_distance_is_the_mahalanobis_distance(seed: int, light: float, readings:
     """The distance equals a float64 solution with the whole covariance, for spectra whose component is known."""
     ood_detector = some_ood(seed)
     pixels = spectra_of(ood_detector, 20, seed)
-    noise, wanted = (ood_detector.shot / light + ood_detector.read / light**2) / readings, []
+    noise = (ood_detector.shot / light + ood_detector.read / light**2) / readings
+    wanted = []
     for number, pixel in enumerate(pixels):
         apart = pixel - ood_detector.centres[number // 20]
         spread = ood_detector.covariance[number // 20] + noise[number // 20]
@@ -80,7 +81,8 @@ def test_fewer_bands_count_as_noisier() -> None:
 
 def test_a_pixel_without_columns_is_not_unknown() -> None:
     """A pixel without columns was not captured; a captured pixel far from all components is unknown."""
-    ood_detector, pixels = some_ood(), np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
+    ood_detector = some_ood()
+    pixels = np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
     told = ood_detector.unknown(pixels, rate=0.005, capture=LineSpec(binned=4), bands=10)
     assert told.tolist() == [False, False, True]
     assert ood_detector.unknown(pixels[:0], rate=0.005, capture=LineSpec(), bands=10).shape == (0,)
@@ -94,8 +96,7 @@ def test_a_capture_is_compared_with_its_own_limit() -> None:
     ood_detector = some_ood(covariance=even, shot=silent, read=silent[0], limits=limits)
     pixels = ood_detector.centres[0] + np.sqrt([[0.9], [2.0], [5.0], [7.0]])  # squared distances
     captures = [LineSpec(), LineSpec(step=1.5), LineSpec(step=2)]
-    told = [ood_detector.unknown(pixels, rate=0.01, capture=one, bands=10).sum() for one in captures]
-    assert told == [3, 2, 2]
+    assert [ood_detector.unknown(pixels, rate=0.01, capture=one, bands=10).sum() for one in captures] == [3, 2, 2]
 
 
 def test_limits_are_interpolated_between_measured_ones() -> None:

@@ -15,23 +15,7 @@ from numpy.typing import NDArray
 import models.reading.prior_map as prior_map
 from models.network.sizes import CELL_PX, TemporalSizes
 from models.network.temporal_reader import TemporalReader
-from models.reading.prior_map import (
-    FAINTEST,
-    ClassProbabilities,
-    CurrentVisit,
-    PriorMap,
-    TemporalAgreement,
-    as_captured,
-    carried,
-    changed_fractions,
-    changed_from,
-    compare,
-    faded,
-    first_probabilities,
-    fuse,
-    in_classes,
-    pooled,
-)
+from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, carried, first_probabilities, fuse
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
 CLASSES, COLUMNS = 3, 4
@@ -57,6 +41,14 @@ def a_prior_map(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: 
     return PriorMap(first_probabilities(coarse_pass), coarse_pass.coarse, days)
 
 
+def a_return(
+    seed: int, shape: tuple[int, int] = SHAPE, days: float = 3.0
+) -> tuple[np.random.Generator, PriorMap, CurrentVisit]:
+    """Return a prior map, the visit some days after it, and the generator that drew both."""
+    rng = np.random.default_rng(seed)
+    return rng, a_prior_map(rng, shape, days), an_observation(rng, shape)
+
+
 def a_reader(seed: int = 0) -> TemporalReader:
     """Return a temporal reader with random weights, none of them idle."""
     with torch.random.fork_rng(devices=[]):
@@ -71,7 +63,8 @@ READERS = pytest.mark.parametrize("reader", [None, a_reader()], ids=["without a 
 
 def test_exposure_of_visits_adds_up_and_fades() -> None:
     """After 30 days 1/e of the earlier exposure is left; lines 2 px apart give a quarter of theirs."""
-    rng, seen = np.random.default_rng(1), np.arange(SHAPE[1]) < np.full(SHAPE, 7)
+    rng = np.random.default_rng(1)
+    seen = np.arange(SHAPE[1]) < np.full(SHAPE, 7)
     visit = replace(an_observation(rng), light=0.4, seen=seen)
     after = fuse(a_prior_map(rng, days=30.0), visit, None)
     np.testing.assert_allclose(after.light, 0.0125 / math.e + np.where(seen, 0.1, 0.0), rtol=1e-5)
@@ -83,18 +76,17 @@ def test_fused_probabilities_sum_to_1(reader: TemporalReader | None, seed: int) 
     """Only raising the faintest classes to the stored minimum adds to the sum."""
     rng = np.random.default_rng(seed)
     after = fuse(a_prior_map(rng), an_observation(rng), reader)
-    assert after.log_probability.min() >= np.float32(FAINTEST)
+    assert after.log_probability.min() >= np.float32(prior_map.FAINTEST)
     total = np.exp(after.log_probability.astype(np.float64)).sum(axis=-1)
     assert total.min() > 1 - 1e-5
-    assert total.max() < 1 + CLASSES * math.exp(FAINTEST) + 1e-5
+    assert total.max() < 1 + CLASSES * math.exp(prior_map.FAINTEST) + 1e-5
 
 
 @READERS
 @given(seed=seeds)
 def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
     """A captured pixel has age 0; any other is older by the days between."""
-    rng = np.random.default_rng(seed)
-    memory, coarse_pass = a_prior_map(rng), an_observation(rng)
+    rng, memory, coarse_pass = a_return(seed)
     seen = rng.random(SHAPE) < 0.5
     after = fuse(
         replace(memory, probabilities=replace(memory.probabilities, age_days=np.full(SHAPE, 2.0, np.float32))),
@@ -108,8 +100,7 @@ def test_ages_grow_where_pixels_are_not_captured(reader: TemporalReader | None, 
 @given(seed=seeds)
 def test_a_fresh_prior_map_stays_where_pixels_are_not_captured(reader: TemporalReader | None, seed: int) -> None:
     """After 0 days its probabilities are the same but for rounding; captured pixels change."""
-    rng = np.random.default_rng(seed)
-    memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
+    rng, memory, coarse_pass = a_return(seed, days=0.0)
     seen = rng.random(SHAPE) < 0.5
     after = fuse(memory, replace(coarse_pass, seen=seen), reader).log_probability
     before = memory.probabilities.log_probability
@@ -121,8 +112,8 @@ def test_a_fresh_prior_map_stays_where_pixels_are_not_captured(reader: TemporalR
 @given(seed=seeds, days=st.floats(0, 0.99))
 def test_the_reader_is_phased_in_over_the_first_day(seed: int, days: float) -> None:
     """A pixel that was not captured moves from the prior map to the reader's result in proportion to the time."""
-    rng = np.random.default_rng(seed)
-    reader, memory = a_reader(seed), a_prior_map(rng, days=days)
+    reader = a_reader(seed)
+    memory = a_prior_map(np.random.default_rng(seed), days=days)
     before, after = np.exp(memory.probabilities.log_probability), np.exp(carried(memory, reader).log_probability)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prior_map, "SETTLED_DAYS", 1e-9)
@@ -133,8 +124,7 @@ def test_the_reader_is_phased_in_over_the_first_day(seed: int, days: float) -> N
 @READERS
 def test_unknown_pixels_take_the_other_source(reader: TemporalReader | None) -> None:
     """A visit fills an empty prior map, and the other way round; a pixel that is empty in both stays unknown."""
-    rng = np.random.default_rng(4)
-    memory, coarse_pass = a_prior_map(rng), an_observation(rng)
+    _, memory, coarse_pass = a_return(4)
     before, today = memory.probabilities.log_probability.copy(), coarse_pass.log_probability.copy()
     before[:8], today[4:12] = np.nan, np.nan
     ages = np.where(np.isnan(before[..., 0]), np.nan, 0.0).astype(np.float32)
@@ -143,7 +133,7 @@ def test_unknown_pixels_take_the_other_source(reader: TemporalReader | None) -> 
         replace(coarse_pass, log_probability=today),
         reader,
     )
-    np.testing.assert_array_equal(after.log_probability[:4], np.maximum(today[:4], np.float32(FAINTEST)))
+    np.testing.assert_array_equal(after.log_probability[:4], np.maximum(today[:4], np.float32(prior_map.FAINTEST)))
     assert np.isnan(after.log_probability[4:8]).all()
     assert np.isnan(after.age_days[4:8]).all()
     assert np.isfinite(after.log_probability[8:]).all()
@@ -154,11 +144,8 @@ def test_a_confident_visit_overrules_the_prior_map() -> None:
     """Without a reader 0.99 for another class wins over 0.9, and 0.6 does not; two that agree are surer together."""
     before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
     today = np.log(np.array([[[0.005, 0.99, 0.005], [0.2, 0.6, 0.2], [0.8, 0.1, 0.1]]], np.float32))
-    coarse = np.zeros((1, 1, COLUMNS), np.float32)
-    coarse_pass = CurrentVisit(today, np.ones((1, 3), np.bool_), coarse, 1.0, 1)
-    after = fuse(
-        PriorMap(first_probabilities(replace(coarse_pass, log_probability=before)), None, 0.0), coarse_pass, None
-    )
+    visit = CurrentVisit(today, np.ones((1, 3), np.bool_), np.zeros((1, 1, COLUMNS), np.float32), 1.0, 1)
+    after = fuse(PriorMap(first_probabilities(replace(visit, log_probability=before)), None, 0.0), visit, None)
     assert after.classes()[0].tolist() == [[1, 0, 0]]
     assert after.classes()[1][0, 2] == pytest.approx(0.9 * 0.8 / (0.9 * 0.8 + 2 * 0.05 * 0.1))
 
@@ -166,15 +153,17 @@ def test_a_confident_visit_overrules_the_prior_map() -> None:
 def test_a_prior_map_fades_to_equal_probabilities() -> None:
     """After many years all classes are equally likely; after 0 days nothing has faded."""
     told = log_probabilities(np.random.default_rng(1))
-    np.testing.assert_allclose(faded(told, np.full(SHAPE, 1e5, np.float32)), -math.log(CLASSES), atol=1e-6)
-    np.testing.assert_allclose(faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, FAINTEST), atol=1e-5)
+    np.testing.assert_allclose(prior_map.faded(told, np.full(SHAPE, 1e5, np.float32)), -math.log(CLASSES), atol=1e-6)
+    np.testing.assert_allclose(
+        prior_map.faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, prior_map.FAINTEST), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("shape", [(80, 36), (33, 21), (7, 5)])
 def test_row_blocks_are_fused_like_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
     """The field is read 8 rows at a time, and its border may cut a coarse pixel."""
-    rng = np.random.default_rng(7)
-    memory, coarse_pass, reader = a_prior_map(rng, shape), an_observation(rng, shape), a_reader(3)
+    _, memory, coarse_pass = a_return(7, shape)
+    reader = a_reader(3)
     whole = fuse(memory, coarse_pass, reader)
     monkeypatch.setattr(prior_map, "ROWS", 8)
     np.testing.assert_allclose(fuse(memory, coarse_pass, reader).log_probability, whole.log_probability, atol=2e-5)
@@ -184,15 +173,14 @@ def test_pooled_columns_are_means_of_known_pixels() -> None:
     """Each 2 x 2 block is averaged, also partial ones at the border; a column without a known pixel is NaN."""
     columns = np.arange(30, dtype=np.float32).reshape(3, 5, 2)
     columns[0, 1], columns[1, 2, 0], columns[:2, 2:4, 1] = np.nan, np.inf, np.nan
-    nan = math.nan
-    expected = [[[22 / 3, 25 / 3], [26 / 3, nan], [13, 14]], [[21, 22], [25, 26], [28, 29]]]
-    np.testing.assert_allclose(pooled(columns), np.array(expected, np.float32), rtol=1e-6)
+    expected = [[[22 / 3, 25 / 3], [26 / 3, math.nan], [13, 14]], [[21, 22], [25, 26], [28, 29]]]
+    np.testing.assert_allclose(prior_map.pooled(columns), np.array(expected, np.float32), rtol=1e-6)
 
 
 def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
     """Without the earlier coarse columns, or where they are NaN, those of the current visit may be anything."""
-    rng = np.random.default_rng(9)
-    memory, coarse_pass, reader = a_prior_map(rng), an_observation(rng), a_reader(5)
+    rng, memory, coarse_pass = a_return(9)
+    reader = a_reader(5)
     other = replace(coarse_pass, coarse=rng.normal(size=coarse_pass.coarse.shape).astype(np.float32))
     blind, nothing = replace(memory, coarse=None), replace(memory, coarse=np.full_like(coarse_pass.coarse, np.nan))
     found = [fuse(one, seen, reader).log_probability for one in (blind, nothing) for seen in (coarse_pass, other)]
@@ -203,15 +191,13 @@ def test_coarse_columns_without_a_counterpart_are_ignored() -> None:
 
 def test_an_untrained_reader_weighs_both_sources_by_its_gates() -> None:
     """The result is .73 of the prior map, and .27 of its product to the power .9 with the visit to the power .5."""
-    rng = np.random.default_rng(2)
-    memory, coarse_pass = a_prior_map(rng, days=0.0), an_observation(rng)
-    reader = TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()
+    _, memory, coarse_pass = a_return(2, days=0.0)
     old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.probabilities, coarse_pass))
     old /= old.sum(axis=-1, keepdims=True)
     product, replaced = old ** (1 / (1 + math.exp(-2.2))) * new**0.5, 1 / (1 + math.e)
     expected = (1 - replaced) * old + replaced * product / product.sum(axis=-1, keepdims=True)
-    found = fuse(memory, coarse_pass, reader).log_probability
-    np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)
+    found = fuse(memory, coarse_pass, TemporalReader(TemporalSizes(CLASSES, COLUMNS)).eval()).log_probability
+    np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(prior_map.FAINTEST)), atol=1e-5)
 
 
 @given(seed=seeds, order=st.permutations(range(CLASSES)))
@@ -219,18 +205,18 @@ def test_reordering_classes_and_back_changes_nothing(seed: int, order: list[int]
     """Probabilities move with their classes, and NaN stays."""
     told = log_probabilities(np.random.default_rng(seed))
     told[0, 0] = np.nan
-    there = in_classes(told, order)
+    there = prior_map.in_classes(told, order)
     np.testing.assert_allclose(there[1:], told[1:][..., order], atol=1e-6)
-    np.testing.assert_allclose(in_classes(there, np.argsort(order).tolist()), told, atol=1e-5)
+    np.testing.assert_allclose(prior_map.in_classes(there, np.argsort(order).tolist()), told, atol=1e-5)
     assert np.isnan(there[0, 0]).all()
 
 
 def test_a_removed_class_leaves_the_others_uncertain() -> None:
     """A removed class of 0.998 does not make another certain; with none removed, a new class starts uniform."""
     before = np.log(np.array([[[0.001, 0.001, 0.998]]], np.float32))
-    np.testing.assert_allclose(np.exp(in_classes(before, (0, 1, -1)))[0, 0], [0.25, 0.25, 0.5], atol=1e-3)
-    np.testing.assert_allclose(np.exp(in_classes(before, (0, 1)))[0, 0], [0.5, 0.5], atol=1e-6)
-    np.testing.assert_allclose(np.exp(in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
+    np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (0, 1, -1)))[0, 0], [0.25, 0.25, 0.5], atol=1e-3)
+    np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (0, 1)))[0, 0], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
 
 
 def test_another_field_is_detected_by_its_agreement() -> None:
@@ -239,11 +225,11 @@ def test_another_field_is_detected_by_its_agreement() -> None:
     memory = a_prior_map(rng)
     same = CurrentVisit(memory.probabilities.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
     whole = np.s_[:, :]
-    found = compare(memory, same, memory.probabilities, whole)
+    found = prior_map.compare(memory, same, memory.probabilities, whole)
     assert found.agreement == 1.0
     assert not found.is_of_another_field
-    assert compare(memory, an_observation(rng), memory.probabilities, whole).is_of_another_field
-    unseen = compare(memory, replace(same, seen=np.zeros(SHAPE, np.bool_)), memory.probabilities, whole)
+    assert prior_map.compare(memory, an_observation(rng), memory.probabilities, whole).is_of_another_field
+    unseen = prior_map.compare(memory, replace(same, seen=np.zeros(SHAPE, np.bool_)), memory.probabilities, whole)
     assert math.isnan(unseen.agreement)
     assert not unseen.is_of_another_field
 
@@ -253,7 +239,7 @@ def test_a_field_of_one_class_is_not_another_field() -> None:
     told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
     coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((12, 10, COLUMNS), np.float32), 1.0, 1)
     memory = PriorMap(first_probabilities(coarse_pass), None, 1.0)
-    assert not compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
+    assert not prior_map.compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
 
 
 def sure_of(classes: NDArray[np.integer], how: float) -> CurrentVisit:
@@ -272,17 +258,17 @@ def test_a_harvest_overnight_is_detected() -> None:
     memory = PriorMap(first_probabilities(before), before.coarse, 1.0)
     after = fuse(memory, today, None)
     assert not after.classes()[0].any()
-    found = compare(memory, today, after, np.s_[:, :])
+    found = prior_map.compare(memory, today, after, np.s_[:, :])
     assert not found.is_of_another_field  # soil between the rows did not change
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
-    np.testing.assert_array_equal(
-        changed_fractions(changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5)), np.float32(0.4)
-    )
+    fractions = prior_map.changed_fractions(prior_map.changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5))
+    np.testing.assert_array_equal(fractions, np.float32(0.4))
 
 
-def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], noise: float) -> TemporalAgreement:
+def two_maps(seed: int, truth: tuple[NDArray[np.int64], ...], noise: float) -> prior_map.TemporalAgreement:
     """Compare maps of two days whose confidences are right: each class's own signal plus noise, and Bayes."""
-    rng, size = np.random.default_rng(seed), 3
+    rng = np.random.default_rng(seed)
+    size = 3
 
     def look(classes: NDArray[np.int64]) -> NDArray[np.float32]:
         blocks = rng.normal(0, noise, (*(side // 4 for side in classes.shape), size)).repeat(4, 0).repeat(4, 1)
@@ -293,7 +279,7 @@ def two_maps(seed: int, truth: tuple[NDArray[np.int64], NDArray[np.int64]], nois
     nothing = np.zeros((2, *truth[0].shape), np.float32)
     today = CurrentVisit(now, np.ones(truth[0].shape, np.bool_), np.zeros((1, 1, 1), np.float32), 1.0, 1)
     memory = PriorMap(ClassProbabilities(before, *nothing), None, 1.0)
-    return compare(memory, today, ClassProbabilities(now, *nothing), np.s_[:, :])
+    return prior_map.compare(memory, today, ClassProbabilities(now, *nothing), np.s_[:, :])
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.45, 0.6])
@@ -324,38 +310,35 @@ def test_a_field_under_snow_counts_as_another_field() -> None:
     rows = np.arange(SHAPE[1]) % 5 < 2
     before, snow = sure_of(np.broadcast_to(rows, SHAPE), 0.99), sure_of(np.full(SHAPE, 2), 0.9)
     memory = PriorMap(first_probabilities(before), before.coarse, 1.0)
-    found = compare(memory, snow, fuse(memory, snow, None), np.s_[:, :])
+    found = prior_map.compare(memory, snow, fuse(memory, snow, None), np.s_[:, :])
     assert found.agreement == 0
     assert found.is_of_another_field
 
 
 def test_changed_fraction_counts_confident_pixels_only() -> None:
     """In one patch 8 of 64 pixels changed; in the next as many are unsure and do not count."""
-    sure, other, expected_error = (
-        np.log(np.array(one, np.float32)) for one in ([0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1])
-    )
+    sure, other, unsure = np.log(np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1]], np.float32))
     before = np.tile(sure, (8, 16, 1))
     now = before.copy()
-    now[0, :8], now[0, 8:] = other, expected_error
+    now[0, :8], now[0, 8:] = other, unsure
     memory = PriorMap(ClassProbabilities(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
-    old = changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
+    old = prior_map.changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
     np.testing.assert_array_equal(old, np.where(now.argmax(axis=-1) == 1, np.where(np.arange(16) < 8, 0, 255), 255))
-    np.testing.assert_array_equal(changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
+    np.testing.assert_array_equal(prior_map.changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
 
 
 def test_only_captured_pixels_change() -> None:
     """The map of the others is an aged prior map, so another class there is no observation."""
-    rng = np.random.default_rng(3)
     told = [np.log(np.where(np.arange(3) == one, 0.98, 0.01)) * np.ones((*SHAPE, 1)) for one in (0, 1)]
     before, after = (ClassProbabilities(one.astype(np.float32), *np.zeros((2, *SHAPE), np.float32)) for one in told)
-    seen = rng.random(SHAPE) < 0.5
+    seen = np.random.default_rng(3).random(SHAPE) < 0.5
     aged = replace(after, age_days=np.where(seen, 0, 7).astype(np.float32))
-    np.testing.assert_array_equal(changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
+    np.testing.assert_array_equal(prior_map.changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
 
 
 def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
     """A field of 20 x 20 px that changed everywhere has a changed fraction of 1 in all four patches of 16 px."""
-    assert (changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
+    assert (prior_map.changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
 
 
 @READERS
@@ -363,11 +346,12 @@ def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
 def test_visits_elsewhere_do_not_change_a_pixel(reader: TemporalReader | None, seed: int, visits: int) -> None:
     """Probabilities after 28 days are the same, however often other pixels were captured meanwhile."""
     memory = replace(a_prior_map(np.random.default_rng(seed), days=28.0), coarse=None)
-    once, probabilities = carried(memory, reader), memory.probabilities
+    once = carried(memory, reader)
+    probabilities = memory.probabilities
     for _ in range(visits):
         part = PriorMap(probabilities, None, 28.0 / visits)
         shown = carried(part, reader)
-        probabilities = as_captured(part, shown)
+        probabilities = prior_map.as_captured(part, shown)
     np.testing.assert_allclose(shown.log_probability, once.log_probability, atol=1e-3)
     np.testing.assert_allclose(shown.age_days, once.age_days, rtol=1e-5)
 

@@ -51,7 +51,8 @@ def test_patches_of_a_region_keep_their_place_in_the_field(field: tuple[int, int
     times = np.zeros(len(patch_index), int)
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=40):
         numbers = region.numbers_here(patch_index)
-        inside, kept = numbers >= 0, np.zeros(grid.patch_shape, np.bool_)
+        inside = numbers >= 0
+        kept = np.zeros(grid.patch_shape, np.bool_)
         kept[region.kept_patches.rows, region.kept_patches.columns] = True
         assert (inside == kept.ravel()).all()
         times += inside
@@ -68,7 +69,8 @@ def test_cropped_regions_make_the_field(field: tuple[int, int, int]):
     patch_index = np.arange(np.prod(grid.patch_shape)).reshape(grid.patch_shape)
     padded = np.pad(patch_index, (0, 16), constant_values=-1)  # a region's patches may extend beyond the field
     for region in plan_regions(grid, SHARD, most_px=(64, 640), halo=32):
-        (top, left), (rows, columns) = region.origin, region.grid.patch_shape
+        top, left = region.origin
+        rows, columns = region.grid.patch_shape
         kept = region.crop(image[region.read.rows, region.read.columns])
         assert (kept == image[region.kept.rows, region.kept.columns]).all()
         own = region.crop_patches(padded[top : top + rows, left : left + columns].ravel())

@@ -18,8 +18,7 @@ from models.training.capture_augmentation import CaptureAugmentation, ColumnNois
 from pipeline.geometry.camera import LineCamera, expose
 
 BANDS = np.linspace(400.0, 1000.0, 60)
-BASIS = SpectralBasis(400.0, 1000.0, 12)
-MATRIX, _ = BASIS.matrix(BANDS)
+MATRIX, _ = SpectralBasis(400.0, 1000.0, 12).matrix(BANDS)
 WHITE_REFERENCE_E = np.linspace(9000.0, 16000.0, 60)  # of a white reference of 1 at the reference exposure
 
 
@@ -34,8 +33,7 @@ def test_covariance_is_that_of_camera_noise(light: float) -> None:
     electrons = np.broadcast_to((0.3 * WHITE_REFERENCE_E * light).astype(np.float32), (200, 100, 60))
     seen = expose(electrons, camera, step=1, rng=np.random.default_rng(2)) / (WHITE_REFERENCE_E * light)
     drawn = np.cov((seen.reshape(-1, 60) @ MATRIX).T)
-    told = _noise().covariance(np.full(12, 0.3), light)
-    np.testing.assert_allclose(np.diag(drawn), np.diag(told), rtol=0.06)
+    np.testing.assert_allclose(np.diag(drawn), np.diag(_noise().covariance(np.full(12, 0.3), light)), rtol=0.06)
     size = np.sqrt(np.diag(drawn))
     np.testing.assert_allclose(drawn / np.outer(size, size), _noise().correlation(), atol=0.05)
 
@@ -43,27 +41,22 @@ def test_covariance_is_that_of_camera_noise(light: float) -> None:
 @given(light=st.floats(1e-3, 1.0))
 def test_more_light_is_less_noise(light: float) -> None:
     """Twice the light is better than the mean of two samples, which has half the variance."""
-    noise, spectrum = _noise(), np.full(12, 0.2)
-    one, two = (np.diag(noise.covariance(spectrum, n * light)) for n in (1, 2))
+    one, two = (np.diag(_noise().covariance(np.full(12, 0.2), n * light)) for n in (1, 2))
     assert (two < one / 2).all()
 
 
 def test_whitening_does_not_amplify_noise() -> None:
     """A direction with as much noise as signal is reduced by the root of two; others keep unit variance."""
-    rng = np.random.default_rng(1)
-    sample = rng.normal(size=(50_000, 2)) * [1.0, 1.0] @ np.array([[1.0, 1.0], [0.1, -0.1]])
+    sample = np.random.default_rng(1).normal(size=(50_000, 2)) * [1.0, 1.0] @ np.array([[1.0, 1.0], [0.1, -0.1]])
     plain, told = Normalisation.measured(sample), Normalisation.measured(sample, np.diag([0.02, 0.02]))
-    sizes = [
-        (one.apply(sample, np.ones(2, bool)) @ np.array([[1, 1], [1, -1]]) / math.sqrt(2)).std(axis=0)
-        for one in (plain, told)
-    ]
+    axes = np.array([[1, 1], [1, -1]]) / math.sqrt(2)
+    sizes = [(one.apply(sample, np.ones(2, bool)) @ axes).std(axis=0) for one in (plain, told)]
     np.testing.assert_allclose(sizes[0], 1, atol=0.02)
     np.testing.assert_allclose(sizes[1], [1, math.sqrt(0.5)], atol=0.02)
 
 
 def _augmentation(darkest_ms: float = 3.0) -> tuple[CaptureAugmentation, Normalisation]:
-    rng = np.random.default_rng(5)
-    normalisation = Normalisation.measured(0.3 + 0.05 * rng.normal(size=(4000, 12)))
+    normalisation = Normalisation.measured(0.3 + 0.05 * np.random.default_rng(5).normal(size=(4000, 12)))
     return CaptureAugmentation(normalisation, darkest_ms=darkest_ms), normalisation
 
 
@@ -123,7 +116,8 @@ def test_noise_of_a_scan_follows_its_light(light: float, step: int) -> None:
     A line of several pixels is read once for all of them; rows between lines have the noise of these lines.
     """
     augmentation, normalisation = _augmentation()
-    noise, unwhiten = _noise(), np.linalg.inv(normalisation.whitening.astype(np.float64))
+    noise = _noise()
+    unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64))
     plain = _flat(normalisation, 0.3, (64, 1000))
     seen = _seen(augmentation.scan, plain, noise, light=light, step=step, rng=np.random.default_rng(6))
     assert (seen[..., 12:] == LineSpec(light, step).planes).all()
@@ -146,7 +140,8 @@ def test_uniform_scans_have_every_spacing_and_light(monkeypatch: pytest.MonkeyPa
     """Both networks see one capture, whose exposure lies between the darkest and the reference."""
     monkeypatch.setattr(capture_augmentation, "INTERLACED", 0.0)
     augmentation, _ = _augmentation(12.0)
-    rng, found = np.random.default_rng(4), []
+    rng = np.random.default_rng(4)
+    found = []
     image = rng.normal(size=(32, 32, 12)).astype(np.float32)
     for _ in range(60):
         both = augmentation.draw(torch.from_numpy(image), SILENT, rng)
@@ -166,7 +161,8 @@ def test_a_first_pass_keeps_its_own_rows(monkeypatch: pytest.MonkeyPatch, step: 
     """Without areas every ``step``-th row is read unchanged; the first of them may be any row."""
     monkeypatch.setattr(capture_augmentation, "AREAS", (1.0,))
     augmentation, _ = _augmentation()
-    image, begun = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32), set()
+    image = np.random.default_rng(1).normal(size=(32, 5, 12)).astype(np.float32)
+    begun = set()
     for seed in range(40):
         seen = _seen(augmentation.interlaced, image, SILENT, step=step, rng=np.random.default_rng(seed))
         same = np.isclose(seen[..., :12], image, atol=1e-4).all(axis=(1, 2))
@@ -185,7 +181,8 @@ def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.Mon
     augmentation, normalisation = _augmentation(3.0)
     lights = iter([0.5, 0.05])
     monkeypatch.setattr(augmentation, "_light", lambda rng: next(lights))
-    unwhiten, plain = np.linalg.inv(normalisation.whitening.astype(np.float64)), _flat(normalisation, 0.3, (64, 2000))
+    unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64))
+    plain = _flat(normalisation, 0.3, (64, 2000))
     seen = _seen(augmentation.interlaced, plain, _noise(), step=8, rng=np.random.default_rng(8))
     captures = {(round(own.light, 3), own.step) for own in _captures(seen[..., 12:])}
     closer = min(step for _, step in captures)
@@ -197,13 +194,14 @@ def test_later_lines_lie_between_those_of_the_first_pass(monkeypatch: pytest.Mon
         np.testing.assert_allclose(values[rows].var(axis=1).max(axis=0), told, rtol=0.15)  # rows of lines have the most
 
 
-def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -> tuple[np.ndarray, SceneSpectra]:
-    """Return noiseless spectra (200, 100, band) about .3, in smooth directions of some times the noise, and moments."""
+def _spectra(rng: np.random.Generator, sizes: tuple[float, ...], light: float) -> tuple[np.ndarray, ColumnNoise]:
+    """Return spectra (200, 100, band) about .3, in smooth directions of some times the noise, and this noise."""
     bumps = np.exp(-0.5 * ((BANDS - np.linspace(430, 970, len(sizes))[:, None]) / 60) ** 2)
     sigma = np.sqrt(0.3 * light * WHITE_REFERENCE_E + 20.0**2) / (light * WHITE_REFERENCE_E)
     axes = np.linalg.qr(bumps.T)[0].T * np.array(sizes)[:, None] * sigma
     spectra = 0.3 + rng.normal(size=(200, 100, len(sizes))) @ axes
-    return spectra, SceneSpectra(np.full(60, 0.3), axes.T @ axes, MATRIX, 1 / WHITE_REFERENCE_E, 20.0)
+    moments = SceneSpectra(np.full(60, 0.3), axes.T @ axes, MATRIX, 1 / WHITE_REFERENCE_E, 20.0)
+    return spectra, replace(_noise(), spectra=moments)
 
 
 @pytest.mark.parametrize(("light", "rtol"), [(0.1, 0.04), (0.5, 0.25)])
@@ -214,14 +212,14 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
     """
     rng = np.random.default_rng(3)
     augmentation, normalisation = _augmentation()
-    spectra, moments = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
-    sigma = np.sqrt(np.sum(moments.noise(light), axis=0))
-    axes = np.linalg.eigh(moments.covariance / np.outer(sigma, sigma))[1][:, ::-1][:, :4]
-    more = sigma * np.sqrt(1 - np.sum(moments.noise(1.0), axis=0) / sigma**2)  # the crop has noise of the reference
+    spectra, noise = _spectra(rng, (30.0, 5.0, 1.0, 0.3), light)
+    sigma = np.sqrt(np.sum(noise.spectra.noise(light), axis=0))
+    axes = np.linalg.eigh(noise.spectra.covariance / np.outer(sigma, sigma))[1][:, ::-1][:, :4]
+    reference = np.sum(noise.spectra.noise(1.0), axis=0)  # the crop has this noise already
+    more = np.sqrt(sigma**2 - reference)
     noisy = spectra + more * rng.normal(size=spectra.shape)
     surveyed = 0.3 + (np.rint((noisy - 0.3) / sigma @ axes) @ axes.T) * sigma
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
-    noise = replace(_noise(), spectra=moments)
     seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
     columns = seen @ augmentation.unwhiten * normalisation.spread + normalisation.centre
     added, wanted = (np.cov((one - spectra @ MATRIX).reshape(-1, 12).T) for one in (columns, surveyed @ MATRIX))
@@ -232,11 +230,11 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
 @pytest.mark.parametrize(("least_power", "left"), [(0.01, 5), (0.5, 4), (40.0, 4)])
 def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, left: int) -> None:
     """The fifth component is dropped if its power is below the limit; four always stay."""
-    rng, light = np.random.default_rng(4), 0.1
+    rng = np.random.default_rng(4)
+    light = 0.1
     augmentation, normalisation = _augmentation()
-    spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
+    spectra, noise = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
-    noise = replace(_noise(), spectra=moments)
     seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=least_power)[..., :12]
     power = np.linalg.eigvalsh(np.cov((seen @ augmentation.unwhiten * normalisation.spread).reshape(-1, 12).T))
     assert np.count_nonzero(power > 1e-6 * power[-1]) == left
@@ -247,9 +245,8 @@ def test_later_lines_share_the_components_of_the_first_pass(monkeypatch: pytest.
     monkeypatch.setattr(capture_augmentation, "AREAS", (0.0, 1.0))
     rng = np.random.default_rng(6)
     augmentation, normalisation = _augmentation()
-    spectra, moments = _spectra(rng, (30.0, 5.0, 3.0, 2.0), 0.1)
+    spectra, noise = _spectra(rng, (30.0, 5.0, 3.0, 2.0), 0.1)
     crop = normalisation.apply(spectra[:64, :64] @ MATRIX, np.ones(12, bool))
-    noise = replace(_noise(), spectra=moments)
     seen = _seen(augmentation.interlaced, crop, noise, step=4, rng=rng, least_power=0.05)
     assert len(_captures(seen[..., 12:])) > 1
     columns = seen[..., :12] @ augmentation.unwhiten * normalisation.spread

@@ -29,7 +29,8 @@ def example(seed: int = 1) -> Example:
 
 def test_killed_training_resumes_to_the_same_weights(tmp_path: Path) -> None:
     """Started again after it was killed at step 5, training takes steps 5 and 6 and ends with the same weights."""
-    file, steps = tmp_path / "c", []
+    file = tmp_path / "c"
+    steps = []
     undisturbed, _ = train(CONFIG, [example()], SHIFT, SETTINGS)
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(5), checkpoint=file, keep_every_s=0)
@@ -47,10 +48,8 @@ def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
     file = tmp_path / "c"
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(3), checkpoint=file, keep_every_s=0)
-    identity, other = (
-        run_identity(config, [example()], SETTINGS, None) for config in (CONFIG, replace(CONFIG, width=16))
-    )
-    assert identity != other
+    one, other = (run_identity(config, [example()], SETTINGS, None) for config in (CONFIG, replace(CONFIG, width=16)))
+    assert one != other
     for settings, scene in ((replace(SETTINGS, seed=7), example()), (SETTINGS, example(2))):
         with pytest.raises(KeyboardInterrupt):  # it takes step 1
             train(CONFIG, [scene], SHIFT, settings, killed_after(1), checkpoint=file)

@@ -29,18 +29,18 @@ def _scene(shape: tuple[int, int] = (40, 50), camera: LineCamera = CAMERA) -> Ra
 
 
 def _observed(scene: RasterScene, camera: LineCamera = CAMERA, seed: int = 0) -> Example:
-    basis = SpectralBasis.spanning(NM)
-    return observe(scene, camera, SceneGrid(*scene.shape, 8), basis, np.random.default_rng(seed))
+    return observe(scene, camera, SceneGrid(*scene.shape, 8), SpectralBasis.spanning(NM), np.random.default_rng(seed))
 
 
 def test_observed_columns_are_those_of_the_camera():
     """Columns are the spectral columns of the camera's reflectances of the whole padded scene."""
     bright = replace(CAMERA, electrons_per_dn=1e6, read_noise_e=0.0)  # so much light that noise is below rounding
     scene = _scene((32, 48), bright)
-    seen, (matrix, _) = _observed(scene, bright), SpectralBasis.spanning(NM).matrix(NM)
-    light, scale = scene.planes * scene.electrons, scene.white_reference / scene.white_reference_electrons
+    matrix, _ = SpectralBasis.spanning(NM).matrix(NM)
+    light = scene.planes * scene.electrons
+    scale = scene.white_reference / scene.white_reference_electrons
     expected = (expose(footprint(light, bright), bright, step=1, rng=None) * scale) @ matrix
-    assert seen.columns == pytest.approx(expected, abs=3e-3)
+    assert _observed(scene, bright).columns == pytest.approx(expected, abs=3e-3)
 
 
 def test_observed_scenes_are_padded_by_mirroring():
@@ -74,7 +74,8 @@ def test_both_networks_see_the_same_crop():
     """However a crop is turned, pixels and labels stay together and share one brightness, at the reference."""
     sampler = CropSampler([_example((64, 96)), _example((48, 48), "other")], 8, 32)
     batch = sampler.draw(12, np.random.default_rng(3), np.zeros(1, np.float32))
-    columns, labels = batch.image[:, 0].numpy(), batch.labels.numpy()
+    columns = batch.image[:, 0].numpy()
+    labels = batch.labels.numpy()
     gain = (columns / (labels + 1)).mean(axis=(1, 2), keepdims=True)
     assert columns == pytest.approx((labels + 1) * gain, rel=1e-5)
     assert gain.std() > 0.01
@@ -119,10 +120,8 @@ def test_crops_contain_labelled_pixels():
 def test_crops_are_augmented_if_their_noise_is_known():
     """Planes of these crops are those of shorter exposures; planes of a scene without noise stay 0."""
     plain = Normalisation(np.zeros(1, np.float32), np.ones(1, np.float32), np.eye(1, dtype=np.float32))
-    noise = ColumnNoise(np.full(1, 1e-4), np.full((1, 1), 1e-4))
-    for known in (noise, None):
-        sampler = CropSampler(
-            [replace(_example((64, 64)), noise=known)], 8, 32, augmentation=CaptureAugmentation(plain, darkest_ms=10.0)
-        )
+    augmentation = CaptureAugmentation(plain, darkest_ms=10.0)
+    for known in (ColumnNoise(np.full(1, 1e-4), np.full((1, 1), 1e-4)), None):
+        sampler = CropSampler([replace(_example((64, 64)), noise=known)], 8, 32, augmentation=augmentation)
         batch = sampler.draw(4, np.random.default_rng(0), np.zeros(1, np.float32))
         assert bool((batch.image[:, 1] > 0).any()) == (known is not None)

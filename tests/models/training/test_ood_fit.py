@@ -20,20 +20,19 @@ PLAIN = Normalisation(*(np.zeros(COLUMNS, np.float32), np.ones(COLUMNS, np.float
 
 def scene(seed: int, side: int = 48) -> Example:
     """Return a scene of two classes of Gaussian spectra, one of them rare, with the noise of a camera."""
-    rng, labels = np.random.default_rng(seed), np.zeros((side, side), np.uint8)
+    labels = np.zeros((side, side), np.uint8)
     labels[:, -side // 8 :] = 1
     labels[:2, :2] = 255
     middles = np.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0], [50.0, 50.0, 50.0]])
-    columns = middles[np.minimum(labels, 2)] + 0.1 * rng.standard_normal((side, side, COLUMNS))
+    columns = middles[np.minimum(labels, 2)] + 0.1 * np.random.default_rng(seed).standard_normal((side, side, COLUMNS))
     noise = ColumnNoise(np.full(COLUMNS, 1e-5), 1e-6 * np.eye(COLUMNS))
     return Example(f"{seed}", columns.astype(np.float16), labels, labels.shape, noise)
 
 
 def test_known_spectra_are_unknown_at_the_stated_rate() -> None:
     """The scenes were not used for the fit; spectra of no class, also of unlabelled pixels, are unknown."""
-    ood_detector = fit_ood(
-        [scene(i) for i in range(4)], [scene(i) for i in range(10, 13)], PLAIN, darkest_ms=3.0, bands=9, seed=0
-    )
+    fitted, validated = ([scene(i) for i in numbers] for numbers in (range(4), range(10, 13)))
+    ood_detector = fit_ood(fitted, validated, PLAIN, darkest_ms=3.0, bands=9, seed=0)
     fresh = np.concatenate([scene(i).columns[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
     fraction = ood_detector.unknown(fresh, rate=0.01, capture=LineSpec(), bands=9).mean()
     assert 0.004 < fraction < 0.02
@@ -61,8 +60,7 @@ def test_fit_needs_validation_scenes() -> None:
 
 def test_repeated_columns_have_an_invertible_covariance() -> None:
     """The centres are those of the data; a class of one pixel is allowed."""
-    rng = np.random.default_rng(0)
-    one = rng.normal(0, 1, (400, 1))
+    one = np.random.default_rng(0).normal(0, 1, (400, 1))
     pixels = np.concatenate([one, one, np.ones((400, 1))], axis=1).astype(np.float32)
     classes = np.zeros(400, np.uint8)
     classes[-1] = 1

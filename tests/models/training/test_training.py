@@ -16,19 +16,10 @@ from models.training import train as training
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import CropSampler
 from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
-from models.training.train import (
-    LabelledPixels,
-    Progress,
-    TrainingSettings,
-    halfway,
-    linear_discriminants,
-    rate_at,
-    train,
-    with_discriminants,
-)
+from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import Maker, block_example
+from tests.models.conftest import block_example, make_weights
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
@@ -37,10 +28,12 @@ SHIFT = np.zeros(2, np.float32)
 
 def test_training_reduces_the_loss(monkeypatch: pytest.MonkeyPatch):
     """Forty small steps bring the loss of two separable classes below a third; freed memory is given back twice."""
-    losses, freed = list[float](), list[None]()
+    losses: list[float] = []
+    freed: list[None] = []
     monkeypatch.setattr(training, "FREED_EVERY", 15)
     monkeypatch.setattr(training, "give_back_freed_memory", lambda: freed.append(None))
-    scene, settings = block_example(64, 16), replace(SETTINGS, steps=40, crop=32, learning_rate=1e-2)
+    scene = block_example(64, 16)
+    settings = replace(SETTINGS, steps=40, crop=32, learning_rate=1e-2)
     model, summary = train(CONFIG, [scene], SHIFT, settings, lambda now: losses.append(now.loss))
     batch = CropSampler([scene], 8, 32).draw(8, np.random.default_rng(0), SHIFT)
     weight = class_weights([scene.labels], 3, 5.0)
@@ -51,12 +44,13 @@ def test_training_reduces_the_loss(monkeypatch: pytest.MonkeyPatch):
     assert not model.training
 
 
-def test_training_at_the_reference_ignores_capture_planes(tiny: Maker):
+def test_training_at_the_reference_ignores_capture_planes():
     """Planes that are 0 in every crop keep kernels of 0, so that every capture gives the same map."""
     scene = block_example()
     model, _ = train(CONFIG, [scene], SHIFT, SETTINGS)
     assert not any(stem.enter.weight[:, 2 : 2 + PLANES].any() for stem in (model.overview_stem, model.full_stem))
-    weights, grid = replace(tiny(columns=2), segmenter=model), SceneGrid(32, 32, 8)
+    weights = replace(make_weights(columns=2), segmenter=model)
+    grid = SceneGrid(32, 32, 8)
     usual, dark = (map_of_columns(weights, scene.columns, grid, one)[1] for one in (LineSpec(), LineSpec(0.1, 4, 4)))
     assert (usual == dark).all()
 
@@ -64,22 +58,21 @@ def test_training_at_the_reference_ignores_capture_planes(tiny: Maker):
 def test_equal_seeds_give_equal_weights():
     """The weights are equal up to rounding; the global random streams of torch and numpy do not change."""
     torch_before, numpy_before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    first, same, other = (
-        train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=3, seed=seed))[0] for seed in (3, 3, 4)
-    )
+    models = [train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=3, seed=seed))[0] for seed in (3, 3, 4)]
     assert torch.equal(torch.random.get_rng_state(), torch_before)
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
-    weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in (first, same, other)]
+    weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in models]
     apart = [(weights[0] - other).norm() for other in weights[1:]]
     assert apart[0] < 1e-3 * apart[1]  # sums differ in the last bit with the memory layout
-    assert not first.training
+    assert not models[0].training
 
 
 @pytest.mark.parametrize(("crop", "first", "last"), [(48, 32, (2, 64)), (64, 64, (4, 64)), (16, 32, (4, 32))])
 def test_batches_halve_where_crops_grow(crop: int, first: int, last: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
     """The last phase has larger crops and fewer of them; if scenes have no larger ones, their number stays."""
     trainer = training.Trainer(CONFIG, [block_example(64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
-    sizes, loss = [], training.batch_loss
+    sizes = []
+    loss = training.batch_loss
     monkeypatch.setattr(
         training,
         "batch_loss",
@@ -87,15 +80,14 @@ def test_batches_halve_where_crops_grow(crop: int, first: int, last: tuple[int, 
     )
     for done in (0.1, 0.9):
         trainer.step(done)
-    sizes = [(count, side) for count, side, _ in sizes]
-    assert sizes == [(4, first), last]
+    assert [(count, side) for count, side, _ in sizes] == [(4, first), last]
 
 
 def test_training_stops_at_its_time_limit(monkeypatch: pytest.MonkeyPatch):
     """The summary counts the steps that were taken."""
     clock = iter(range(0, 10_000, 30))
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
-    seen: list[Progress] = []
+    seen: list[training.Progress] = []
     _, summary = train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
     assert len(seen) == summary["steps"] == 3
     assert seen[-1].done == pytest.approx(0.8)
@@ -106,16 +98,15 @@ def test_an_infinite_gradient_is_no_step():
     model = Segmenter(CONFIG)
     optimiser = torch.optim.AdamW(model.parameters(), 0.1)
     before = torch.nn.utils.parameters_to_vector(model.parameters()).clone()
-    zero = model.to_token.bias.sum() * 0
-    assert not training._step(model, optimiser, zero.abs().sqrt())
+    assert not training._step(model, optimiser, (model.to_token.bias.sum() * 0).abs().sqrt())
     assert torch.equal(torch.nn.utils.parameters_to_vector(model.parameters()), before)
     assert training._step(model, optimiser, model.to_token.bias.square().sum() + model.to_token.bias.sum())
 
 
 def test_learning_rate_warms_up_and_falls():
     """The rate rises from 5 % to 100 % over the first twentieth, then falls to 1 %."""
-    assert [rate_at(done) for done in (0.0, 0.025, 0.05, 1.0)] == pytest.approx([0.05, 0.525, 1.0, 0.01])
-    falling = [rate_at(done) for done in np.linspace(0.05, 1, 50)]
+    assert [training.rate_at(done) for done in (0.0, 0.025, 0.05, 1.0)] == pytest.approx([0.05, 0.525, 1.0, 0.01])
+    falling = [training.rate_at(done) for done in np.linspace(0.05, 1, 50)]
     assert falling == sorted(falling, reverse=True)
 
 
@@ -147,11 +138,12 @@ def test_most_patches_of_a_late_phase_are_drawn_by_entropy():
 @pytest.mark.parametrize(("deep", "least", "most"), [(False, 1.0, 1.0), (True, 0.04, 0.2)])
 def test_deep_networks_read_patches_in_few_steps(deep: bool, least: float, most: float):
     """The full network of a deep segmenter learns in about a tenth of the steps, that of others in every step."""
-    model, rng, weight = Segmenter(replace(CONFIG, deep=deep)), np.random.default_rng(0), torch.ones(3)
+    model = Segmenter(replace(CONFIG, deep=deep))
+    rng = np.random.default_rng(0)
+    weight = torch.ones(3)
     batch = CropSampler([block_example()], 8, 32).draw(1, rng, SHIFT)
     losses = [batch_loss(model, batch, weight, rng, phase_at(0.0), soft_dice=False) for _ in range(100 if deep else 10)]
-    bias = model.full_classes.bias
-    read = [torch.autograd.grad(loss, bias, allow_unused=True)[0] is not None for loss in losses]
+    read = [torch.autograd.grad(loss, model.full_classes.bias, allow_unused=True)[0] is not None for loss in losses]
     assert least <= np.mean(read) <= most
 
 
@@ -171,8 +163,8 @@ def test_unlabelled_pixels_do_not_change_the_loss():
 
 def test_absent_classes_are_never_the_likeliest():
     """Two of three classes have pixels and are separated; the third has a logit of -20 everywhere."""
-    rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 2], np.uint8), 50)
-    features = (rng.normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
+    labels = np.repeat(np.array([0, 2], np.uint8), 50)
+    features = (np.random.default_rng(0).normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
     found = linear_discriminants(LabelledPixels(features, labels), 3)
     logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
     assert (logits.argmax(axis=1) == labels).all()
@@ -195,8 +187,8 @@ def test_as_few_pixels_as_classes_are_refused() -> None:
 
 def test_discriminants_do_not_rely_on_brightness() -> None:
     """A feature that depends on brightness loses its weight; one that does not keeps it."""
-    rng, labels = np.random.default_rng(0), np.repeat(np.array([0, 1], np.uint8), 500)
-    features = (rng.normal(0, 0.1, (1000, 2)) + 1.5 * labels[:, None]).astype(np.float32)
+    labels = np.repeat(np.array([0, 1], np.uint8), 500)
+    features = (np.random.default_rng(0).normal(0, 0.1, (1000, 2)) + 1.5 * labels[:, None]).astype(np.float32)
     shift = np.array([100.0, 0.0], np.float32)  # twice the light moves the first feature by so much
     own = LabelledPixels(features, labels)
     weights = [
@@ -210,7 +202,8 @@ def test_discriminants_do_not_rely_on_brightness() -> None:
 def test_discriminants_are_fitted_to_dark_pixels() -> None:
     """Weights for dark crops are less than half of those for bright ones; scenes without known noise stay bright."""
     plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
-    augmentation, silent = CaptureAugmentation(plain, darkest_ms=3.0), block_example(64, 16)
+    augmentation = CaptureAugmentation(plain, darkest_ms=3.0)
+    silent = block_example(64, 16)
     noisy = replace(silent, noise=ColumnNoise(np.zeros(2), 0.01 * np.eye(2)))
     drawn = [
         LabelledPixels.drawn([scene], np.random.default_rng(0), how)
@@ -232,7 +225,7 @@ def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
     start = {f"spectral.{name}": torch.randn_like(tensor) for name, tensor in own.spectral.named_parameters()}
     flat = torch.randn(1, 4 + PLANES, 1, 1)
     given = flat.expand(-1, -1, 32, 32), torch.randn(1, 4 + PLANES, 32, 32), torch.arange(16)[None]
-    nets = [with_discriminants(own, start, share) for share in (fraction, 0.0)]
+    nets = [training.with_discriminants(own, start, share) for share in (fraction, 0.0)]
     mixed, alone, whole = (net(*given, torch.zeros(1, 2)) for net in (*nets, own))
     for found, plain, full in zip(mixed, alone, whole, strict=True):
         torch.testing.assert_close(found, fraction * full + (1 - fraction) * plain, rtol=1e-4, atol=1e-3)
@@ -244,7 +237,8 @@ def test_halfway_network_has_the_mean_of_each_weight() -> None:
     """Both networks themselves stay as they are."""
     one, other = (Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2)) for _ in range(2))
     before = [parameter.clone() for parameter in (*one.parameters(), *other.parameters())]
-    mean = halfway(one, other)
-    for middle, first, second in zip(*(net.parameters() for net in (mean, one, other)), strict=True):
+    for middle, first, second in zip(
+        *(net.parameters() for net in (training.halfway(one, other), one, other)), strict=True
+    ):
         torch.testing.assert_close(middle, (first + second) / 2)
     assert all(map(torch.equal, before, (*one.parameters(), *other.parameters())))

@@ -40,13 +40,13 @@ def with_reader(path: Path, **changed: int) -> None:
     """Add a temporal reader to the weights."""
     config = files.describe_weights(path).config
     sizes = {"classes": config.classes, "columns": config.columns, "width": 8}
-    built = TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed}))
-    files.add_reader(path, path, built, {"seed": 1})
+    files.add_reader(path, path, TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed})), {"seed": 1})
 
 
 def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
     """Both parts are read in any order; each has a key of its own, which adding it again does not change."""
-    bare, weights = files.describe_weights(path), files.load_weights(path)
+    bare = files.describe_weights(path)
+    weights = files.load_weights(path)
     assert (bare.ood_detector, bare.reader) == (None, None)
     for add in (with_ood, with_reader, with_ood):
         add(path)
@@ -54,10 +54,9 @@ def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
     assert told.key == bare.key
     assert (told.ood_detector.trained_on, told.ood_detector.record) == (SEEN, {"scenes": 48})
     assert told.reader.record == {"seed": 1}
-    key, reader = told.reader.key, files.load_reader(path)
-    files.add_reader(path, path, reader, {"seed": 1})
+    files.add_reader(path, path, files.load_reader(path), {"seed": 1})
     again = files.describe_weights(path)
-    assert (again.reader.key, again.ood_detector) == (key, told.ood_detector)
+    assert (again.reader.key, again.ood_detector) == (told.reader.key, told.ood_detector)
     assert files.load_ood(path).limits.steps == (1, 2)
     for name, tensor in files.load_weights(path).segmenter.state_dict().items():
         torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
@@ -80,7 +79,8 @@ def test_training_description_round_trips() -> None:
 def test_every_flipped_bit_is_found(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
     """The bits are drawn from the part's own tensors and from the description; the error names the file."""
     add(path)
-    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
     size = 8 + int.from_bytes(whole[:8], "little")
     header = json.loads(whole[8:size])
     told = header.pop("__metadata__")["about"]
@@ -121,7 +121,9 @@ def test_loaded_weights_survive_overwriting_the_file(path: Path) -> None:
     """During a survey another file may be copied onto it: weights, reader and limits stay those that were checked."""
     with_ood(path)
     with_reader(path)
-    weights, told, numbers = files.load_weights(path), files.load_ood(path), files.load_reader(path).state_dict()
+    weights = files.load_weights(path)
+    told = files.load_ood(path)
+    numbers = files.load_reader(path).state_dict()
     kept = told.read.copy(), weights.normalisation.whitening.copy()
     before = {name: one.clone() for name, one in numbers.items()}
     with path.open("r+b") as opened:

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from models.weights.checksummed_files import SEAL, TENSORS, _seal, hash_of
 from models.weights.files import FORMAT, describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
-from tests.models.conftest import Maker
+from tests.models.conftest import make_weights
 
 
 def _about(path: Path) -> dict[str, Any]:
@@ -34,19 +34,20 @@ def _rewritten(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tenso
 
 
 @pytest.fixture
-def saved(tiny: Maker, tmp_path: Path) -> Path:
+def saved(tmp_path: Path) -> Path:
     """Return the path of a file of small weights."""
-    save_weights(tiny(), tmp_path / "w.safetensors")
+    save_weights(make_weights(), tmp_path / "w.safetensors")
     return tmp_path / "w.safetensors"
 
 
-def test_weights_round_trip_bit_by_bit(tiny: Maker, saved: Path):
+def test_weights_round_trip_bit_by_bit(saved: Path):
     """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
-    before, after, described = tiny(), load_weights(saved), describe_weights(saved)
+    before = make_weights()
+    after = load_weights(saved)
     old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
     assert list(old) == list(new)
     assert all(torch.equal(old[name], new[name]) for name in old)
-    for one in (after, described):
+    for one in (after, describe_weights(saved)):
         told = (one.config, one.basis, one.class_names, one.record)
         assert told == (before.config, before.basis, before.class_names, before.record)
     for name in ("centre", "spread", "whitening"):
@@ -55,7 +56,7 @@ def test_weights_round_trip_bit_by_bit(tiny: Maker, saved: Path):
     assert not after.segmenter.training
 
 
-def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
+def test_saving_twice_gives_equal_files(saved: Path, tmp_path: Path):
     """The same weights give the same bytes, and no other file is left in the folder."""
     save_weights(load_weights(saved), tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
@@ -153,7 +154,7 @@ def test_an_incomplete_description_is_refused(saved: Path):
         load_weights(saved)
 
 
-def test_a_failed_write_keeps_the_old_file(tiny: Maker, saved: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_failed_write_keeps_the_old_file(saved: Path, monkeypatch: pytest.MonkeyPatch):
     """A full disk leaves the file that was there, and no part of the new one."""
     before = saved.read_bytes()
 
@@ -163,7 +164,7 @@ def test_a_failed_write_keeps_the_old_file(tiny: Maker, saved: Path, monkeypatch
 
     monkeypatch.setattr(Path, "write_bytes", fill)
     with pytest.raises(WeightsError, match="No space left on device"):
-        save_weights(tiny(1), saved)
+        save_weights(make_weights(1), saved)
     monkeypatch.undo()
     assert saved.read_bytes() == before
     assert [path.name for path in saved.parent.iterdir()] == ["w.safetensors"]
@@ -180,15 +181,15 @@ def test_a_flipped_bit_of_a_tensor_is_found(saved: Path):
 
 def test_a_changed_description_is_refused(saved: Path):
     """A class is renamed by one bit, which no tensor shows."""
-    raw = saved.read_bytes()
-    saved.write_bytes(raw.replace(b"class 1", b"class 3"))
+    saved.write_bytes(saved.read_bytes().replace(b"class 1", b"class 3"))
     with pytest.raises(WeightsError, match="is damaged: its description is not what was written"):
         describe_weights(saved)
 
 
 def test_a_header_of_petabytes_is_refused(saved: Path):
     """A claimed tensor of 3.6 PB that the file lacks is refused before memory is allocated."""
-    about, size = json.dumps(_about(saved)), 900 * 10**12
+    about = json.dumps(_about(saved))
+    size = 900 * 10**12
     header = {"__metadata__": {"about": about}, "a": {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}}
     text = json.dumps(header).encode()
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))

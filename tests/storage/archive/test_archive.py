@@ -39,7 +39,8 @@ def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
     """Before publication `find` returns None; afterwards the manifest has files, hashes and parameters."""
     archive = Archive.open(tmp_path / "archive")
     assert archive.find("mosaic", "abc") is None
-    path, ref = _publish(archive), archive.find("mosaic", "abc")
+    path = _publish(archive)
+    ref = archive.find("mosaic", "abc")
     assert (ref.uri, ref.path) == ("stages/mosaic/abc", path)
     manifest = archive.manifest(ref)
     assert (manifest["version"], manifest["params"], manifest["inputs"]) == (3, {"tol": 0.1}, ["k0"])
@@ -101,7 +102,8 @@ def test_any_changed_byte_of_a_manifest_is_detected(archive: Archive, change: Ca
 
 def test_a_store_is_synced_before_and_after_its_rename(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files, manifest and folders are synced first, then the store is renamed, then its parent folder is synced."""
-    told, rename = list[str](), Path.rename
+    told: list[str] = []
+    rename = Path.rename
 
     def renamed(self: Path, to: Path) -> Path:
         told.append(f"rename {self.name}")
@@ -248,9 +250,7 @@ def test_releasing_a_lock_twice_keeps_the_next_holders_lock(tmp_path: Path) -> N
 
 def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files that a killed run of the same second and name left are not published with the next run."""
-    monkeypatch.setattr(
-        "storage.archive.archive.datetime", Mock(now=Mock(return_value=datetime(2026, 5, 1, tzinfo=UTC)))
-    )
+    monkeypatch.setattr("storage.archive.archive.datetime", Mock(now=lambda zone: datetime(2026, 5, 1, tzinfo=UTC)))
     left = tmp_path / "runs" / "20260501T000000-a.part"
     left.mkdir(parents=True)
     (left / "torn.bin").write_bytes(b"x")
@@ -317,8 +317,7 @@ PLAIN = st.recursive(
 @settings(max_examples=25, deadline=None)
 def test_stage_key_ignores_the_order_of_parameters(params: dict[str, object]) -> None:
     """The same parameters in reverse order have the same key."""
-    turned = dict(reversed(params.items()))
-    assert stage_key("mosaic", 1, params, ["a"]) == stage_key("mosaic", 1, turned, ["a"])
+    assert stage_key("mosaic", 1, params, ["a"]) == stage_key("mosaic", 1, dict(reversed(params.items())), ["a"])
 
 
 @given(st.floats(1e-6, 1e6))

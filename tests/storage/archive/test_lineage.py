@@ -20,7 +20,8 @@ from tests.storage.small_archive import flip, rewrite, small_survey
 
 def test_lineage_includes_indirect_inputs(tmp_path: Path, archive: Archive) -> None:
     """A map depends on its mosaic and, through it and directly, on the raw lines."""
-    small, catalogue = small_survey(archive), lineage.Catalogue.read(tmp_path)
+    small = small_survey(archive)
+    catalogue = lineage.Catalogue.read(tmp_path)
     assert catalogue.ancestors([small.map.uri]) == {small.mosaic.uri, small.raw.uri}
     assert catalogue.inputs_first(catalogue.stores) == [small.raw.uri, small.mosaic.uri, small.map.uri]
     assert [ref.uri for ref in lineage.rests_on(tmp_path, [small.mosaic])] == [small.raw.uri, small.mosaic.uri]
@@ -43,21 +44,17 @@ def test_an_invalid_manifest_is_reported_as_damaged(tmp_path: Path, archive: Arc
     small = small_survey(archive)
     (small.mosaic.path / "manifest.json").write_text(content)
     catalogue = lineage.Catalogue.read(tmp_path)
-    problem = catalogue.stores[small.mosaic.uri].problem
-    assert problem.startswith("manifest.json is damaged")
+    assert catalogue.stores[small.mosaic.uri].problem.startswith("manifest.json is damaged")
     assert catalogue.inputs_of(small.mosaic.uri) == []
-    broken = [one.uri for one in verify_archive(archive) if one.problem is not None]
-    assert broken == [small.mosaic.uri]
+    assert [one.uri for one in verify_archive(archive) if one.problem is not None] == [small.mosaic.uri]
 
 
 @pytest.mark.parametrize("inputs", [7, "abc", [3, None], {"a": 5}, ["nowhere", "stages/rectify/nowhere"]])
 def test_malformed_inputs_of_a_manifest_are_tolerated(tmp_path: Path, archive: Archive, inputs: object) -> None:
     """Inputs, parameters and dates of a wrong type raise no exception."""
     small = small_survey(archive)
-    odd = {"inputs": inputs, "params": 3, "created": None, "libraries": []}
-    rewrite(small.map.path / "manifest.json", **odd)
-    catalogue = lineage.Catalogue.read(tmp_path)
-    assert lineage.version_before(catalogue, small.map.uri) is None
+    rewrite(small.map.path / "manifest.json", **{"inputs": inputs, "params": 3, "created": None, "libraries": []})
+    assert lineage.version_before(lineage.Catalogue.read(tmp_path), small.map.uri) is None
     assert all(isinstance(one.uri, str) for one in verify_archive(archive))
 
 
@@ -67,8 +64,7 @@ def test_changes_are_traced_to_their_origin(tmp_path: Path, archive: Archive) ->
     catalogue = lineage.Catalogue.read(tmp_path)
     before = lineage.version_before(catalogue, second.map.uri)
     assert before.ref != first.map
-    changes = lineage.changes_between(catalogue, before, catalogue.stores[second.map.uri])
-    assert changes == [
+    assert lineage.changes_between(catalogue, before, catalogue.stores[second.map.uri]) == [
         lineage.Change("segment", "input", "rectify", catalogue.inputs_of(before.ref.uri)[0], second.mosaic.uri),
         lineage.Change("rectify", "parameter", "kernel", "nearest", "catmull-rom"),
     ]
@@ -124,7 +120,8 @@ def test_nested_parameters_have_dotted_names() -> None:
 
 def test_products_are_found_by_address_key_run_and_name(tmp_path: Path, archive: Archive) -> None:
     """Accepted are addresses of stores and files, stage and key, a key's start, a run, and a name in the newest run."""
-    small, catalogue = small_survey(archive), lineage.Catalogue.read(tmp_path)
+    small = small_survey(archive)
+    catalogue = lineage.Catalogue.read(tmp_path)
     key = small.map.key
     for text in (small.map.uri, f"{small.map.uri}/class_map.zarr/", f"segment/{key}", key, key[:8], "class_map"):
         assert lineage.find_product(catalogue, text) == small.map.uri

@@ -101,7 +101,8 @@ def test_an_extended_run_keeps_its_name_and_date(archive: Archive) -> None:
 
 def test_an_unpublished_extension_changes_nothing(archive: Archive) -> None:
     """A block that raises, or ends without publishing, leaves the run as it was and no other folder."""
-    name, before = run_id(archive), (archive.runs()[0] / "manifest.json").read_bytes()
+    name = run_id(archive)
+    before = (archive.runs()[0] / "manifest.json").read_bytes()
     for error in (None, KeyboardInterrupt(), ArchiveError("the disk is full")):
         with suppress(KeyboardInterrupt, ArchiveError), archive.extend_run(name) as draft:
             draft.write_file("receipt.json", "{}")
@@ -156,7 +157,8 @@ def test_a_run_stays_whole_when_killed_at_any_system_call(archive: Archive, tmp_
 def test_interrupted_replacement_of_files_is_reported(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without folder exchange, a run killed before its manifest is replaced is damaged: verify names it, gc works."""
     monkeypatch.setattr(run_folders, "try_exchange", lambda one, other: False)
-    name, replace = run_id(archive), Path.replace
+    name = run_id(archive)
+    replace = Path.replace
 
     def refuse(self: Path, to: Path) -> Path:
         if to.name == "manifest.json":

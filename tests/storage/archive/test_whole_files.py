@@ -53,7 +53,8 @@ def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.M
     """A process killed between the renames leaves no old second file beside a new first one."""
     for name in ("x", "y"):
         (tmp_path / name).write_text("old")
-    true, seen = Path.replace, []
+    true = Path.replace
+    seen = []
 
     def watched(self: Path, target: Path) -> Path:
         seen.append(_files(tmp_path))

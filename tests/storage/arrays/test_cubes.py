@@ -26,14 +26,14 @@ GRID = AngularGrid(1.057e-4, (100, 70))
 def _header(lines: int, samples: int, bands: int, started: str | None = None) -> SweepHeader:
     frame = np.arange(samples * bands, dtype=np.float32).reshape(samples, bands)
     references = References(frame, frame + 1000, np.full(bands, 0.9, np.float32))
-    sweep, fwhm = Sweep("fine-0", "fine", "y", 12.5, -40.0, lines), np.full(bands, 5.0)
+    sweep = Sweep("fine-0", "fine", "y", 12.5, -40.0, lines)
+    fwhm = np.full(bands, 5.0)
     return SweepHeader(sweep, references, np.linspace(400, 1000, bands), fwhm, source="sim", started=started)
 
 
 def _lines(header: SweepHeader, seed: int = 0) -> list[Line]:
-    rng = np.random.default_rng(seed)
     lines, *frame = header.shape
-    data = rng.integers(0, 4096, (lines, *frame), dtype=np.uint16)
+    data = np.random.default_rng(seed).integers(0, 4096, (lines, *frame), dtype=np.uint16)
     return [Line(n, data[n], 0.001 * n, -0.5, 0.1 * n, 100.0, n % 7 != 3) for n in range(lines)]
 
 
@@ -82,8 +82,9 @@ def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
 
 def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
     """Return a stored sweep of 130 lines whose references have all optional parts."""
-    header, rng = _header(130, 9, 4), np.random.default_rng(4)
-    flat, bad = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32), np.zeros((9, 4), np.bool_)
+    header = _header(130, 9, 4)
+    flat = np.random.default_rng(4).uniform(0.9, 1.1, (9, 4)).astype(np.float32)
+    bad = np.zeros((9, 4), np.bool_)
     bad[3, 1] = True
     header = replace(header, references=replace(header.references, bad=bad, flat=flat, by_mirror=True))
     lines = _lines(header)
@@ -162,8 +163,7 @@ def test_mosaic_round_trip(tmp_path: Path, bands: int) -> None:
 
 def test_mosaic_has_the_spatial_transform_of_its_grid(tmp_path: Path) -> None:
     """The transform maps the centre pixel's corner to the undeflected direction, for coarse grids too."""
-    coarse = AngularGrid(1.057e-4, (100, 70), factor=4)
-    for grid, shape in ((GRID, (100, 70)), (coarse, (25, 18))):
+    for grid, shape in ((GRID, (100, 70)), (AngularGrid(1.057e-4, (100, 70), factor=4), (25, 18))):
         a, _, c, _, e, f = grid.attributes(shape)["spatial:transform"]
         assert a * 35 / grid.factor + c == pytest.approx(0, abs=1e-12)
         assert e * 50 / grid.factor + f == pytest.approx(0, abs=1e-12)

@@ -33,8 +33,7 @@ def test_appended_bytes_are_read_back(tmp_path: Path):
 
 def test_an_empty_file_is_stored(tmp_path: Path):
     """An empty file differs from a file that was never fetched."""
-    kept = FetchedFiles(tmp_path)
-    kept.append("/a/empty", b"")
+    FetchedFiles(tmp_path).append("/a/empty", b"")
     assert [path.name for path in tmp_path.iterdir()] == ["a%2Fempty"]
 
 
@@ -77,9 +76,11 @@ def test_a_full_disk_keeps_earlier_bytes(tmp_path: Path, name: str, monkeypatch:
 @pytest.mark.parametrize("rotten", ["bytes", "sums"])
 def test_a_flipped_bit_cuts_the_file_off_before_its_part(tmp_path: Path, rotten: str):
     """Only parts before the flipped bit are kept; the camera sends the rest again."""
-    chance, name = random.Random(7), "/captured/a/raw_0"
+    chance = random.Random(7)
+    name = "/captured/a/raw_0"
     parts = [chance.randbytes(chance.randint(1, 40)) for _ in range(12)]
-    truth, ends = b"".join(parts), [0, *itertools.accumulate(len(part) for part in parts)]
+    truth = b"".join(parts)
+    ends = [0, *itertools.accumulate(len(part) for part in parts)]
     before = FetchedFiles(tmp_path / "whole")
     for part in parts:
         before.append(name, part)

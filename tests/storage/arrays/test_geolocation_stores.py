@@ -67,7 +67,9 @@ def test_a_damaged_geolocation_store_is_refused(tmp_path: Path) -> None:
 @given(st.integers(0, 4), st.floats(1e-12, 1e-3))
 def test_path_digest_depends_on_usable_lines(line: int, change: float) -> None:
     """The digest changes with a usable line's position or correction, and with the set of usable lines."""
-    position, shift, usable = np.linspace(0.1, 0.5, 10).reshape(5, 2), np.zeros((5, 2)), np.ones(5, np.bool_)
+    position = np.linspace(0.1, 0.5, 10).reshape(5, 2)
+    shift = np.zeros((5, 2))
+    usable = np.ones(5, np.bool_)
     moved, off = position.copy(), usable.copy()
     moved[line, 1] += change
     off[line] = False
@@ -89,6 +91,7 @@ def test_path_digest_ignores_defaults_and_unusable_lines() -> None:
     assert len(plain) == 20
     assert plain == path_digest(position, np.ones(5, np.bool_), -np.zeros((5, 2)))
     assert plain == path_digest(np.asfortranarray(position))
-    usable, lost = np.arange(5) != 2, position.copy()
+    usable = np.arange(5) != 2
+    lost = position.copy()
     lost[2] = np.nan
     assert path_digest(lost, usable) == path_digest(position, usable)

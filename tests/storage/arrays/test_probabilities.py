@@ -33,10 +33,9 @@ def stored(path: Path, seed: int = 0) -> Path:
     """Store class probabilities of two tiles, and return their path."""
     values, ages, light = drawn(seed)
     class_maps.create_probabilities(path, SHAPE, LEGEND)
-    for top, bottom in ((0, 64), (64, 70)):
-        class_maps.write_probabilities_tile(
-            path, (top, 0), class_maps.packed_probabilities(values[top:bottom]), ages[top:bottom], light[top:bottom]
-        )
+    packed = class_maps.packed_probabilities(values)
+    for top, end in ((0, 64), (64, 70)):
+        class_maps.write_probabilities_tile(path, (top, 0), packed[top:end], ages[top:end], light[top:end])
     return path
 
 
@@ -44,13 +43,12 @@ def test_hourly_visits_add_up_in_age_and_light(tmp_path: Path) -> None:
     """After 72 hourly visits a pixel is three days older, and its light has faded by 0.998 per visit."""
     values, age, light = drawn(0)
     age, light = np.zeros_like(age), np.ones_like(light)
-    class_maps.create_probabilities(tmp_path / "visits.zarr", SHAPE, LEGEND)
+    path = tmp_path / "visits.zarr"
+    class_maps.create_probabilities(path, SHAPE, LEGEND)
     packed = class_maps.packed_probabilities(values)
     for _ in range(72):
-        class_maps.write_probabilities_tile(
-            tmp_path / "visits.zarr", (0, 0), packed, age + 1 / 24, light * np.float32(0.998)
-        )
-        _, age, light = class_maps.ProbabilityStore(tmp_path / "visits.zarr").read()
+        class_maps.write_probabilities_tile(path, (0, 0), packed, age + 1 / 24, light * np.float32(0.998))
+        _, age, light = class_maps.ProbabilityStore(path).read()
     np.testing.assert_allclose(age, 3, atol=1e-3)
     np.testing.assert_allclose(light, 0.998**72, rtol=0.01)
 
@@ -92,8 +90,7 @@ def test_a_window_equals_that_part_of_the_whole(tmp_path: Path) -> None:
 
 def test_xarray_unpacks_probabilities(tmp_path: Path) -> None:
     """Probabilities and days are packed by CF's rules; unknown pixels are NaN."""
-    path = stored(tmp_path / "class_probabilities.zarr")
-    opened = xr.open_zarr(path, consolidated=False)
+    opened = xr.open_zarr(stored(tmp_path / "class_probabilities.zarr"), consolidated=False)
     values, ages, light = drawn(0)
     np.testing.assert_array_equal(opened.light.values, light)
     assert opened.log_probability.dims == ("y", "x", "class")
@@ -138,7 +135,8 @@ def test_old_classes_are_stored_with_their_names(tmp_path: Path) -> None:
 
 def test_a_first_visit_has_no_old_classes(tmp_path: Path) -> None:
     """A later visit has none after `drop_changes`; both refuse tiles of old classes."""
-    first, (dropped, old) = stored(tmp_path / "first.zarr"), gone_on(tmp_path / "dropped.zarr")
+    first = stored(tmp_path / "first.zarr")
+    dropped, old = gone_on(tmp_path / "dropped.zarr")
     class_maps.drop_changes(dropped)
     for path in (first, dropped):
         assert class_maps.ProbabilityStore(path).old_class() is None
@@ -151,9 +149,8 @@ def test_missing_and_outdated_probabilities_are_refused(tmp_path: Path) -> None:
     """A store whose light is packed in bytes has to be computed again by `reprocess`."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         class_maps.ProbabilityStore(tmp_path / "none.zarr")
-    write_image(
-        open_group(stored(tmp_path / "old.zarr"), "r+"), "log2_light", ("y", "x"), np.zeros(SHAPE, np.uint8), {}
-    )
+    group = open_group(stored(tmp_path / "old.zarr"), "r+")
+    write_image(group, "log2_light", ("y", "x"), np.zeros(SHAPE, np.uint8), {})
     with pytest.raises(IncompleteStoreError, match=r"has packed light, .*; reprocess computes it again"):
         class_maps.ProbabilityStore(tmp_path / "old.zarr")
 
@@ -164,9 +161,8 @@ def test_a_probability_of_1_is_not_read_as_unknown(tmp_path: Path) -> None:
     class_maps.create_probabilities(path, (4, 4), LEGEND)
     sure = np.full((4, 4, 3), -50.0, np.float32)
     sure[..., 1] = 0.0
-    class_maps.write_probabilities_tile(
-        path, (0, 0), class_maps.packed_probabilities(sure), *np.full((2, 4, 4), 1e9, np.float32)
-    )
+    packed = class_maps.packed_probabilities(sure)
+    class_maps.write_probabilities_tile(path, (0, 0), packed, *np.full((2, 4, 4), 1e9, np.float32))
     found, days, light = class_maps.ProbabilityStore(path).read()
     assert (found.argmax(axis=-1) == 1).all()
     assert np.exp(found[..., 1]).min() > 0.99

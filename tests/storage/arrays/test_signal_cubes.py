@@ -25,7 +25,9 @@ from storage.readers.recordings import RESTORED, open_recording
 from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
 from tests.storage.small_archive import flip
 
-SHAPE, BANDS, RARE = (130, 70), 24, [(2, 3), (64, 69), (129, 0)]
+SHAPE = (130, 70)
+BANDS = 24
+RARE = [(2, 3), (64, 69), (129, 0)]
 
 
 def lines_of(bands: int = BANDS, signal: float = 30.0) -> MadeLines:
@@ -37,20 +39,17 @@ def lines_of(bands: int = BANDS, signal: float = 30.0) -> MadeLines:
     return MadeLines.of(raw)
 
 
-def store(
-    path: Path, lines: MadeLines, *, step: float = 1.0, largest: float | None = None
-) -> tuple[signal_cubes.SignalCube, CondensedSweep]:
+def store(path: Path, lines: MadeLines, *, step: float = 1.0) -> tuple[signal_cubes.SignalCube, CondensedSweep]:
     """Condense lines and store them."""
     values, valid = calibrate(lines.raw, lines.references, saturated_dn=4095, position=lines.position)
     found = SignalStatistics(values.shape[2], values[..., 0].size)
     found.add(values, valid)
-    components, bands = find_components(found), np.linspace(400, 1000, values.shape[2])
+    components = find_components(found)
+    bands = np.linspace(400, 1000, values.shape[2])
     header = SweepHeader(lines.sweep, lines.references, bands, np.full(len(bands), 5.0), "sim", "2026-05-01T10:00:00")
     origin = np.zeros(len(bands)) if found.origin is None else found.origin
-    reach = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
-    writer = signal_cubes.SignalCubeWriter(
-        path, header, components, step=step, largest=reach if largest is None else largest
-    )
+    largest = components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean)))
+    writer = signal_cubes.SignalCubeWriter(path, header, components, step=step, largest=largest)
     law = ResidualLaw.learned(found.spectra, components)
     done = Condenser(components, law, CAMERA, 1e-3, step).sweep(lines, writer.write)
     x, y = lines.position.T
@@ -89,7 +88,8 @@ def test_plain_zarr_restores_the_spectra(tmp_path: Path, step: float) -> None:
     group = zarr.open_group(tmp_path / "fine-0.zarr", mode="r")
     scores, axes, mean = (np.asarray(group[name][...], np.float32) for name in ("scores", "axes", "mean"))
     step = np.float32(group["scores"].attrs["scale_factor"])
-    spectra, found = scores.transpose(1, 2, 0) * step @ axes + mean, cube.spectra(0, 130)
+    spectra = scores.transpose(1, 2, 0) * step @ axes + mean
+    found = cube.spectra(0, 130)
     np.testing.assert_array_equal(spectra[common(cube)], found[common(cube)])
     assert (spectra != found)[~common(cube)].any(axis=1).all()
 
@@ -132,8 +132,7 @@ def test_differing_lines_finds_an_altered_score(tmp_path: Path) -> None:
     lines = lines_of()
     cube, _ = store(tmp_path / "fine-0.zarr", lines)
     assert differing_lines(lines, cube, CAMERA) == []
-    scores = zarr.open_group(tmp_path / "fine-0.zarr", mode="r+")["scores"]
-    scores[2, 99, 41] += 1
+    zarr.open_group(tmp_path / "fine-0.zarr", mode="r+")["scores"][2, 99, 41] += 1
     assert differing_lines(lines, signal_cubes.open_signal_cube(tmp_path / "fine-0.zarr"), CAMERA) == [99]
 
 
@@ -167,7 +166,8 @@ def test_a_store_that_was_not_closed_is_incomplete(tmp_path: Path) -> None:
 @pytest.mark.parametrize("by_mirror", [False, True])
 def test_restored_lines_are_close_to_raw_lines(tmp_path: Path, by_mirror: bool) -> None:
     """Errors stay below 6 standard deviations, and 3.5 DN in rare spectra; the noise falls by half or more."""
-    made, lines = field_of(4, SHAPE, BANDS), MadeLines.of(lines_of().raw, by_mirror=by_mirror)
+    made = field_of(4, SHAPE, BANDS)
+    lines = MadeLines.of(lines_of().raw, by_mirror=by_mirror)
     light = mirror_throughput(lines.position)[:, None, None] if by_mirror else 1.0
     raw = np.rint((lines.raw.astype(float) - DARK) * light + DARK).astype(np.uint16)
     lines = replace(lines, raw=raw)
@@ -224,8 +224,7 @@ def test_scores_beyond_16_bits_are_stored_in_32(tmp_path: Path, largest: float, 
     """The largest possible score selects the type; both types store the rounded scores exactly."""
     lines = lines_of()
     header = SweepHeader(lines.sweep, lines.references, np.linspace(400, 1000, BANDS))
-    axes = np.eye(2, BANDS)
-    components = Components(np.zeros(BANDS), axes, np.ones(BANDS), spread=np.array([9.0, 4.0]))
+    components = Components(np.zeros(BANDS), np.eye(2, BANDS), np.ones(BANDS), spread=np.array([9.0, 4.0]))
     writer = signal_cubes.SignalCubeWriter(tmp_path / "a.zarr", header, components, step=1.0, largest=largest)
     scores = np.random.default_rng(0).uniform(-largest, largest, (*SHAPE, 2)).astype(np.float32)
     writer.write(0, scores, np.zeros(SHAPE, np.uint8))

@@ -29,10 +29,6 @@ FIELDS: Mapping[str, Mapping[str, Any]] = {
     "processing:software": {"type": "object", "minProperties": 1, "additionalProperties": {"type": "string"}},
 }
 PREFIXES = {"proj": "projection/v2.0.0", "processing": "processing/v1.2.0"}
-PLACES = {  # where the fields of each extension may stand in an item
-    "proj": {"properties", "asset"},
-    "processing": {"properties", "asset"},
-}
 
 
 def extension_problems(item: Mapping[str, Any]) -> list[str]:
@@ -50,7 +46,7 @@ def _problems(item: Mapping[str, Any]) -> Iterator[str]:
             used.add(prefix)
             if name not in FIELDS:
                 yield f"{place}: {name} is no field that is known"
-            elif kind not in PLACES[prefix]:
+            elif kind == "band":  # fields of both extensions stand in properties and assets
                 yield f"{place}: {name} does not belong there"
             else:
                 checker = jsonschema.Draft7Validator(FIELDS[name])
@@ -76,7 +72,8 @@ def _together(table: Mapping[str, Any]) -> Iterator[str]:
         yield "proj:bbox without a CRS"
     box, transform, shape = (table.get(f"proj:{name}") for name in ("bbox", "transform", "shape"))
     if box and transform and shape and len(transform) >= 6 and len(shape) == 2:
-        (a, _, c, _, e, f), (rows, columns) = transform[:6], shape
+        a, _, c, _, e, f = transform[:6]
+        rows, columns = shape
         corners = [min(c, c + a * columns), min(f, f + e * rows), max(c, c + a * columns), max(f, f + e * rows)]
         if any(abs(one - other) > 1e-6 * max(abs(one), 1) for one, other in zip(box, corners, strict=True)):
             yield f"proj:bbox {box} is not that of transform and shape, {corners}"
@@ -84,7 +81,8 @@ def _together(table: Mapping[str, Any]) -> Iterator[str]:
 
 def core_problems(path: Path) -> list[str]:
     """Return the problems of an item or a collection by STAC's core schemas, which pystac brings."""
-    content, schemas = json.loads(path.read_text(encoding="utf-8")), get_local_schema_cache()
+    content = json.loads(path.read_text(encoding="utf-8"))
+    schemas = get_local_schema_cache()
     known = Registry().with_resources([(name, Resource.from_contents(schema)) for name, schema in schemas.items()])
     kind = "collection" if content.get("type") == "Collection" else "item"
     schema = schemas[f"https://schemas.stacspec.org/v1.1.0/{kind}-spec/json-schema/{kind}.json"]

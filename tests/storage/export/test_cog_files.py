@@ -24,9 +24,7 @@ from storage.arrays.georeference import AngularGrid
 from storage.export.image_files import CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
-LEGEND = ClassNames(
-    ("sugar beet", "soil & stones", "maïs"), np.array([[10, 200, 30], [120, 90, 60], [0, 0, 255]], "u1")
-)
+LEGEND = ClassNames(("sugar beet", "soil & stones", "maïs"), np.array([[9, 200, 30], [120, 90, 60], [0, 0, 255]], "u1"))
 GRID = AngularGrid(1e-4, (1300, 1100))
 FEW = (90, 70)
 
@@ -66,7 +64,8 @@ def test_ctrl_c_during_the_import_of_gdal_is_raised(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733"])
 def test_rasterio_reads_values_and_tags_as_written(tmp_path: Path, crs: str) -> None:
     """Values, CRS, transform, nodata, band names and tags of a map are those given."""
-    values, box = classes_of(FEW), on_map(FEW, crs)
+    values = classes_of(FEW)
+    box = on_map(FEW, crs)
     write_cog(tmp_path / "a.tif", class_image(box), rows_of(values))
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(1), values)
@@ -93,8 +92,7 @@ def test_overviews_of_classes_show_the_commonest_class(tmp_path: Path) -> None:
     """Three white pixels and a black one give white, though grey is nearer to the mean of their colours."""
     greys = ClassNames(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
     values = np.tile(np.array([[0, 2], [2, 2]], np.uint8), (300, 280))
-    image = replace(class_image(on_map(values.shape)), legend=greys)
-    write_cog(tmp_path / "a.tif", image, rows_of(values))
+    write_cog(tmp_path / "a.tif", replace(class_image(on_map(values.shape)), legend=greys), rows_of(values))
     with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
         assert set(np.unique(file.read(1))) == {2}
 
@@ -113,7 +111,8 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
     """The file has a colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
     write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), rows_of(classes_of(FEW)))
     with rasterio.open(tmp_path / "a.tif") as file:
-        table, tags = file.colormap(1), file.tags(1)
+        table = file.colormap(1)
+        tags = file.tags(1)
     assert [table[number][:3] for number in range(3)] == [tuple(colour) for colour in LEGEND.colours.tolist()]
     assert [tags[f"CLASS_{number}"] for number in range(3)] == list(LEGEND.names)
     assert tags["flag_meanings"] == "sugar_beet soil_&_stones maïs"

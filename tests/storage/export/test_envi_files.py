@@ -27,14 +27,14 @@ ORDERS = {"little": "<", "big": ">"}
 CODES = sorted(DATA_TYPES)
 SHAPE = (6, 7, 5)
 NM = [401.25, 402.5, 550.0, 800.125, 999.875]
-
 WIDTHS = [5.5, 5.25, 6.0, 7.125, 8.0]
 NAMES = ["blue 1", "blue 2", "green", "edge", "last"]
 
 
 def numbers(code: int, seed: int = 0) -> NDArray[Any]:
     """Return random numbers over an ENVI type's whole range, (line, sample, band); floats include NaN and infinity."""
-    kind, rng = np.dtype(DATA_TYPES[code]), np.random.default_rng(100 * code + seed)
+    kind = np.dtype(DATA_TYPES[code])
+    rng = np.random.default_rng(100 * code + seed)
     if kind.kind in "ui":
         return np.frombuffer(rng.bytes(int(np.prod(SHAPE)) * kind.itemsize), kind).reshape(SHAPE).copy()
     values = rng.normal(0, 1e6, SHAPE) + (1j * rng.normal(0, 1, SHAPE) if kind.kind == "c" else 0)
@@ -44,7 +44,8 @@ def numbers(code: int, seed: int = 0) -> NDArray[Any]:
 
 def written_by_spy(folder: Path, code: int, interleave: str, order: str, **about: Any) -> tuple[Path, NDArray[Any]]:
     """Return a header that SPy wrote beside a random cube, and the cube."""
-    values, header = numbers(code), folder / "a.hdr"
+    values = numbers(code)
+    header = folder / "a.hdr"
     envi.save_image(str(header), values, interleave=interleave, byteorder=order, ext=".img", metadata=about, force=True)
     return header, values
 
@@ -84,7 +85,8 @@ def shifted(header: Path, offset: int) -> None:
 @pytest.mark.parametrize("code", CODES)
 def test_spy_reads_written_envi_files(tmp_path: Path, code: int) -> None:
     """For every type, SPy and this project read the same numbers, bands and description."""
-    values, file = numbers(code), EnviFile(SHAPE, DATA_TYPES[code], np.array(NM), np.array(WIDTHS), "two {x}")
+    values = numbers(code)
+    file = EnviFile(SHAPE, DATA_TYPES[code], np.array(NM), np.array(WIDTHS), "two {x}")
     data = write_envi(tmp_path / "a.hdr", file, in_blocks(values))
     assert data == tmp_path / "a.img"
     np.testing.assert_array_equal(as_spy_reads(tmp_path / "a.hdr"), values)
@@ -117,7 +119,8 @@ def test_spy_and_this_project_agree_on_band_metadata(tmp_path: Path) -> None:
 def test_rasterio_reads_written_envi_files(tmp_path: Path, dtype: str) -> None:
     """GDAL's reader agrees on values, number of bands and wavelengths."""
     code = next(code for code, name in DATA_TYPES.items() if name == dtype)
-    values, file = numbers(code), EnviFile(SHAPE, dtype, np.array(NM), np.array(WIDTHS))
+    values = numbers(code)
+    file = EnviFile(SHAPE, dtype, np.array(NM), np.array(WIDTHS))
     with rasterio.open(write_envi(tmp_path / "a.hdr", file, in_blocks(values))) as found:
         np.testing.assert_array_equal(np.moveaxis(found.read(), 0, -1), values)
         assert found.count == 5
@@ -130,7 +133,8 @@ def test_a_large_cube_is_written_in_little_memory(tmp_path: Path) -> None:
     block = np.ones((64, *shape[1:]), np.uint16)
     blocks = ((first, block[: min(64, shape[0] - first)]) for first in range(0, shape[0], 64))
     tracemalloc.start()
-    data, peak = write_envi(tmp_path / "a.hdr", EnviFile(shape, "u2"), blocks), tracemalloc.get_traced_memory()[1]
+    data = write_envi(tmp_path / "a.hdr", EnviFile(shape, "u2"), blocks)
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert data.stat().st_size == 2 * int(np.prod(shape))
     assert peak < 3 * block.nbytes

@@ -25,7 +25,9 @@ WORDS = TaskText("spot spraying of the northern field", "north", "weed 2.5 l/ha"
 def schema_problems(found: Any, of: str = "") -> Iterator[str]:
     """Yield violations of the schema in a parsed file: required values, ranges, lengths, patterns."""
     for one in fields(found):
-        value, rule, name = getattr(found, one.name), one.metadata, f"{of}{type(found).__name__}.{one.name}"
+        value = getattr(found, one.name)
+        rule = one.metadata
+        name = f"{of}{type(found).__name__}.{one.name}"
         if isinstance(value, list):
             for part in value:
                 yield from schema_problems(part, f"{of}{type(found).__name__}.")

@@ -31,7 +31,8 @@ def content(ref: StageRef) -> str:
 def test_clear_removes_files_and_keeps_the_manifest(archive: Archive) -> None:
     """Key, parameters, inputs, date and size are still known, and verify finds no problem."""
     small = small_survey(archive)
-    before, size = archive.manifest(small.mosaic), archive.stored_bytes(small.mosaic)
+    before = archive.manifest(small.mosaic)
+    size = archive.stored_bytes(small.mosaic)
     assert cleared(archive) == [small.mosaic.uri]
     assert [path.name for path in small.mosaic.path.iterdir()] == ["manifest.json"]
     after = archive.manifest(small.mosaic)
@@ -70,7 +71,8 @@ def test_locating_a_cleared_store_explains_what_to_do(archive: Archive) -> None:
 
 def test_a_store_cleared_during_a_check_is_not_damaged(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another survey may clear it while a reader or verify checks its files."""
-    small, problem = small_survey(archive), manifests.file_problem
+    small = small_survey(archive)
+    problem = manifests.file_problem
 
     def clear_first(path: Path, *given: Any, **options: Any) -> str | None:
         archive.clear(small.mosaic)

@@ -153,8 +153,7 @@ def test_gc_keeps_all_stores_if_inputs_are_unknown(archive: Archive) -> None:
     for ref in (small.raw, small.mosaic):
         grow_old(ref, days=3)
     (small.map.path / "manifest.json").write_text("{")
-    found = clear_up(archive, keep_days=2)
-    assert f"the inputs of {small.map.uri} are not known" in found.obstacle
+    assert f"the inputs of {small.map.uri} are not known" in clear_up(archive, keep_days=2).obstacle
     assert len(archive.refs()) == 3
 
 

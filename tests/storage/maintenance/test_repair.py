@@ -42,6 +42,14 @@ def _two(archive: Archive) -> tuple[Small, Small]:
     return small_survey(archive), small_survey(archive, kernel="nearest")
 
 
+def _pictured(archive: Archive, asked: dict[str, Any], **facts: Any) -> Path:
+    """Publish a run of a receipt and a picture, and return its folder."""
+    with archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", json.dumps({"settings": asked}))
+        draft.write_file("quicklook.png", b"picture")
+        return draft.publish(**facts)
+
+
 def _moments(archive: Archive) -> dict[str, int]:
     return {ref.uri: (ref.path / "manifest.json").stat().st_mtime_ns for ref in archive.refs()}
 
@@ -62,15 +70,10 @@ def test_repair_makes_only_broken_stores_again(archive: Archive) -> None:
 
 def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> None:
     """A repeated survey has two runs with the same settings; each is repaired under its own name and date."""
-    for _ in range(2):
-        with archive.new_run("farm") as draft:
-            draft.write_file("receipt.json", json.dumps({"settings": settings(kernel="bilinear")}))
-            draft.write_file("quicklook.png", b"picture")
-    runs = archive.runs()
+    runs = [_pictured(archive, settings(kernel="bilinear")) for _ in range(2)]
     for run in runs:
         flip(run / "quicklook.png")
-    done = _repair(archive)
-    assert done.complete
+    assert _repair(archive).complete
     assert archive.runs() == runs
     for run in runs:  # its date is that of its name
         assert re.sub(r"\D", "", read_run(run).created).startswith(run.name[:8] + run.name[9:15])
@@ -79,10 +82,8 @@ def test_two_damaged_runs_of_one_command_keep_their_names(archive: Archive) -> N
 
 def test_a_changed_scene_file_does_not_replace_a_run(archive: Archive) -> None:
     """The scene's file was overwritten, so the repeated survey made other stores; the run stays and is reported."""
-    with archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", json.dumps({"settings": settings()}))
-        draft.write_file("quicklook.png", b"picture")
-        run = draft.publish(rests_on=archive.manifest_hashes([small_survey(archive, named=False).map]))
+    small = small_survey(archive, named=False)
+    run = _pictured(archive, settings(), rests_on=archive.manifest_hashes([small.map]))
     flip(run / "quicklook.png")
     done = _repair(archive, lambda asked: _run(small_survey(archive, seed=7)))
     assert "its scene shows something else by now" in done.failed[f"runs/{run.name}"]
@@ -111,7 +112,8 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
 
 def test_damaged_raw_lines_of_a_rig_stay(archive: Archive) -> None:
     """Raw lines cannot be captured again, and their dependents stay; a broken map of them is made again."""
-    small, before = small_survey(archive, simulated=False), _moments(archive)
+    small = small_survey(archive, simulated=False)
+    before = _moments(archive)
     flip(small.raw.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert not done.complete
@@ -127,7 +129,8 @@ def test_damaged_raw_lines_of_a_rig_stay(archive: Archive) -> None:
 @pytest.mark.parametrize("how", ["flip", "short", "manifest", "gone", "old"])
 def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how: str) -> None:
     """They are the only copy. A broken map is made from them only if a survey finds them; nothing is captured again."""
-    light, asked = {"scene": "farm", "source": "rig"}, settings(source="rig")
+    light = {"scene": "farm", "source": "rig"}
+    asked = settings(source="rig")
     raw = make_store(archive, "capture", light, [])
     signal = make_store(archive, "condense", {}, [raw])
     drawn = make_store(archive, "segment", {}, [signal])
@@ -159,12 +162,10 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
 def test_repair_keeps_a_damaged_ingested_cube(archive: Archive) -> None:
     """Surveys read it and cannot make it, even those of simulated rigs."""
     cube = make_store(archive, "ingest", {}, [])
-    asked = settings(scene=str(cube.path))
-    archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([cube]))
+    archive.new_run("farm").publish(settings=settings(scene=str(cube.path)), rests_on=archive.manifest_hashes([cube]))
     flip(cube.path / "data.bin")
     given = NOW | {"versions": {"ingest": 1}, "can_capture": lambda run: True}
-    done = repair(archive, verify_archive(archive), Mock(), **given)
-    assert list(done.plan.hopeless) == [cube.uri]
+    assert list(repair(archive, verify_archive(archive), Mock(), **given).plan.hopeless) == [cube.uri]
     assert cube.path.exists()
 
 
@@ -261,10 +262,7 @@ def test_repair_keeps_stores_of_outdated_keys(archive: Archive, store: str, newe
 
 def test_a_damaged_run_is_run_again(archive: Archive) -> None:
     """The settings come from its receipt if only a picture is damaged; a damaged receipt is not used."""
-    with archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", json.dumps({"settings": {"seed": 0, "kernel": "bilinear", "source": "sim"}}))
-        draft.write_file("quicklook.png", b"picture")
-    (run,) = archive.runs()
+    run = _pictured(archive, {"seed": 0, "kernel": "bilinear", "source": "sim"})
     flip(run / "quicklook.png")
     done = _repair(archive)
     assert done.complete

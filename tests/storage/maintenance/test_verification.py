@@ -16,8 +16,6 @@ from storage.arrays.layout import create_group, open_group, read_array, write_im
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
-FLIPS = 30
-
 
 def _with_cube(archive: Archive) -> StageRef:
     """Make a store with a cube of (130, 700, 3): shards of 64 rows and 640 columns, chunks of 32 x 32."""
@@ -45,7 +43,7 @@ def test_verify_finds_flipped_bits_in_any_file(tmp_path: Path, archive: Archive)
     _with_cube(archive)
     files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file() and path.suffix != ".lock"]
     chance = random.Random(4)
-    for number in range(FLIPS):
+    for number in range(30):
         weights = [path.stat().st_size if number % 2 else 1 for path in files]
         (path,) = chance.choices(files, weights)
         at, bit = chance.randrange(path.stat().st_size), chance.randrange(8)
@@ -113,9 +111,7 @@ def test_a_store_removed_during_verify_is_not_damage(archive: Archive) -> None:
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
     def clear(ref: StageRef) -> list[str]:
-        return [
-            one.uri for one in verify_archive(archive, lambda uri, done: archive.discard(ref) and None) if one.problem
-        ]
+        return [one.uri for one in verify_archive(archive, lambda *_: archive.discard(ref) and None) if one.problem]
 
     assert clear(other.map) == []
     assert clear(named.map) == [named.map.uri]

@@ -22,7 +22,6 @@ from storage.parallel import pool as pool_module
 from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
-PROCESSES = WorkerPool("processes", 2)
 # dask does not close its handshake with a worker that dies
 pytestmark = pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 
@@ -62,7 +61,7 @@ def threads_here(number: int) -> tuple[int, str | None]:
 @pytest.fixture(scope="module")
 def processes() -> Iterator[WorkerPool]:
     """Yield two worker processes for all tests of this module."""
-    with PROCESSES.open() as pool:
+    with WorkerPool("processes", 2).open() as pool:
         yield pool
 
 
@@ -125,9 +124,8 @@ def test_a_block_that_always_kills_its_worker_raises_an_error() -> None:
     """The error says what to do, and the open pool gets new workers."""
     with WorkerPool("processes", 1).open() as pool:
         (before, _), *_ = run_blocks(threads_here, [0], pool)
-        with pytest.raises(
-            WorkerError, match=r"--scheduler processes: workers died .* in the same block.*--scheduler threads"
-        ):
+        died = r"--scheduler processes: workers died .* in the same block.*--scheduler threads"
+        with pytest.raises(WorkerError, match=died):
             run_blocks(die, range(3), pool)
         (after, _), *_ = run_blocks(threads_here, [0], pool)
         assert before != after
@@ -181,7 +179,8 @@ def test_workers_that_differ_are_refused(
     elsewhere: WorkerPool, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
 ) -> None:
     """Other code, another numpy or other files would give other bytes; the error names the first difference."""
-    run, true = pool_module.dask_distributed.Client.run, pool_module.about_here([])
+    run = pool_module.dask_distributed.Client.run
+    true = pool_module.about_here([])
     monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, inputs: run(self, _true, true))
     monkeypatch.setattr(pool_module, "about_here", lambda inputs: {**true, **here})
     with pytest.raises(SettingsError, match=rf"worker tcp:.* {words}"):
@@ -266,12 +265,10 @@ def nap(number: int) -> int:
 def test_a_lost_scheduler_raises_one_error(tmp_path: Path) -> None:
     """There is one message and no traceback of dask; a restarted scheduler serves the pool again."""
     with socket.create_server(("127.0.0.1", 0)) as free:
-        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    with run_script(tmp_path, GONE, address) as started:
+        at = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    with run_script(tmp_path, GONE, at) as started:
         printed, said = started.communicate(timeout=60)
-    gone = (
-        f"--scheduler {address}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
-    )
+    gone = f"--scheduler {at}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
     assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 
 
@@ -293,7 +290,8 @@ if __name__ == "__main__":
 def run_script(folder: Path, text: str, *words: str) -> subprocess.Popen[str]:
     """Start a program in a process and a session of its own."""
     (script := folder / "script.py").write_text(text)
-    command, environment = [sys.executable, str(script), *words], {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, str(script), *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, start_new_session=True, **said)  # type: ignore[call-overload, no-any-return]
 

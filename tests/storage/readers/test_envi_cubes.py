@@ -57,8 +57,7 @@ def test_truncated_cubes_keep_their_whole_lines(tmp_path: Path, interleave: str)
 def test_lines_are_counted_from_the_file_size(tmp_path: Path, interleave: str) -> None:
     """The header does not state the number of lines."""
     values = np.arange(60, dtype="f4").reshape(5, 4, 3)
-    path = write_envi(tmp_path / "a.bin", values, interleave)
-    header = path.with_suffix(".hdr")
+    header = write_envi(tmp_path / "a.bin", values, interleave).with_suffix(".hdr")
     header.write_text(header.read_text().replace("lines = 5\n", ""))
     cube = open_envi_cube(header)
     np.testing.assert_array_equal(cube.values, values)
@@ -110,10 +109,8 @@ def test_unbalanced_braces_do_not_hide_fields() -> None:
 
 def test_comment_lines_hold_settings() -> None:
     """Lines that begin with a semicolon are no fields, but settings in them are kept, also within braces."""
-    text = (
-        PLAIN + "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
-    )
-    header = parse_envi_header(text)
+    text = "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
+    header = parse_envi_header(PLAIN + text)
     assert header.settings == {"exposure (ms)": "100.25", "post aoi width": "1600", "x": "1"}
     np.testing.assert_array_equal(header.wavelength_nm, [400, 402])
 

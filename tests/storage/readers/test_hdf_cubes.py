@@ -42,17 +42,16 @@ def emit_file(path: Path) -> NDArray[np.float32]:
         "good_wavelengths": (("bands",), np.array([1, 1, 0, 1, 1], np.float32)),
     }
     table = {name: (("ortho_y", "ortho_x"), np.ones((9, 9), np.int32)) for name in ("glt_x", "glt_y")}
-    tree = xr.DataTree.from_dict(
-        {"/": root, "/sensor_band_parameters": xr.Dataset(bands), "/location": xr.Dataset(table)}
-    )
+    groups = {"/": root, "/sensor_band_parameters": xr.Dataset(bands), "/location": xr.Dataset(table)}
     packed = {"/": {"reflectance": {"_FillValue": np.float32(-9999), "zlib": True, "chunksizes": (4, 3, 5)}}}
-    tree.to_netcdf(path, engine="h5netcdf", encoding=packed)
+    xr.DataTree.from_dict(groups).to_netcdf(path, engine="h5netcdf", encoding=packed)
     return values
 
 
 def test_emit_reflectance_is_read(tmp_path: Path) -> None:
     """Values, wavelengths, widths and bad bands are EMIT's; a note says that there is no map grid."""
-    values, source = emit_file(tmp_path / "emit.nc"), open_cube(tmp_path / "emit.nc")
+    values = emit_file(tmp_path / "emit.nc")
+    source = open_cube(tmp_path / "emit.nc")
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
     scene = load_scene_file(tmp_path / "emit.nc")
     np.testing.assert_array_equal(scene.wavelength_nm, NM[[0, 1, 3, 4]])
@@ -84,7 +83,8 @@ def neon_file(path: Path, **about: Any) -> None:
 def test_neon_reflectance_is_read(tmp_path: Path) -> None:
     """Values are divided by their scale, no-data is NaN, and the grid comes from the map info."""
     neon_file(tmp_path / "NEON_SERC.h5")
-    scene, expected = load_scene_file(tmp_path / "NEON_SERC.h5"), CUBE / 10000
+    scene = load_scene_file(tmp_path / "NEON_SERC.h5")
+    expected = CUBE / 10000
     expected[1, 1] = np.nan
     np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
     np.testing.assert_array_equal(scene.wavelength_nm, NM)
@@ -162,7 +162,8 @@ def test_cf_files_are_read(tmp_path: Path, dims: tuple[str, ...], unit: str, sca
 def test_hdf5_without_dimension_names_is_read(tmp_path: Path) -> None:
     """The axis whose length is the number of wavelengths is the band; a note says which."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["cube"], file["wavelength"] = np.moveaxis(CUBE, -1, 0), NM
+        file["cube"] = np.moveaxis(CUBE, -1, 0)
+        file["wavelength"] = NM
     scene = load_scene_file(tmp_path / "a.h5")
     np.testing.assert_array_equal(scene.values, CUBE)
     assert "dims have no names, read as y, x and band: axis 0 (from 0) is band" in scene.provenance
@@ -171,7 +172,9 @@ def test_hdf5_without_dimension_names_is_read(tmp_path: Path) -> None:
 def test_an_address_selects_variable_and_time_step(tmp_path: Path) -> None:
     """The name of the variable may be given with its groups or without."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["field/one"], file["field/two"], file["wavelength"] = CUBE, CUBE + 1, NM
+        file["field/one"] = CUBE
+        file["field/two"] = CUBE + 1
+        file["wavelength"] = NM
         file["series/days"] = np.stack([CUBE, CUBE + 7])
     for name, more in (("field/one", 0), ("two", 1), ("series/days:1", 7)):
         np.testing.assert_array_equal(load_scene_file(f"{tmp_path / 'a.h5'}:{name}").values, CUBE + more)
@@ -256,8 +259,7 @@ def test_netcdf_packing_is_decoded(tmp_path: Path, stored: Any, about: dict[str,
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file["values"] = stored.reshape(1, 4, 1)
         file["values"].attrs.update({"scale_factor": 0.01, **about})
-    found = open_cube(f"{tmp_path / 'a.nc'}:values").read(0, 1)
-    np.testing.assert_allclose(found[0, :, 0], read, rtol=1e-6)
+    np.testing.assert_allclose(open_cube(f"{tmp_path / 'a.nc'}:values").read(0, 1)[0, :, 0], read, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

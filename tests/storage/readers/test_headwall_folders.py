@@ -15,6 +15,7 @@ from pipeline.rig.camera.camera_texts import times_of_lines
 from storage.readers.envi_files import load_frame_index
 from storage.readers.open_cubes import open_cube
 
+DROPPED = "1 frames between the first and the last were dropped by the camera"
 NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
 
 
@@ -63,7 +64,8 @@ def test_missing_lines_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) ->
     """A truncated or missing part leaves a gap; the last part's lost lines are at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)
     write_part(tmp_path, "raw_10", lines[10:20], lines=12)
-    source, missing = open_cube(tmp_path), [6, 7, 8, 9, 20, 21]
+    source = open_cube(tmp_path)
+    missing = [6, 7, 8, 9, 20, 21]
     assert source.shape[0] == 22
     assert np.flatnonzero(~source.lines.valid).tolist() == missing
     np.testing.assert_array_equal(source.read(0, 22)[source.lines.valid], lines[[*range(6), *range(10, 20)]])
@@ -119,9 +121,8 @@ def test_parts_that_do_not_fit_are_refused(tmp_path: Path, lines: NDArray[np.uin
 
 def test_folders_without_lines_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A folder without parts and one with only empty parts have different messages."""
-    with pytest.raises(
-        SceneError, match="is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
-    ):
+    expected = "is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
+    with pytest.raises(SceneError, match=expected):
         open_cube(tmp_path)
     write_part(tmp_path, "raw_0", lines[:0])
     with pytest.raises(SceneError, match=r"every part of .* is empty"):
@@ -166,25 +167,13 @@ def test_an_empty_frame_index_is_refused(tmp_path: Path, text: str) -> None:
             [2000, 2001, -1, 2003, -1],
             ("the frame index has the time of 3 of 5 lines", "the frame index lists 1 frames beyond the lines"),
         ),
-        (
-            # as many frames as lines: they are the lines, whatever their numbers
-            {0: 10, 1: 20, 3: 40},
-            (0, 3),
-            0,
-            [0, 1, 3],
-            ("1 frames between the first and the last were dropped by the camera",),
-        ),
+        # as many frames as lines: they are the lines, whatever their numbers
+        ({0: 10, 1: 20, 3: 40}, (0, 3), 0, [0, 1, 3], (DROPPED,)),
         # the index of a later part may count from the part's own start
         ({0: 10, 1: 20}, (2000, 3), 0, [2000, 2001, -1], ("the frame index has the time of 2 of 3 lines",)),
         ({0: 10, 1: 20, 2: 30}, (2000, 3), 0, [2000, 2001, 2002], ()),
         # a file that lost its last line still has its lines in order, also with dropped frames
-        (
-            {0: 10, 1: 20, 3: 40, 4: 50},
-            (0, 3),
-            1,
-            [0, 1, 3],
-            ("1 frames between the first and the last were dropped by the camera",),
-        ),
+        ({0: 10, 1: 20, 3: 40, 4: 50}, (0, 3), 1, [0, 1, 3], (DROPPED,)),
     ],
 )
 def test_lines_have_the_times_of_their_frames(

@@ -54,7 +54,8 @@ def npy_header(shape: tuple[int, ...], kind: str = "<u2") -> bytes:
 def test_arrays_with_huge_claims_are_refused(tmp_path: Path, packed: int | None) -> None:
     """A shape beyond the bytes of the file or of its member is refused before it is allocated."""
     claim = npy_header((100_000, 1000, 1000)) + bytes(100)
-    path, words = tmp_path / ("a.npy" if packed is None else "a.npz"), "claims 200000000000 bytes of numbers"
+    path = tmp_path / ("a.npy" if packed is None else "a.npz")
+    words = "claims 200000000000 bytes of numbers"
     if packed is None:
         path.write_bytes(claim)
         words = "cannot be read as"
@@ -104,7 +105,8 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
 def test_mat_arrays_with_huge_claims_are_refused(tmp_path: Path) -> None:
     """Axes beyond the file's size are refused in both versions; the array of version 7.3 was never written."""
     scipy.io.savemat(tmp_path / "a.mat", {"cube": np.ones((3, 4, 5), np.uint8)})
-    whole, sizes = (tmp_path / "a.mat").read_bytes(), struct.pack("<iii", 3, 4, 5)
+    whole = (tmp_path / "a.mat").read_bytes()
+    sizes = struct.pack("<iii", 3, 4, 5)
     assert sizes in whole
     (tmp_path / "a.mat").write_bytes(whole.replace(sizes, struct.pack("<iii", 30_000, 40_000, 50_000)))
     with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
@@ -128,9 +130,8 @@ def test_matlab_text_and_cells_are_ignored(tmp_path: Path) -> None:
 def png(width: int, height: int, packed: bytes) -> bytes:
     """Return a grey PNG of any claimed size."""
     chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", packed), (b"IEND", b"")]
-    parts = [
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
-    ]
+    number = struct.Struct(">I").pack
+    parts = [number(len(body)) + kind + body + number(zlib.crc32(kind + body)) for kind, body in chunks]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 

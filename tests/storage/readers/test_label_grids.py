@@ -17,15 +17,16 @@ from flows.training.init_command import draft_scene
 from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
-WEST, NORTH, SIDE = 600_000.0, 5_700_000.0, 60
+WEST = 600_000.0
+NORTH = 5_700_000.0
+SIDE = 60
 CLASSES = np.zeros((SIDE, SIDE), np.uint8)  # three stripes and a corner, without any symmetry
 CLASSES[:, 20:], CLASSES[:, 45:], CLASSES[:10, :15] = 1, 2, 3
 NORTH_UP = Affine(1, 0, WEST, 0, -1, NORTH)
+SOUTH_UP = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
 
 
-def write(
-    path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: str | None = "EPSG:32632", **about: Any
-) -> Path:
+def write(path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: Any = 32632, **about: Any) -> Path:
     """Write a GeoTIFF of (y, x) or (y, x, band) values, and return its path."""
     planes = np.moveaxis(np.atleast_3d(values), -1, 0)
     count, height, width = planes.shape
@@ -64,7 +65,8 @@ def test_labels_shifted_by_seven_metres_are_aligned(tmp_path: Path) -> None:
 
 def test_labels_in_another_crs_are_aligned(tmp_path: Path) -> None:
     """Labels in degrees agree with the image in more than 98 % of the pixels; borders of classes may differ."""
-    path, to_metres = image(tmp_path), Transformer.from_crs(4326, 32632, always_xy=True)
+    path = image(tmp_path)
+    to_metres = Transformer.from_crs(4326, 32632, always_xy=True)
     to_degrees = Transformer.from_crs(32632, 4326, always_xy=True)
     west, south, east, north = to_degrees.transform_bounds(WEST - 5, NORTH - SIDE - 5, WEST + SIDE + 5, NORTH + 5)
     grid = Affine((east - west) / 200, 0, west, 0, (south - north) / 200, north)
@@ -81,10 +83,9 @@ def test_labels_in_another_crs_are_aligned(tmp_path: Path) -> None:
 @pytest.mark.parametrize("turned", ["labels", "image"])
 def test_labels_align_with_rows_in_opposite_order(tmp_path: Path, turned: str) -> None:
     """Rows from the south up and rows from the north down show the same ground."""
-    south_up = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
     flipped = np.ascontiguousarray(CLASSES[::-1])
-    path = image(tmp_path, south_up, flipped) if turned == "image" else image(tmp_path)
-    labels = (flipped, south_up) if turned == "labels" else (CLASSES, NORTH_UP)
+    path = image(tmp_path, SOUTH_UP, flipped) if turned == "image" else image(tmp_path)
+    labels = (flipped, SOUTH_UP) if turned == "labels" else (CLASSES, NORTH_UP)
     write(tmp_path / "field_labels.tif", *labels)
     scene = load_scene_file(path)
     assert agree(scene) == 1.0
@@ -114,11 +115,10 @@ def test_labels_outside_of_the_image_are_refused(tmp_path: Path) -> None:
 
 def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:
     """The mask of training pixels is resampled to the scene's pixels as well."""
-    path, south_up = image(tmp_path), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
-    labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), south_up)
-    mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), south_up)
-    data = load_data_set(path, labels=labels, train_mask=mask)
-    train = data.load("field", "train").labels
+    path = image(tmp_path)
+    labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), SOUTH_UP)
+    mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), SOUTH_UP)
+    train = load_data_set(path, labels=labels, train_mask=mask).load("field", "train").labels
     assert train is not None
     np.testing.assert_array_equal(train != 255, CLASSES == 1)
 
@@ -126,8 +126,9 @@ def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:
 @pytest.mark.parametrize("turned", [False, True])
 def test_nodata_of_a_label_file_is_unlabelled(tmp_path: Path, turned: bool) -> None:
     """The value is found on the scene's grid and on another; a note counts its pixels."""
-    path, codes = image(tmp_path), np.where(CLASSES == 3, np.uint8(255), CLASSES)
-    grid = (codes[::-1].copy(), Affine(1, 0, WEST, 0, 1, NORTH - SIDE)) if turned else (codes, NORTH_UP)
+    path = image(tmp_path)
+    codes = np.where(CLASSES == 3, np.uint8(255), CLASSES)
+    grid = (codes[::-1].copy(), SOUTH_UP) if turned else (codes, NORTH_UP)
     write(tmp_path / "field_labels.tif", *grid, nodata=255)
     scene = load_scene_file(path)
     assert scene.class_names == ("class_0", "class_1", "class_2")

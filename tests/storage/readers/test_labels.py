@@ -35,14 +35,14 @@ def test_an_unknown_colour_is_counted(tmp_path: Path) -> None:
     Image.fromarray(image).save(tmp_path / "a.png")
     with pytest.raises(SceneError, match=r"3 px of colour \[9, 9, 9\], which is no class"):
         load_labels(tmp_path / "a.png", (4, 4), classes=COLOURS)
-    found = load_labels(tmp_path / "a.png", (4, 4), classes=COLOURS, unlabelled=(9, 9, 9))
-    assert (found.index == 255).sum() == 3
+    assert (load_labels(tmp_path / "a.png", (4, 4), classes=COLOURS, unlabelled=(9, 9, 9)).index == 255).sum() == 3
 
 
 @pytest.mark.parametrize("ending", ["npy", "mat", "png"])
 def test_numbers_become_indices(tmp_path: Path, ending: str) -> None:
     """Numbers of a .npy, .mat or grey PNG give indices; the unlabelled number gives 255."""
-    codes, path = np.array([[0, 7, 3], [3, 3, 7]], np.uint8), tmp_path / f"a.{ending}"
+    codes = np.array([[0, 7, 3], [3, 3, 7]], np.uint8)
+    path = tmp_path / f"a.{ending}"
     if ending == "npy":
         np.save(path, codes)
     elif ending == "mat":

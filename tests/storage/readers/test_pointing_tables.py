@@ -62,8 +62,7 @@ def test_invalid_lines_need_no_numbers(tmp_path: Path, line: str) -> None:
 
 def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
     """Rows belong to the cube that they name; for a single cube of another name they name its sweeps."""
-    text = "sweep,position_px,time\na,0,0\na,1,1\nb,5,0\nb,4,1\nb,3,2\n"
-    table = load_pointing_table(_table(tmp_path, text))
+    table = load_pointing_table(_table(tmp_path, "sweep,position_px,time\na,0,0\na,1,1\nb,5,0\nb,4,1\nb,3,2\n"))
     assert table.of_cube("a", 2).position[:, 0].tolist() == [0, 1]
     assert table.of_cube("b", 3).position[:, 0].tolist() == [5, 4, 3]
     assert table.of_cube("whole", 5, alone=True).part == ("a", "a", "b", "b", "b")

@@ -65,9 +65,7 @@ def test_polygon_labels_equal_rasterios(tmp_path: Path) -> None:
     place = PLACE * Affine.rotation(20)
     shapes = [shapely.Point(400_010, 5_699_995).buffer(6), shapely.Point(400_016, 5_699_990).buffer(5)]
     found = load_scene_file(scene(tmp_path, place=place), labels=written(tmp_path / "a.gpkg", shapes, code=[4, 7]))
-    other = rasterio.features.rasterize(
-        zip(shapes, (0, 1), strict=True), SHAPE, fill=NONE, transform=place, dtype="uint8"
-    )
+    other = rasterio.features.rasterize(zip(shapes, (0, 1), strict=True), SHAPE, NONE, transform=place, dtype="uint8")
     np.testing.assert_array_equal(found.labels, other)
     assert found.class_names == ("class_4", "class_7")
     assert found.class_values == (4, 7)
@@ -112,7 +110,8 @@ def test_overlapping_polygons_take_the_later_class(tmp_path: Path) -> None:
     """A note counts their pixels; a polygon without a value is left out."""
     shapes = [WEST, WEST.buffer(-2, join_style="mitre"), EAST]
     path = written(tmp_path / "a.gpkg", shapes, crop=["wheat", "maize", None])
-    found, expected = load_scene_file(scene(tmp_path), labels=path), np.where(TRUTH == 1, 1, NONE)
+    found = load_scene_file(scene(tmp_path), labels=path)
+    expected = np.where(TRUTH == 1, 1, NONE)
     expected[1:9, 1:3] = 0
     np.testing.assert_array_equal(found.labels, expected)
     assert "16 px lie in polygons of several classes: the later polygon counts" in found.provenance
@@ -141,8 +140,7 @@ def test_scenes_of_a_folder_share_their_classes(tmp_path: Path) -> None:
     assert data.classes == {"maize": 1, "oats": 2, "wheat": 3}
     assert [data.load(name).class_names for name in ("a", "b")] == [("maize", "oats", "wheat")] * 2
     assert (data.load("b").labels == 0).sum() == (TRUTH == 1).sum()
-    draft = draft_scene(tmp_path)
-    assert {one.name: (one.value, round(one.fraction * 140)) for one in draft.classes} == {
+    assert {one.name: (one.value, round(one.fraction * 140)) for one in draft_scene(tmp_path).classes} == {
         "maize": (1, 70),
         "oats": (2, 30),
         "wheat": (3, 40),

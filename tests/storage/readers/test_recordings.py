@@ -15,14 +15,7 @@ import pytest
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import (
-    ArchiveError,
-    IncompleteStoreError,
-    PipelineError,
-    SceneError,
-    SettingsError,
-    WavelengthError,
-)
+from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep
@@ -172,7 +165,8 @@ def test_a_scan_without_a_mirror_uses_its_positions(
 
 def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
     """Forward and backward motion become two sweeps; lines of neither are left out."""
-    cube, rows = open_raw_cube(tmp_path / "raw" / "scan-0.zarr"), ["mirror_x,mirror_y,sweep"]
+    cube = open_raw_cube(tmp_path / "raw" / "scan-0.zarr")
+    rows = ["mirror_x,mirror_y,sweep"]
     for number in range(80):
         x, y = cube.position[number if number < 42 else 80 - number].tolist()
         rows.append(f"{x!r},{y!r},{'there' if number < 40 else '' if number < 42 else 'back'}")
@@ -215,7 +209,7 @@ NO_WAVELENGTHS = "has 3 bands and nothing says their wavelengths; give --wavelen
     ],
 )
 def test_unusable_cubes_are_refused(
-    tmp_path: Path, values: NDArray[Any], fields: dict[str, Any], error: type[PipelineError], message: str
+    tmp_path: Path, values: NDArray[Any], fields: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     """Each fault of interleave, wavelengths and number type has its own message."""
     write_envi_cube(tmp_path / "cube", values, **fields)
@@ -301,7 +295,8 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
 
 def test_the_key_of_a_recording_depends_on_its_content(files: Path, tmp_path: Path) -> None:
     """The key is the same at another address; other numbers, bits, pointing or frames change it."""
-    key, moved = open_recording(files, CAMERA).key(), files.rename(tmp_path / "moved")
+    key = open_recording(files, CAMERA).key()
+    moved = files.rename(tmp_path / "moved")
     assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
     np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
     keys = [key, open_recording(moved, CAMERA, RecordedWith(dark=tmp_path / "dark.npy")).key()]
@@ -360,7 +355,8 @@ def test_nodata_values_are_invalid(tmp_path: Path, kind: str, void: int) -> None
     values[2] = values[4, 3] = void
     write_envi_cube(tmp_path / "a", values, data_ignore_value=void)
     recording = open_recording(tmp_path / "a.hdr")
-    (sweep,), source = recording.sweeps, recording.source((6, 16))
+    (sweep,) = recording.sweeps
+    source = recording.source((6, 16))
     np.testing.assert_array_equal(sweep.read(0, 6), np.where(values == void, np.int32(65535), values))
     assert [line.valid for line in source.lines(sweep.sweep)] == [True, True, False, True, True, True]
     assert recording.camera.bits == 12

@@ -15,22 +15,21 @@ from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file, open_scene_file
 
-RNG = np.random.default_rng(9)
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 
 
 def test_jpeg_2000_is_read(tmp_path: Path) -> None:
     """Numbers are read as written, whole and by lines; wavelengths have to be stated."""
-    values, path = RNG.integers(1, 60_000, (3, 70, 50)).astype(np.uint16), tmp_path / "a.jp2"
+    values = np.random.default_rng(9).integers(1, 60_000, (3, 70, 50)).astype(np.uint16)
+    path = tmp_path / "a.jp2"
     place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
     with rasterio.open(path, "w", "JP2OpenJPEG", 50, 70, 3, dtype="uint16", **place, **REVERSIBLE) as file:
         file.write(values)
     source = open_cube(path)
     assert source.geobox is not None
-    np.testing.assert_array_equal(np.concatenate([source.read(0, 64), source.read(64, 70)]), np.moveaxis(values, 0, -1))
-    np.testing.assert_array_equal(
-        load_scene_file(path, wavelengths=[500, 600, 700]).values, np.moveaxis(values, 0, -1).astype(np.float32)
-    )
+    expected = np.moveaxis(values, 0, -1)
+    np.testing.assert_array_equal(np.concatenate([source.read(0, 64), source.read(64, 70)]), expected)
+    np.testing.assert_array_equal(load_scene_file(path, wavelengths=[500, 600, 700]).values, expected)
     path.write_bytes(path.read_bytes()[:80])
     with pytest.raises(SceneError, match="cannot be read as JPEG 2000"):
         load_scene_file(path, wavelengths=[500, 600, 700])
@@ -68,7 +67,6 @@ def test_unscaled_files_keep_their_hash(tmp_path: Path) -> None:
     """Files without a scale have the hash of their bytes, bands and wavelengths alone."""
     path = write_tiff(tmp_path / "plain.tif")
     scene = load_scene_file(path, wavelengths=[500, 600])
-
     parts = [hashlib.sha256(path.read_bytes()).hexdigest(), None, [0, 1], [500.0, 600.0], None]
     assert scene.light_hash == hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 

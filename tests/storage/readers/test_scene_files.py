@@ -160,7 +160,8 @@ def test_truncated_envi_scenes_have_nan_lines(tmp_path: Path, cube: NDArray[np.u
 def test_headwall_scenes_are_divided_by_the_white_reference(tmp_path: Path) -> None:
     """With dark and white frames beside its parts a folder gives reflectance, without them raw numbers."""
     shown = np.random.default_rng(5).uniform(0.1, 0.9, (6, 40, 5))
-    raw, head = np.rint(100 + shown * 1000).astype(np.uint16), ENVI.replace("9", "40").replace("bip", "bil")
+    raw = np.rint(100 + shown * 1000).astype(np.uint16)
+    head = ENVI.replace("9", "40").replace("bip", "bil")
     frames = {"raw_0": raw[:4], "raw_4": raw[4:], "darkReference": np.full((2, 40, 5), 100, np.uint16)}
     frames["whiteReference"] = np.full((1, 40, 5), 1100, np.uint16)
     for name, values in frames.items():

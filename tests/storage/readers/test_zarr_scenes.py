@@ -26,8 +26,7 @@ NM = np.array([450.0, 550.0, 650.0, 800.0, 900.0])
 
 
 def _dataset(cube: NDArray[Any], dims: tuple[str, ...], **about: Any) -> xr.Dataset:
-    order = [("y", "x", "band").index(dim) for dim in dims]
-    array = xr.DataArray(cube.transpose(order), dims=dims, name="reflectance")
+    array = xr.DataArray(cube.transpose([("y", "x", "band").index(dim) for dim in dims]), dims=dims, name="reflectance")
     return array.to_dataset().assign_coords(wavelength=("band", about.pop("nm", NM), about))
 
 
@@ -73,7 +72,8 @@ def test_packing_is_decoded(tmp_path: Path, cube: NDArray[np.uint16], version: i
 
 def test_a_raw_cube_is_refused_as_a_scene(tmp_path: Path) -> None:
     """A raw cube of this project is a recording; the error says to survey it with `--sweeps`."""
-    sweep, frame = Sweep("fine-0", "fine", "y", 0.0, 0.0, 6), np.ones((40, 5), np.float32)
+    sweep = Sweep("fine-0", "fine", "y", 0.0, 0.0, 6)
+    frame = np.ones((40, 5), np.float32)
     with RawCubeWriter(tmp_path / "s0.zarr", SweepHeader(sweep, References(frame, frame, frame[0]), NM)) as cube:
         cube.write([Line(i, np.ones((40, 5), np.uint16), 0.0, 0.0, 0.1 * i, 10.0, True) for i in range(6)])
     with pytest.raises(SceneError, match=r"holds raw lines of a survey.*; survey them as --sweeps .*s0\.zarr"):

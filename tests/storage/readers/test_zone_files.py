@@ -57,9 +57,8 @@ def test_crossing_borders_are_repaired_with_a_note(tmp_path: Path) -> None:
 
 def test_plots_are_named_by_an_attribute(tmp_path: Path) -> None:
     """The default is the first usual one; equal names are one plot, and a polygon without a name gets its number."""
-    path = written(
-        tmp_path / "z.gpkg", [SQUARE, OTHER, BOWTIE.convex_hull], plot_id=[7.0, 7.0, None], kind=["a", "b", "c"]
-    )
+    plots = [SQUARE, OTHER, BOWTIE.convex_hull]
+    path = written(tmp_path / "z.gpkg", plots, plot_id=[7.0, 7.0, None], kind=["a", "b", "c"])
     assert {name: shape.area for name, shape in read_zones(path).shapes.items()} == {"7": 150, "3": 100}
     assert list(read_zones(path, named_by="kind").shapes) == ["a", "b", "c"]
     with pytest.raises(ZoneError, match="an attribute 'variety' to name plots by, got plot_id, kind"):

@@ -47,7 +47,8 @@ def test_a_store_is_found_and_fetched_by_another_machine(machine: Machine) -> No
 
 def test_a_second_writer_takes_the_published_store(bucket: str, machine: Machine) -> None:
     """If two machines make one key at the same time, one publishes; both end with its store."""
-    archives, together = [machine(FIRST), machine(SECOND)], threading.Barrier(2)
+    archives = [machine(FIRST), machine(SECOND)]
+    together = threading.Barrier(2)
 
     def publish(number: int) -> StageRef:
         def build(path: Path) -> None:
@@ -61,8 +62,7 @@ def test_a_second_writer_takes_the_published_store(bucket: str, machine: Machine
     assert made[0] == made[1]
     assert archives[0].manifest_hash(made[0]) == archives[1].manifest_hash(made[1])
     assert (made[0].path / "a.bin").read_bytes() == (made[1].path / "a.bin").read_bytes()
-    names = archives[0].objects.listing(made[0].uri)
-    assert sum(name.endswith("manifest.json") for name in names) == 1
+    assert sum(name.endswith("manifest.json") for name in archives[0].objects.listing(made[0].uri)) == 1
     assert problems(archives[0]) == []
 
 
@@ -215,8 +215,7 @@ def test_a_lost_working_copy_is_fetched_again(machine: Machine) -> None:
     archive = machine(FIRST)
     ref, _ = make(archive)
     (ref.path / "deep" / "a.bin").unlink()
-    again = machine(FIRST).find("rectify", ref.key)
-    assert (again.path / "deep" / "a.bin").read_bytes() == b"light"
+    assert (machine(FIRST).find("rectify", ref.key).path / "deep" / "a.bin").read_bytes() == b"light"
     shutil.rmtree(archive.root)
     found, built = make(machine(FIRST))
     assert not built

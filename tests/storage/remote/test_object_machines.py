@@ -29,14 +29,14 @@ from tests.storage.readers.test_recordings import write_raw
 from tests.storage.small_archive import problems, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make
 
-THIRD = "third"
-
 
 def test_gc_restores_a_store_that_a_new_run_names(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another machine publishes a run between gc's listing of the runs and its removal of a store."""
     archive = machine(FIRST)
     small_survey(archive, named=False)
-    opened, remove, done = machine(SECOND, create=False), Objects.remove, list[bool]()
+    opened = machine(SECOND, create=False)
+    remove = Objects.remove
+    done: list[bool] = []
 
     def publish_first(self: Objects, names: Any) -> None:
         remove(self, names)
@@ -52,7 +52,8 @@ def test_gc_restores_a_store_that_a_new_run_names(machine: Machine, monkeypatch:
 def test_files_cleared_by_another_machine_are_missing(machine: Machine) -> None:
     """The working copy has an older manifest of them."""
     archive = machine(FIRST)
-    small, _ = small_survey(archive), machine(SECOND, create=False)
+    small = small_survey(archive)
+    machine(SECOND, create=False)
     archive.clear(small.raw)
     other = machine(SECOND, create=False)
     assert (other.is_there(small.raw.uri), other.is_there(small.map.uri)) == (False, True)
@@ -62,7 +63,9 @@ def test_discard_keeps_a_store_that_a_new_run_names(machine: Machine, monkeypatc
     """A run that names the store is published after gc's last listing of the runs."""
     archive = machine(FIRST)
     ref = small_survey(archive, named=False).map
-    opened, discard, done = machine(SECOND, create=False), Archive.discard, list[bool]()
+    opened = machine(SECOND, create=False)
+    discard = Archive.discard
+    done: list[bool] = []
 
     def publish_first(self: Archive, *given: Any, **options: Any) -> bool:
         if not done:
@@ -95,7 +98,8 @@ def extend(archive: Archive, name: str, content: str) -> None:
 def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
     """Runs from before the opening are listed at once, later ones after a refresh."""
     archive = machine(FIRST)
-    runs, opened = [small_survey(archive).run.name], machine(SECOND)
+    runs = [small_survey(archive).run.name]
+    opened = machine(SECOND)
     assert [folder.name for folder in opened.runs()] == runs
     runs.append(small_survey(archive, seed=1).run.name)
     opened.refresh()
@@ -128,7 +132,8 @@ def test_two_machines_that_extend_one_run_leave_it_whole(machine: Machine, monke
     archives = machine(FIRST), machine(SECOND)
     name = small_survey(archives[0]).run.name
     archives[1].refresh()
-    write, done = Objects.write, list[bool]()
+    write = Objects.write
+    done: list[bool] = []
 
     def first_goes_between(self: Objects, path: str, content: Any) -> None:
         write(self, path, content)
@@ -197,7 +202,8 @@ def test_a_store_removed_during_verify_is_not_damage(machine: Machine, monkeypat
 def test_a_full_disk_under_the_working_copy_is_one_error(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fetching a file and writing a manifest can fail; stored files stay, and the next attempt continues."""
     ref, _ = make(machine(FIRST))
-    other, full = machine(SECOND), Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    other = machine(SECOND)
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr(object_archive, "sync_path", full)
         with pytest.raises(ArchiveError, match="the disk is full: free some space"):
@@ -225,14 +231,14 @@ def test_leftovers_of_killed_fetches_are_removed_after_a_day(machine: Machine) -
 
 def test_a_store_fetched_while_it_is_made_here_is_kept(machine: Machine) -> None:
     """Another process of this machine fetched the store that another machine published; its files stay in place."""
-    mine, read = machine(FIRST), list[int]()
+    mine = machine(FIRST)
+    read: list[int] = []
 
     def build(path: Path) -> None:
         (path / "a.bin").write_bytes(b"mine")
         theirs = lambda path: (path / "a.bin").write_bytes(b"theirs")  # noqa: E731
         ref, _ = machine(SECOND).produce("rectify", theirs, version=1, params={})
-        beside = machine(FIRST).find("rectify", ref.key)
-        read.append((beside.path / "a.bin").stat().st_ino)
+        read.append((machine(FIRST).find("rectify", ref.key).path / "a.bin").stat().st_ino)
 
     ref, _ = mine.produce("rectify", build, version=1, params={})
     assert (ref.path / "a.bin").read_bytes() == b"theirs"
@@ -248,7 +254,7 @@ def test_a_store_cleared_by_one_machine_is_remade_by_another(machine: Machine) -
     assert [name.rpartition("/")[2] for name in first.objects.listing(small.mosaic.uri)] == ["manifest.json"]
     assert problems(first) == []
     assert first.find("rectify", small.mosaic.key) is None
-    third = machine(THIRD)
+    third = machine("third")
     assert third.find("rectify", small.mosaic.key) is None
     again = small_survey(third)
     assert any(name.endswith("/data.bin") for name in third.objects.listing(again.mosaic.uri))
@@ -258,7 +264,8 @@ def test_a_store_cleared_by_one_machine_is_remade_by_another(machine: Machine) -
 
 def test_a_run_of_a_bucket_is_a_recording(bucket: str, machine: Machine) -> None:
     """The newest run, a named run and a store give the cubes that the first machine wrote; others are refused."""
-    archive, source = machine(FIRST), simulated()
+    archive = machine(FIRST)
+    source = simulated()
     ref, _ = archive.produce("capture", partial(write_raw, source=source, sweep=FULL), version=1, params={})
     with archive.new_run("field") as draft:
         draft.write_file("receipt.json", json.dumps({"products": {"raw_coarse": ref.uri}}))
