@@ -183,12 +183,13 @@ def _send_away(
     with _guard:
         team = _teams.get(pool) or Cluster(pool)
         _teams[pool] = team
+    lost = (WorkerError, CancelledError, dask_distributed.KilledWorker)
     try:
         count = team.check(inputs)
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GiB"}):
             shared = team.client.submit(_itself, make, pure=False)  # travels once to each worker
-        _send(partial(team.submit, call, shared), items, AHEAD * count, ended, alive=team.count)
-    except (WorkerError, CancelledError, dask_distributed.KilledWorker) as error:
+        _send(partial(team.submit, call, shared), items, AHEAD * count, ended, alive=team.count, lost=lost)
+    except lost as error:
         _dismiss(pool)
         if isinstance(error, WorkerError):
             raise
@@ -212,10 +213,12 @@ def _send(
     window: int,
     ended: Callable[[int, Any], None],
     alive: Callable[[], object] = lambda: None,
+    lost: tuple[type[Exception], ...] = (),
 ) -> None:
     """Send blocks in order, fewer than ``window`` ahead of the oldest unfinished one; ``ended`` takes each result.
 
-    An error is raised when the running blocks have ended; ``alive``, called while none ends, raises without workers.
+    An error is raised when the running blocks have ended; one of ``lost`` workers at once, since blocks may never end.
+    ``alive``, called while none ends, raises without workers.
     """
     running: dict[Future[Any], int] = {}
     sent = 0
@@ -230,6 +233,8 @@ def _send(
             for future in sorted(done, key=running.__getitem__):
                 ended(running[future], future.result())
                 del running[future]
+    except lost:
+        raise
     except Exception:
         wait(running)
         raise

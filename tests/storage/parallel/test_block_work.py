@@ -10,8 +10,10 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from dask.distributed import LocalCluster
@@ -203,6 +205,14 @@ def fail_or_write(folder: Path, number: int) -> None:
     (folder / "begun").touch()
     time.sleep(STALE_S)
     (folder / f"late {number}").touch()
+
+
+def test_blocks_of_lost_workers_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A block whose workers are gone never ends: the error is raised at once."""
+    monkeypatch.setattr(pool_module, "ANSWER_S", 0.01)
+    gone = Mock(side_effect=WorkerError("no workers"))
+    with pytest.raises(WorkerError, match="no workers"):
+        pool_module._send(lambda item: Future(), [0], 1, print, alive=gone, lost=(WorkerError,))
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
