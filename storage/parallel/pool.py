@@ -33,6 +33,7 @@ from pipeline.lazy import dask, dask_distributed
 from storage.archive.keys import StageRef
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
+RESTART_S = 60.0  # time limit until a process of this machine replaces one that died
 AHEAD = 2  # blocks sent to a worker: one running, one waiting
 ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
 LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
@@ -277,12 +278,11 @@ class Cluster:
     def count(self) -> int:
         """Return the number of blocks at a time. Raises WorkerError: there are no workers."""
         try:
-            self.client.wait_for_workers(1, timeout=ANSWER_S)
+            self.client.wait_for_workers(1, timeout=ANSWER_S if self._own is None else RESTART_S)
         except TimeoutError:
-            raise WorkerError(
-                f"{self.name} has no workers: expected at least one; start `dask worker "
-                f"{self.client.scheduler.address}`"
-            ) from None
+            address = self.client.scheduler.address
+            advice = f"start `dask worker {address}`" if self._own is None else "use --scheduler threads"
+            raise WorkerError(f"{self.name} has no workers: expected at least one; {advice}") from None
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
 
     def check(self, inputs: Sequence[StageRef]) -> int:
