@@ -26,7 +26,7 @@ _numbers = count()
 def s3_server() -> Iterator[str]:
     """Yield the endpoint of a server with an empty bucket; skip if moto or obstore is not installed."""
     pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
-    moto = pytest.importorskip("moto.moto_server.werkzeug_app", reason="moto[s3] and flask are not installed (extra dev)")
+    moto = pytest.importorskip("moto.moto_server.werkzeug_app", reason="moto[s3] or flask is not installed (extra dev)")
     import boto3
     from werkzeug.serving import make_server
 
