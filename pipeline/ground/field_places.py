@@ -30,7 +30,6 @@ class GroundFootprint:
     A long and narrow footprint that goes to the horizon ends where the map does.
     """
 
-    outline_m: Floats  # (corner, 2) east and north of the rig's foot, in order
     width_m: float  # across the direction of view, at its widest
     depth_m: float  # along the direction of view
     area_m2: float  # as a map shows it
@@ -96,7 +95,7 @@ def footprint_of(view: GroundView, shape: tuple[int, int]) -> GroundFootprint:
     near, middle, far = float(ranges.min()), float(np.median(ranges)), float(ranges.max())
     x, y = corners.T
     area = float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)  # by the shoelace formula
-    return GroundFootprint(corners, width, depth, area, median_footprint_m(view, shape), (near, middle, far))
+    return GroundFootprint(width, depth, area, median_footprint_m(view, shape), (near, middle, far))
 
 
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
