@@ -19,7 +19,7 @@ from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse_region, overview_file, seen_patches
 from models.network.spectral import LineSpec
 from models.policies.policies import class_errors, gain_of
-from models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
+from models.reading.inference import CoarsePass, CoarsePrediction, load_overview, read_coarse_prediction, segment
 from models.reading.ood import OodDetector
 from models.reading.prior_map import (
     CurrentVisit,
@@ -118,15 +118,7 @@ class Drawing:
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
             after.log_probability[unknown], after.age_days[unknown] = np.nan, 0  # they are captured
-        reading = None
-        if self.choice is not None:
-            read = np.zeros(gain.shape, np.bool_)
-            read[patch_index] = True
-            before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
-            other = (drawn.classes != before) & (drawn.classes != UNLABELLED)
-            changed = np.zeros(gain.shape, np.float32)
-            changed[patch_index] = changed_fractions(other, region.grid).ravel()[patch_index]
-            reading = FullReading(region.crop_patches(gain), region.crop_patches(read), region.crop_patches(changed))
+        reading = None if self.choice is None else FullReading.of(region, predicted, drawn.classes, gain, patch_index)
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return DrawnRegion(
             region.crop(classes),
@@ -208,6 +200,23 @@ class FullReading:
     gain: NDArray[np.float64]  # expected gain by the policy
     read: NDArray[np.bool_]  # patches that it read
     changed: NDArray[np.float32]  # fraction of their pixels whose class it changed
+
+    @staticmethod
+    def of(
+        region: Region,
+        predicted: CoarsePrediction,
+        classes: NDArray[np.integer],
+        gain: NDArray[np.float64],
+        patch_index: NDArray[np.integer],
+    ) -> FullReading:
+        """Compare the ``classes`` (y, x) of a region, where ``patch_index`` was read, with those of the overview."""
+        read = np.zeros(gain.shape, np.bool_)
+        read[patch_index] = True
+        before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
+        other = (classes != before) & (classes != UNLABELLED)
+        changed = np.zeros(gain.shape, np.float32)
+        changed[patch_index] = changed_fractions(other, region.grid).ravel()[patch_index]
+        return FullReading(region.crop_patches(gain), region.crop_patches(read), region.crop_patches(changed))
 
 
 @dataclass(frozen=True)
