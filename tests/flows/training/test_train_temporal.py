@@ -50,7 +50,8 @@ def test_reader_learns_to_distrust_a_prior_map() -> None:
     images = [np.log(visit.scan_passes[0].probability.astype(np.float32)) for visit in lands[0]]
     before, now = (CurrentVisit(image, seen, coarse, 0.25, step) for image, step in zip(images, (1, 4), strict=True))
     quick = TemporalTraining(batch=2, visits=2, learning_rate=0.1, average=0.5)
-    readers = [train_reader(lands, replace(quick, steps=steps))[0] for steps in (1, 20)]
+    readers, steps = zip(*(train_reader(lands, replace(quick, steps=most)) for most in (1, 20)), strict=True)
+    assert steps == (1, 20)
     fused = [fuse(PriorMap(first_probabilities(before), coarse, 3.0), now, reader) for reader in readers]
     scores = [
         mean_iou(confusion(lands[0][1].labels, one.classes()[0], classes))
