@@ -203,22 +203,23 @@ def _export_sweeps(export: Export, console: Console) -> None:
 
 def _add_stores(export: Export) -> None:
     """Add the archive's own stores and the run's files to the catalogue."""
+    run = export.run
     for product, title in {
         "mosaic": "Mosaic of all passes",
         "class_map": "Class map and confidence on the camera's grid",
         "attention": "Score and rank of the patches",
         "ground_map": "Class map, picture and prior map, on the map",
     }.items():
-        if export.run.store(product) is not None and (product != "ground_map" or export.run.geobox is not None):
-            box = None if product == "attention" else load_geobox(export.run.path(product))
-            path = export.run.archive.root / export.run.receipt["products"][product]
+        if run.store(product) is not None and (product != "ground_map" or run.geobox is not None):
+            box = None if product == "attention" else load_geobox(run.path(product))
+            path = run.archive.root / run.receipt["products"][product]
             export.add(f"{product}_zarr", path, title, ZARR, ["data"], **export.projection(box))
-    for sweep in export.run.sweeps():
+    for sweep in run.sweeps():
         title, roles = ("Raw sweep", ["data", "raw"]) if (sweep / "dn").is_dir() else ("Signal of sweep", ["data"])
         export.add(f"{sweep.stem}_zarr", sweep, f"{title} {sweep.stem}", ZARR, roles, **export.projection())
     for name, (title, kind, roles) in RUN_FILES.items():
-        if name in read_manifest(export.run.folder)["files"]:
-            export.add(Path(name).stem, export.run.folder / name, title, kind, roles)
+        if name in read_manifest(run.folder)["files"]:
+            export.add(Path(name).stem, run.folder / name, title, kind, roles)
 
 
 def describe_item(export: Export) -> Item:

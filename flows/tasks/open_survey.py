@@ -164,7 +164,7 @@ class OpenSurvey:
 
         with suppress(OSError):  # Linux: reset the peak
             Path("/proc/self/clear_refs").write_text("5")
-        begun_s = time.perf_counter(), time.process_time()
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
         reached = 0.0
 
         def report(done: float) -> None:
@@ -181,7 +181,7 @@ class OpenSurvey:
             watch(stage, "failed", reached)
             raise
         state: Literal["ran", "cached"] = "ran" if built else "cached"
-        spent = (time.perf_counter() - begun_s[0], time.process_time() - begun_s[1], peak_bytes()) if built else ()
+        spent = (time.perf_counter() - wall_s, time.process_time() - cpu_s, peak_bytes()) if built else ()
         self._record(stage, ref, inputs, state, *spent)
         if built:
             self._written += bytes_below(self.run.archive.root / ref.uri)

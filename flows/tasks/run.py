@@ -480,8 +480,11 @@ class _PlannedCapture:
     """Planned lines of a survey, the choices behind them, and settings that request exactly these lines."""
 
     settings: Settings
-    # a raster has no sweeps
-    plan: CapturePlan = field(default_factory=lambda: CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, plain=True))
+    plan: CapturePlan = field(  # a raster has no sweeps
+        default_factory=lambda: CapturePlan(
+            "x", coarse=[], full=[], coarse_s=0.0, full_s=0.0, fine_s=0.0, margin_px=0.0, plain=True
+        )
+    )
     scans: ScanChoice = field(default_factory=ScanChoice)
     extent: ExtentChoice | None = None
     notes: tuple[str, ...] = ()

@@ -29,7 +29,6 @@ class SurveyZones:
     place: FieldPlace
     grid: SceneGrid
     kept: FieldZones | None = None  # None: all of the field
-
     plots: Mapping[str, BaseGeometry] | None = None  # by name, in pixels; None where there are none
     notes: tuple[str, ...] = ()
 

@@ -341,7 +341,15 @@ def open_training_data(
         raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
     kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
     train = tuple(name for name in names if name not in kept)
-    return TrainingData(files.path.stem, train, kept, files.held_out, camera, files, files.notes)
+    return TrainingData(
+        files.path.stem,
+        train=train,
+        validation=kept,
+        held_out=files.held_out,
+        camera=camera,
+        files=files,
+        notes=files.notes,
+    )
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

@@ -72,10 +72,11 @@ class OodDetector:
 
         ``bands`` are those of the camera. A pixel of NaN is not out of distribution.
         """
+        limit = self.limits.at(rate, capture.light, capture.step)
         readings = min(1.0, bands / self.bands)  # fewer bands count as fewer samples
         distance = self.lit(capture.light, readings).distance(columns)
         with np.errstate(invalid="ignore"):
-            return np.asarray(distance > self.limits.at(rate, capture.light, capture.step), np.bool_)
+            return np.asarray(distance > limit, np.bool_)
 
 
 def _floored(covariance: Exact) -> Exact:

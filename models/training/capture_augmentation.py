@@ -121,8 +121,8 @@ class CaptureAugmentation:
     def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """Return a crop (y, x, column) by a random capture, as inputs of the overview and the full network.
 
-        Both are one image: a uniform scan, or a first pass with closer lines in some areas. Exposures are log-uniform.
-        For the paper's tables the networks get two (`make paper`).
+        Both inputs are the same image: a uniform scan, or a first pass with closer lines in some areas. Exposures are
+        log-uniform. A subclass may return two images.
         """
         odds = {step: often for step, often in STEPS.items() if len(columns) % step == 0}
         step = int(rng.choice(list(odds), p=np.array(list(odds.values())) / sum(odds.values())))

@@ -58,9 +58,9 @@ def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
         raise PoseError(f"EPSG:{code} ({crs.name}) is no projected CRS in metres; {hint}")
     if crs.area_of_use is not None:
         west, south, east, north = crs.area_of_use.bounds
-        # the area may cross the date line
-        beside = (pose.lon_deg - west + AREA_SLACK_DEG) % 360 > ((east - west) % 360 or 360.0) + 2 * AREA_SLACK_DEG
-        if beside or not south - AREA_SLACK_DEG <= pose.lat_deg <= north + AREA_SLACK_DEG:
+        width = (east - west) % 360 or 360.0  # the area may cross the date line
+        within = (pose.lon_deg - west + AREA_SLACK_DEG) % 360 <= width + 2 * AREA_SLACK_DEG
+        if not within or not south - AREA_SLACK_DEG <= pose.lat_deg <= north + AREA_SLACK_DEG:
             raise PoseError(
                 f"EPSG:{code} ({crs.name}) is made for longitudes {west:g} to {east:g}, latitudes {south:g} to "
                 f"{north:g}; the rig stands at lon_deg {pose.lon_deg:g}, lat_deg {pose.lat_deg:g}; {hint}"

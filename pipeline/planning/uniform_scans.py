@@ -150,9 +150,9 @@ def priced_scan(
         step,
         exposure_ms,
         cost.seconds(exposed, camera),
-        raw_bytes(exposed, camera, bands),
-        record.expected(step, exposure_ms),
-        None if record.spread is None else record.between(record.spread, step, exposure_ms),
+        bytes_raw=raw_bytes(exposed, camera, bands),
+        expected=record.expected(step, exposure_ms),
+        spread=None if record.spread is None else record.between(record.spread, step, exposure_ms),
     )
 
 

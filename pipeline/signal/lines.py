@@ -74,7 +74,7 @@ class Signal:
         return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))
 
     def broad_image(self, usable: NDArray[np.bool_], full_scale_dn: float) -> NDArray[np.float32]:
-        """Return the mean of 16 bands spread over all, (line, sample); NaN where one is not valid.
+        """Return the mean of `BROAD_BANDS` bands spread over all, (line, sample); NaN where one is not valid.
 
         Lines are read 64 at a time. ``usable`` (line,) are those with a trusted position.
         """
@@ -152,7 +152,7 @@ class CondensedSignal:
         return scores, self._condensed.usable[numbers, samples] & self.lines.valid_line[numbers, None]
 
     def broad_image(self, usable: NDArray[np.bool_], full_scale_dn: float) -> NDArray[np.float32]:
-        """Return the mean of 16 bands spread over all, (line, sample); NaN where one is not valid."""
+        """Return the mean of `BROAD_BANDS` bands spread over all, (line, sample); NaN where one is not valid."""
         weights, offset = broad_weights(self._condensed.components)
         image = np.full((len(usable), self.samples), np.nan, np.float32)
         for part in cuts(len(usable), BLOCK_LINES):

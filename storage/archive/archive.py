@@ -282,7 +282,7 @@ class Archive:
         parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
         found: dict[str, int] = {}
         for path in sorted((*parts, *spools)):
-            lock = self._lock_path(self._lock_of(path))
+            lock = self._lock_path(self._lock_name(path))
             release = take_lock(lock, wait=False) if lock.exists() else lambda: None
             if release is not None:
                 release()
@@ -292,12 +292,12 @@ class Archive:
     def drop_leftover(self, uri: str) -> bool:
         """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
         path = self.root / uri
-        with self._locked(self._lock_of(path), wait=False) as held:
+        with self._locked(self._lock_name(path), wait=False) as held:
             if held:
                 remove_tree(path)
         return not path.exists()
 
-    def _lock_of(self, path: Path) -> str:
+    def _lock_name(self, path: Path) -> str:
         kind = "capture" if path.parent.name == "spool" else path.parent.name
         return f"{kind}-{path.name.removesuffix(PART_SUFFIX)}"
 

@@ -119,6 +119,7 @@ def create_array(
     Its bytes are packed channel after channel, and its files lie in one folder.
     """
     kind = np.dtype(spec.dtype)
+    codec, level = packing
     shuffle = zarr_codecs.BloscShuffle.shuffle if flat else zarr_codecs.BloscShuffle.bitshuffle
     fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", attributes.get("nodata", 0))
     return group.create_array(
@@ -132,7 +133,7 @@ def create_array(
         attributes=dict(attributes),
         filters=(zarr_codecs.TransposeCodec(order=(2, 0, 1)),) if flat and len(spec.shape) == 3 else None,
         compressors=(
-            zarr_codecs.BloscCodec(cname=packing[0], clevel=packing[1], shuffle=shuffle, typesize=kind.itemsize),
+            zarr_codecs.BloscCodec(cname=codec, clevel=level, shuffle=shuffle, typesize=kind.itemsize),
             zarr_codecs.Crc32cCodec(),
         ),
         chunk_key_encoding={"name": "default", "separator": "." if flat else "/"},

@@ -40,7 +40,7 @@ from storage.arrays.layout import (
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
 RGB_NM = (640.0, 550.0, 460.0)  # shown as red, green and blue
-FAR_NM = 60.0  # the farthest band that is
+FAR_NM = 60.0  # largest distance of a band from the colour that shows it
 MID_GREY = 0.42  # of the median of a picture
 HALF = 0.5  # least fraction of its finer pixels with which a pixel has a value
 

@@ -63,7 +63,7 @@ SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rar
 
 
 class LineRows(NamedTuple):
-    """Facts of every line, (line,) each."""
+    """Facts of every line, (line,) each, in the order that `write_line_facts` takes."""
 
     time_s: NDArray[np.float64]
     mirror_x: NDArray[np.float64]

@@ -119,7 +119,7 @@ class Spool:
                 os.fdatasync(self._file.fileno())
 
     def blocks(self) -> Iterator[list[Line]]:
-        """Yield the lines in blocks of 64; the last may be shorter. A damaged line is not valid."""
+        """Yield the lines in blocks of `SYNC_LINES`; the last may be shorter. A damaged line is not valid."""
         nothing = np.zeros((self.samples, self.bands), np.uint16)
         unknown = (float("nan"),) * 4
         with self.path.open("rb") as file:

@@ -218,8 +218,8 @@ def _send(
 ) -> None:
     """Send blocks in order, fewer than ``window`` ahead of the oldest unfinished one; ``ended`` takes each result.
 
-    An error is raised when the running blocks have ended; one of ``lost`` workers at once, since blocks may never end.
-    ``alive``, called while none ends, raises without workers.
+    An error is raised when the running blocks have ended. One of the types ``lost`` is raised at once: blocks of lost
+    workers may never end. ``alive``, called while none ends, raises without workers.
     """
     running: dict[Future[Any], int] = {}
     sent = 0
