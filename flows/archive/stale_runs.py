@@ -16,7 +16,7 @@ from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
-from storage.archive.records import Run, Store
+from storage.archive.records import Run
 from storage.readers.recordings import stores_of_lines
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
@@ -121,13 +121,15 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
     """Return the stores that a survey would make again: missing, damaged, of another version or of other weights."""
     now = versions()
     by_weights = {one.product.name for one in STAGES.values() if one.product.by_weights}
-
-    def is_stale(store: Store | None) -> bool:
-        if store is None or store.problem is not None or store.version != str(now.get(store.ref.stage)):
-            return True
-        return store.ref.stage in by_weights and store.params.get("weights", weights) != weights
-
-    return {uri for uri in uris if is_stale(catalogue.stores.get(uri))}
+    found = {uri: catalogue.stores.get(uri) for uri in uris}
+    return {
+        uri
+        for uri, store in found.items()
+        if store is None
+        or store.problem is not None
+        or store.version != str(now.get(store.ref.stage))
+        or (store.ref.stage in by_weights and store.params.get("weights", weights) != weights)
+    }
 
 
 def weights_now(run: Run, settings: Settings | None = None) -> str | None:

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, g
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
+from flows.settings.renamed import RENAMED
 from flows.settings.survey_settings import (
     ALWAYS,
     AUTO,
@@ -263,8 +264,11 @@ def _check_table(
             everywhere = [*SURVEY, *(f"{name}.{inner}" for name, keys in TABLES.items() for inner in keys)]
             near = [name for name in everywhere if name.split(".")[-1] == key]
             near = near or [prefix + name for name in difflib.get_close_matches(key, declared, n=1, cutoff=0.5)]
-            every = f"; known keys: {', '.join(prefix + name for name in declared)}"
-            raise SettingsError(f"unknown setting {place}" + (f"; did you mean '{near[0]}'?" if near else every))
+            every = f"known keys: {', '.join(prefix + name for name in declared)}"
+            hint = f"did you mean '{near[0]}'?" if near else every
+            raise SettingsError(
+                f"unknown setting {place}; " + (f"it is called '{RENAMED[full]}' now" if full in RENAMED else hint)
+            )
         if not prefix and key in TABLES:
             checked[key] = _parse_table(key, value, place, origin)
         else:

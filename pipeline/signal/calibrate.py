@@ -279,7 +279,7 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     """Return elements whose response is missing or odd beside their neighbours'."""
     size = min(WINDOW, len(response))
     around = (max(size - 1 + size % 2, 1), 1)  # an odd number of samples
-    filled = _without_gaps(response)
+    filled = np.where(np.isfinite(response), response, np.nan_to_num(_median(response, axis=0)))  # median of the band
     local: Floats = scipy.ndimage.median_filter(filled, around, mode="reflect")
     least = np.maximum(LIT_SIGMAS * noise, LIT_FRACTION * _median(response, axis=0))
     judged = np.isfinite(response) & (local > least)
@@ -297,11 +297,6 @@ def _off_neighbours(response: Floats, noise: Floats) -> Bools:
     beyond = (response < low * (1 - ODD_FRACTION)) | (response > high * (1 + ODD_FRACTION))
     odd: Bools = (np.abs(off) > ODD_SIGMAS * spread) & beyond
     return dead | odd
-
-
-def _without_gaps(columns: Floats) -> Floats:
-    """Fill gaps with the median of their band, and bands without a value with 0."""
-    return np.where(np.isfinite(columns), columns, np.nan_to_num(_median(columns, axis=0)))
 
 
 def _median(values: Floats, axis: int) -> Floats:
