@@ -163,7 +163,7 @@ def _scan_path(scan: Floats, across: Floats, lines: NDArray[np.intp], step: floa
     real = np.repeat(seen, sizes)
     members = np.empty(len(real), np.intp)
     members[real] = lines
-    members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]  # knots that nothing saw get the nearest knot's first
+    members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]  # unseen knots get the nearest knot's first line
     knot = np.arange(len(seen))
     scan, across = np.interp(knot, at, scan), np.interp(knot, at, across)
     if len(scan) > 1:  # the mean step where all are equal up to rounding
