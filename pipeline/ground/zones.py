@@ -33,11 +33,13 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
     west, _, east, _ = extent_deg(place.outline, place.crs)
     middle = east if east - west > 180 else (west + east) / 2
     if crs.is_geographic and abs(middle) > FAR_EAST_DEG:  # polygons may cross 180 degrees
-
-        def unwrapped(at: Floats) -> Floats:
-            return np.column_stack([(at[:, 0] - middle + 180) % 360 - 180 + middle, at[:, 1:]])
-
-        there, given = (shapely.make_valid(shapely.transform(one, unwrapped)) for one in (outline, shape))
+        turned = [
+            shapely.transform(
+                one, lambda at: np.column_stack([(at[:, 0] - middle + 180) % 360 - 180 + middle, at[:, 1]])
+            )
+            for one in (outline, shape)
+        ]
+        there, given = map(shapely.make_valid, turned)
     around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
     near = shapely.intersection(given, around)
     if near.is_empty:
