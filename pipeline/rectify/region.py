@@ -97,12 +97,9 @@ def mosaic_rows(sweeps: Sequence[SweepLines], camera: LineCamera, grid: SceneGri
 def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
     """Group (y, x, 2) by 32 columns, (group, n, 2); the last group is filled with NaN."""
     rows, columns = coordinates.shape[:2]
-    groups = -(-columns // GROUP_COLUMNS)
-    if groups * GROUP_COLUMNS > columns:
-        coordinates = np.pad(
-            coordinates, ((0, 0), (0, groups * GROUP_COLUMNS - columns), (0, 0)), constant_values=np.nan
-        )
-    return coordinates.reshape(rows, groups, GROUP_COLUMNS, 2).swapaxes(0, 1)
+    beyond = -columns % GROUP_COLUMNS
+    padded = np.pad(coordinates, ((0, 0), (0, beyond), (0, 0)), constant_values=np.nan)
+    return padded.reshape(rows, (columns + beyond) // GROUP_COLUMNS, GROUP_COLUMNS, 2).swapaxes(0, 1)
 
 
 def _reader(

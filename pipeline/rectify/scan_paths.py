@@ -155,13 +155,21 @@ def _scan_path(scan: Floats, across: Floats, lines: NDArray[np.intp], step: floa
     at = np.concatenate([[0], np.cumsum(missing + 1)])
     seen = np.zeros(at[-1] + 1, np.bool_)
     seen[at] = True
-    lines, starts = _with_stand_ins(lines, counts, at, seen)
+    sizes = np.ones(len(seen), np.intp)
+    sizes[at] = counts
+    empty = np.flatnonzero(~seen)
+    before = np.searchsorted(at, empty) - 1
+    nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
+    real = np.repeat(seen, sizes)
+    members = np.empty(len(real), np.intp)
+    members[real] = lines
+    members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]  # unseen knots get the nearest knot's first line
     knot = np.arange(len(seen))
     scan, across = np.interp(knot, at, scan), np.interp(knot, at, across)
     if len(scan) > 1:  # the mean step where all are equal up to rounding
         mean = float(scan[-1] - scan[0]) / (len(scan) - 1)
         step = mean if np.abs(scan - scan[0] - mean * knot).max() < EVEN_STEPS * mean else step
-    return ScanPath(scan, across, lines, starts, seen, step)
+    return ScanPath(scan, across, members, np.cumsum(sizes) - sizes, seen, step)
 
 
 def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
@@ -173,22 +181,6 @@ def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
     while (start := int(following[starts[-1]])) < len(scan):
         starts.append(start)
     return np.array(starts, np.intp)
-
-
-def _with_stand_ins(
-    lines: NDArray[np.intp], counts: NDArray[np.intp], at: NDArray[np.intp], seen: NDArray[np.bool_]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return members and first members of all knots; knots that nothing saw get the nearest knot's first line."""
-    sizes = np.ones(len(seen), np.intp)
-    sizes[at] = counts
-    empty = np.flatnonzero(~seen)
-    before = np.searchsorted(at, empty) - 1
-    nearest = np.where(empty - at[before] <= at[np.minimum(before + 1, len(at) - 1)] - empty, before, before + 1)
-    real = np.repeat(seen, sizes)
-    members = np.empty(len(real), np.intp)
-    members[real] = lines
-    members[~real] = lines[(np.cumsum(counts) - counts)[nearest]]
-    return members, np.cumsum(sizes) - sizes
 
 
 @dataclass(frozen=True)

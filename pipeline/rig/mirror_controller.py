@@ -253,8 +253,16 @@ class MirrorController(Closing):
                     # with a CRC: an earlier session may have had them checked
                     ProLink(self.wire, with_crc=True).set(pro.GO_SIMPLE, "changing to simple mode")
                 self._greet()
-            self.identity = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
-            self._check_identity()
+            found = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
+            self.identity = found
+            part = self.rig.expected_id
+            good = part.lower() in found.device.lower() if part else found.device.upper().startswith(KNOWN_MODEL)
+            if not good:
+                wanted = f"whose id holds {part!r}" if part else f"whose id begins with {KNOWN_MODEL}"
+                raise RigError(
+                    f"expected a controller {wanted} on {self.wire.port}, got {found.summary}; is another device at "
+                    "this port? If it is the mirror, set rig.expected_id to a part of its id"
+                )
             try:
                 with suppress(DeadlinePassed):  # it may have changed; the status shows
                     ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
@@ -271,17 +279,6 @@ class MirrorController(Closing):
             ask_line(self.wire, START, read_done)
         except DeviceRefused:  # the greeting ended a line that was begun before
             ask_line(self.wire, START, read_done)
-
-    def _check_identity(self) -> None:
-        """Raise RigError for another model than the settings expect, or than the documented ones."""
-        found, expected = self.identity, self.rig.expected_id
-        good = expected.lower() in found.device.lower() if expected else found.device.upper().startswith(KNOWN_MODEL)
-        if not good:
-            wanted = f"whose id holds {expected!r}" if expected else f"whose id begins with {KNOWN_MODEL}"
-            raise RigError(
-                f"expected a controller {wanted} on {self.wire.port}, got {found.summary}; is another device at this "
-                "port? If it is the mirror, set rig.expected_id to a part of its id"
-            )
 
     def status(self) -> pro.Status:
         """Return the present status bits."""

@@ -110,8 +110,12 @@ class SignalStatistics:
         self.total += exact.sum(axis=0)
         self.kept.append(some[-self.count % self._thin :: self._thin].copy())
         self.count += len(some)
-        if self.bands <= FEW_BANDS:
-            self._add_rough(spectra, whole)
+        if self.bands <= FEW_BANDS and min(whole.shape) >= 3:
+            # Second differences in both directions: for a smooth field they have 36 times the noise's variance.
+            across = spectra[:, :-2] - 2 * spectra[:, 1:-1] + spectra[:, 2:]
+            both = across[:-2] - 2 * across[1:-1] + across[2:]
+            near = sliding_window_view(whole, (3, 3)).all(axis=(2, 3))
+            self.rough.append(both[near][:: self._thin * self._stride**2].copy())
 
     def _centred(self, values: Values, valid: Bools) -> tuple[Values, Bools]:
         """Return spectra from the origin with 0 for missing values, and which of them count."""
@@ -183,18 +187,6 @@ class SignalStatistics:
         for name in SUMS:
             setattr(found, name, stored[name])
         return found
-
-    def _add_rough(self, spectra: Values, whole: Bools) -> None:
-        """Store second differences in both directions: for a smooth field they have 36 times the noise's variance.
-
-        All nine spectra must count.
-        """
-        if min(whole.shape) < 3:
-            return
-        across = spectra[:, :-2] - 2 * spectra[:, 1:-1] + spectra[:, 2:]
-        both = across[:-2] - 2 * across[1:-1] + across[2:]
-        near = sliding_window_view(whole, (3, 3)).all(axis=(2, 3))
-        self.rough.append(both[near][:: self._thin * self._stride**2].copy())
 
 
 def find_components(found: SignalStatistics, *, false_alarm: float = 0.01, least: int = 4) -> Components:
@@ -294,17 +286,14 @@ def _noise(found: SignalStatistics, covariance: Floats, lit: NDArray[np.intp], m
             correlation = covariance / scale[:, None] / scale
             sigma = scale / np.sqrt(np.abs(np.diag(np.linalg.pinv(correlation, hermitian=True))))
     else:
-        sigma = np.array([_unpredicted(covariance, band) for band in range(len(lit))])
+        sigma = np.zeros(len(lit))
+        for band in range(len(lit)):
+            near = np.arange(max(band - NEIGHBOURS, 0), min(band + NEIGHBOURS + 1, len(lit)))
+            near = near[near != band]
+            weights = np.linalg.lstsq(covariance[np.ix_(near, near)], covariance[near, band], rcond=1e-10)[0]
+            sigma[band] = np.sqrt(max(covariance[band, band] - covariance[band, near] @ weights, 0.0))
     sigma = np.minimum(np.where(np.isfinite(sigma), sigma, 0), np.sqrt(np.maximum(variance, 0)))
     return np.maximum(sigma, floor)
-
-
-def _unpredicted(covariance: Floats, band: int) -> float:
-    """Return the standard deviation of a band that its neighbours do not predict linearly."""
-    near = np.arange(max(band - NEIGHBOURS, 0), min(band + NEIGHBOURS + 1, len(covariance)))
-    near = near[near != band]
-    weights = np.linalg.lstsq(covariance[np.ix_(near, near)], covariance[near, band], rcond=1e-10)[0]
-    return float(np.sqrt(max(covariance[band, band] - covariance[band, near] @ weights, 0.0)))
 
 
 def _axes(

@@ -22,7 +22,6 @@ from storage.archive.staging import MANIFEST_NAME, file_hash
 RECEIPT = "receipt.json"
 YEARS = range(1900, 2201)
 _DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
-State = Literal["ran", "cached", "skipped", "failed"]  # of a stage of a run
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 RESTS_ON = "rests_on"  # in a run's manifest: address of a store or of an input of it -> SHA-256 of its manifest.json
 
@@ -44,7 +43,7 @@ class StageRecord:
 
     name: str
     key: str
-    state: State
+    state: Literal["ran", "cached", "skipped", "failed"]
     wall_s: float | None = None
     cpu_s: float | None = None
     peak_rss_bytes: int | None = None

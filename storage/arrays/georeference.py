@@ -197,7 +197,10 @@ def find_geobox(
     the image's axes. Read are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform,
     and evenly spaced coordinates of pixel centres.
     """
-    mapping = _mapping(attributes, arrays)
+    named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
+    single = [dict(array.attrs) for array in arrays.values() if array.ndim == 0]
+    single = [about for about in single if {"crs_wkt", "spatial_ref"} & set(about)]
+    mapping = dict(arrays[named].attrs) if named in arrays else single[0] if len(single) == 1 else {}
     places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
     said = next((about[name] for about, names in places for name in names if about.get(name)), None)
     if said is None:
@@ -215,16 +218,6 @@ def find_geobox(
         return odc_geobox.GeoBox(shape, Affine(*map(float, stated)), crs)
     transform = _transform_of_axes(arrays, dims)
     return None if transform is None else odc_geobox.GeoBox(shape, transform, crs)
-
-
-def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of the grid mapping that the image names, else of the only array that is one."""
-    named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
-    if named in arrays:
-        return dict(arrays[named].attrs)
-    found = [dict(array.attrs) for array in arrays.values() if array.ndim == 0]
-    found = [about for about in found if {"crs_wkt", "spatial_ref"} & set(about)]
-    return found[0] if len(found) == 1 else {}
 
 
 def _transform_of_axes(arrays: Mapping[str, Any], dims: tuple[str, str]) -> Affine | None:

@@ -19,7 +19,6 @@ from storage.archive.staging import MANIFEST_NAME, refusals
 DAY_S = 86400.0
 _CURE = "restore this folder from a copy, or delete it and with it the stores that only it names"
 IN_USE = "the archive is in use: run gc again when it is free"
-What = Literal["store", "files", "leftover"]  # files: raw lines that the setting `keep` of a run does not keep
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Removal:
     """Something that can be removed: its address, kind, size [bytes] and the reason."""
 
     uri: str
-    what: What
+    what: Literal["store", "files", "leftover"]  # files: raw lines that the setting `keep` of a run does not keep
     size: int
     why: str
 

@@ -136,7 +136,9 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
     unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
     stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
-    missing = _missing(array.attrs, stored)
+    given = [np.ravel(array.attrs[name]) for name in ("_FillValue", "missing_value") if name in array.attrs]
+    given = [one for one in given if one.dtype.kind in "iuf"]
+    missing = list(dict.fromkeys(float(number) for one in given for number in _as_stored(one, stored)))
     fill = missing[0] if missing else None
     low, high = _valid_range(array.attrs, stored)
     checked = len(missing) > 1 or (low, high) != (-np.inf, np.inf)
@@ -330,13 +332,6 @@ def _base(name: str) -> str:
 
 def _word(name: str) -> str:
     return _base(name).lower()
-
-
-def _missing(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> list[float]:
-    """Return the numbers of an array that stand for no value: its fill value, and missing values."""
-    given = [np.ravel(attributes[name]) for name in ("_FillValue", "missing_value") if name in attributes]
-    known = [one for one in given if one.dtype.kind in "iuf"]
-    return list(dict.fromkeys(float(number) for one in known for number in _as_stored(one, stored)))
 
 
 def _valid_range(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[float, float]:

@@ -272,7 +272,14 @@ def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) 
     """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
     notes: list[str] = []
     of_file = _file_tags(file)
-    of_bands = [_band_tags(file, band) for band in keep]
+    of_bands = []
+    for band in keep:  # counted from 0; GDAL's own tags take precedence
+        tags = _lower(file.tags(band + 1))
+        imagery = file.tags(band + 1, ns="IMAGERY")
+        if "CENTRAL_WAVELENGTH_UM" in imagery:
+            tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
+            tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
+        of_bands.append(tags)
     fields = {"wavelength units": next(iter(of_bands), {}).get(_UNIT) or of_file.get(_UNIT, "")}
     for key in ("wavelength", "fwhm"):
         values = [tags.get(key, "") for tags in of_bands]
@@ -303,16 +310,6 @@ def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
 
 def _file_tags(file: Any) -> dict[str, str]:
     return _lower(file.tags()) | _lower(file.tags(ns="ENVI"))
-
-
-def _band_tags(file: Any, band: int) -> dict[str, str]:
-    """Return the tags of one band, counted from 0; GDAL's own take precedence."""
-    tags = _lower(file.tags(band + 1))
-    imagery = file.tags(band + 1, ns="IMAGERY")
-    if "CENTRAL_WAVELENGTH_UM" in imagery:
-        tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
-        tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
-    return tags
 
 
 def _lower(tags: Mapping[str, str]) -> dict[str, str]:

@@ -79,7 +79,13 @@ def read_polygons(source: str) -> PolygonLayer:
         raise ZoneError(f"there is no file {path}; give the path of a file with polygons, or leave it out")
     try:
         if path.suffix.lower() == ".gpkg":
-            layer = _layer_of(path, layer)
+            layers = [str(one) for one in pyogrio.list_layers(path)[:, 0]]
+            if layer is None and len(layers) == 1:
+                layer = layers[0]
+            if layer not in layers:
+                asked = "has several layers" if layer is None else f"has no layer {layer!r}"
+                example = f"{path}:{layers[0] if layers else 'LAYER'}"
+                raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {example}")
         about, _, found, values = pyogrio.raw.read(path, layer=layer)
         known = about["crs"] is not None
         if known and path.suffix.lower() in GEOJSON:  # GDAL assumes WGS 84
@@ -113,16 +119,6 @@ def split_layer(source: str | Path) -> tuple[Path, str | None]:
     """Return path and layer of ``FILE.gpkg:LAYER``."""
     head, mark, layer = str(source).rpartition(".gpkg:")
     return Path(f"{head}.gpkg" if mark else source), layer if mark else None
-
-
-def _layer_of(path: Path, layer: str | None) -> str | None:
-    layers = [str(one) for one in pyogrio.list_layers(path)[:, 0]]
-    if layer is None and len(layers) == 1:
-        return layers[0]
-    if layer is None or layer not in layers:
-        asked = "has several layers" if layer is None else f"has no layer {layer!r}"
-        raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{layers[0] if layers else 'LAYER'}")
-    return layer
 
 
 def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:

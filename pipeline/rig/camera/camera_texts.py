@@ -194,7 +194,16 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
     fields, settings = split_header(text, where, notes)
     samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
     kind = fields.get("file type", "ENVI Standard")
-    _refuse_layouts(fields, kind, where)
+    # Numbers that are not contiguous would be read as other numbers.
+    if finite_number(fields.get("file compression", "0")) != 0:
+        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
+    for key in ("major frame offsets", "minor frame offsets"):
+        if any(word and finite_number(word) != 0 for word in re.split(r"[,\s]+", fields.get(key, ""))):
+            raise SceneError(
+                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not supported; remove them"
+            )
+    if any(word in kind.lower() for word in OTHER_FILES):
+        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
     channels = samples if "spectral library" in kind.lower() else bands
     wavelength, scale = wavelengths_nm(fields, channels, notes)
     code = _whole(fields, "data type", where, least=1)
@@ -239,19 +248,6 @@ def _whole(fields: Mapping[str, str], key: str, where: str, *, least: int, other
     if number is None or number != int(number) or number < least:
         raise SceneError(f"{where}: {key} = {fields[key]!r}, expected a whole number from {least}; correct it")
     return int(number)
-
-
-def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
-    """Raise SceneError for files whose numbers are not contiguous: they would be read as other numbers."""
-    if finite_number(fields.get("file compression", "0")) != 0:
-        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
-    for key in ("major frame offsets", "minor frame offsets"):
-        if any(word and finite_number(word) != 0 for word in re.split(r"[,\s]+", fields.get(key, ""))):
-            raise SceneError(
-                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not supported; remove them"
-            )
-    if any(word in kind.lower() for word in OTHER_FILES):
-        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
 
 
 @dataclass(frozen=True)

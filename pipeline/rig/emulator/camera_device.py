@@ -28,7 +28,6 @@ from pipeline.rig.transports import Clock, Closing
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
 Raw = NDArray[np.uint16]
-Lines = Callable[[Floats], Raw]  # times (line,) of mid exposure -> (line, sample, band)
 
 _BLOCK = 8  # frames that are made together, while the camera takes no other request
 ROOT = "/captured"
@@ -107,10 +106,10 @@ class EmulatedCapture:
 class CameraDevice:
     """One camera. It makes frames when they are asked for.
 
-    ``lines`` gives lines (line, sample, band) uint16 of times (line,) by ``clock``, which may be past.
+    ``lines`` gives lines (line, sample, band) uint16 of times (line,) of mid exposure by ``clock``, which may be past.
     """
 
-    def __init__(self, lines: Lines, clock: Clock, *, wavelength_nm: Sequence[float] = ()) -> None:
+    def __init__(self, lines: Callable[[Floats], Raw], clock: Clock, *, wavelength_nm: Sequence[float] = ()) -> None:
         self.clock = clock
         self.wavelength_nm = wavelength_nm
         self.exposure_ms, self.period_ms = 10.0, 10.0

@@ -124,7 +124,15 @@ def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: A
             break
     enough = max(_ENOUGH * min(error for _, error in tried), NEGLIGIBLE)
     chosen = next(kernels for kernels, error in tried if error <= enough)
-    kept = _needed(_passed(chosen, own), wanted, enough)
+    passed = _passed(chosen, own)
+    kept = list(range(passed.shape[1]))
+    while len(kept) > 1:  # as many as are needed
+        without = [[one for one in kept if one != left] for left in kept]
+        errors = [_error(passed[:, some], wanted) for some in without]
+        least = int(np.argmin(errors))
+        if errors[least] > enough:
+            break
+        kept = without[least]
     chosen = Kernels(chosen.shift[:, kept], chosen.variance[:, kept], chosen.level[kept])
     passed = _passed(chosen, own)
     for count in _BASIS:
@@ -134,18 +142,6 @@ def _fit(packed: bytes, bands: int, box: tuple[float, float], held: int, disc: A
         if np.abs(passed @ (fractions @ between[:, judged]) - wanted).max() <= enough or count >= bands:
             break
     return chosen, fractions, between
-
-
-def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
-    kept = list(range(passed.shape[1]))
-    while len(kept) > 1:
-        without = [[one for one in kept if one != left] for left in kept]
-        errors = [_error(passed[:, some], wanted) for some in without]
-        least = int(np.argmin(errors))
-        if errors[least] > enough:
-            break
-        kept = without[least]
-    return kept
 
 
 def _error(passed: Transfer, wanted: Transfer) -> float:

@@ -266,10 +266,9 @@ def raster_from_values(
         )
     planes = np.ascontiguousarray(values, dtype=np.float32)
     bright = _bright_value(planes, name)
-    missing = _missing_pixels(planes)
+    planes, filled, missing = _fill_by_median(planes)
     if missing is not None and labels is not None:
         labels = np.where(missing, np.uint8(UNLABELLED), labels)
-    planes, filled = _fill_by_median(planes)
     bands = planes.shape[2]
     return RasterScene(
         name=name,
@@ -290,15 +289,6 @@ def raster_from_values(
         missing=missing,
         geobox=geobox,
     )
-
-
-def _missing_pixels(planes: NDArray[np.float32]) -> NDArray[np.bool_] | None:
-    """Return the pixels (y, x) with no finite value in more than half of their bands; None without any."""
-    known = np.isfinite(planes)
-    if known.all():
-        return None
-    missing: NDArray[np.bool_] = 2 * known.sum(axis=2) < planes.shape[2]
-    return missing if missing.any() else None
 
 
 def content_key(planes: NDArray[np.float32]) -> str:
@@ -325,14 +315,18 @@ def _bright_value(planes: NDArray[np.float32], name: str) -> float:
     return bright if bright > 0 else 1.0
 
 
-def _fill_by_median(planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:
-    """Replace what is not finite by the band's median (0 in a band without any), and count such pixels."""
-    missing = ~np.isfinite(planes)
-    if not missing.any():
-        return planes, 0
+def _fill_by_median(planes: NDArray[np.float32]) -> tuple[NDArray[np.float32], int, NDArray[np.bool_] | None]:
+    """Replace what is not finite by the band's median (0 in a band without any), and count such pixels.
+
+    Returned third are the pixels (y, x) with no finite value in more than half of their bands; None without any.
+    """
+    unknown = ~np.isfinite(planes)
+    if not unknown.any():
+        return planes, 0, None
     filled = planes.copy()
-    for band in np.flatnonzero(missing.any(axis=(0, 1))):
-        gaps = missing[..., band]
+    for band in np.flatnonzero(unknown.any(axis=(0, 1))):
+        gaps = unknown[..., band]
         known = planes[..., band][~gaps]
         filled[..., band][gaps] = np.median(known) if known.size else 0.0
-    return filled, int(missing.any(axis=2).sum())
+    missing = 2 * unknown.sum(axis=2) > planes.shape[2]
+    return filled, int(unknown.any(axis=2).sum()), missing if missing.any() else None

@@ -26,7 +26,6 @@ from pipeline.simulator.scenes.farm.land import (
     Crop,
     Field,
     Points,
-    Sun,
     canopy_cover,
     days_since_turned,
     disc_pixels,
@@ -118,7 +117,11 @@ def _standing_crop(
     growth = np.clip(1 + 0.32 * np.minimum(here.vigour + 1.9, 0), 0.15, 1)  # bare spots where vigour fails
     plants = growth * np.clip(between + (ON_ROW - between) * row + uneven, 0, 0.99) * (1 - gaps * (1 - 0.6 * closed))
     plants = np.asarray(plants + down * (ON_ROW - plants), np.float32)
-    shaded = row_shadow(work.plan.sun, float(np.interp(age, *np.array(crop.heights).T)), rows, period, width)
+    room = np.maximum(period - width, 0)
+    cast = float(np.interp(age, *np.array(crop.heights).T)) * (rows.normal @ work.plan.sun.cast)  # of the rows' shadow
+    shift = np.clip(cast, -room, room)
+    both = stripes_of(rows.place - shift / 2, period, width + np.abs(shift))
+    shaded = np.asarray(np.clip(both - row, 0, 1), np.float32)  # outside the rows themselves
     dense = np.clip(0.2 + 0.3 * width, 0, 0.75) * (1 - gaps) * (1 - down)  # seedlings let light through
     soil = blend(soil, {"shade": np.ones_like(plants)}, np.asarray(dense * shaded, np.float32))
     deep = np.asarray(0.24 * (1 - row) * closed * (1 - down), np.float32)  # between rows that have closed
@@ -225,14 +228,6 @@ def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
     fails = _scatter(number, piece, salt + 2) < field.gap_rate * np.clip(1 - 0.6 * here.vigour, 0.2, 3)
     onto = np.abs(rows.place - number * field.row_period_px) / field.row_period_px  # 0 on the row, 0.5 between rows
     return np.asarray(edge(np.minimum(inside, length - inside)) * fails * np.clip(2.2 - 3.4 * onto, 0, 1), np.float32)
-
-
-def row_shadow(sun: Sun, height: float, rows: Rows, period: float, width: Floats) -> Field:
-    """Return the fraction of each pixel in the shadow of rows of a height, outside the rows themselves."""
-    room = np.maximum(period - width, 0)
-    shift = np.clip(height * (rows.normal @ sun.cast), -room, room)
-    both = stripes_of(rows.place - shift / 2, period, width + np.abs(shift))
-    return np.asarray(np.clip(both - stripes_of(rows.place, period, width), 0, 1), np.float32)
 
 
 def stripes_of(place: Floats, period: float, width: Floats) -> Field:
