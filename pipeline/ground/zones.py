@@ -27,19 +27,10 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> 
     if crs is None or place.crs is None:
         return shapely.intersection(shape, _grown(shapely.box(*place.outline.bounds), BORDER_PX))
     to_place = pyproj.Transformer.from_crs(crs, place.crs, always_xy=True)
+    middle = _middle_deg(place) if crs.is_geographic else None
     back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
     outline = shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
-    there, given = outline, shape
-    west, _, east, _ = extent_deg(place.outline, place.crs)
-    middle = east if east - west > 180 else (west + east) / 2
-    if crs.is_geographic and abs(middle) > FAR_EAST_DEG:  # polygons may cross 180 degrees
-        turned = [
-            shapely.transform(
-                one, lambda at: np.column_stack([(at[:, 0] - middle + 180) % 360 - 180 + middle, at[:, 1]])
-            )
-            for one in (outline, shape)
-        ]
-        there, given = map(shapely.make_valid, turned)
+    there, given = (_unwrapped(one, middle) for one in (outline, shape))
     around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
     near = shapely.intersection(given, around)
     if near.is_empty:
@@ -54,6 +45,25 @@ def extent_deg(shape: BaseGeometry, crs: pyproj.CRS) -> tuple[float, float, floa
     places = shapely.get_coordinates(shape)
     lon, lat = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True).transform(places[:, 0], places[:, 1])
     return float(np.min(lon)), float(np.min(lat)), float(np.max(lon)), float(np.max(lat))
+
+
+def _middle_deg(place: FieldPlace) -> float | None:
+    """Return the longitude of a field so near 180 degrees that polygons may cross it; None for all others."""
+    assert place.crs is not None
+    west, _, east, _ = extent_deg(place.outline, place.crs)
+    middle = east if east - west > 180 else (west + east) / 2
+    return middle if abs(middle) > FAR_EAST_DEG else None
+
+
+def _unwrapped(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
+    """Return a polygon with longitudes within 180 degrees of ``middle_deg``; unchanged if that is None."""
+    if middle_deg is None:
+        return shape
+    return shapely.make_valid(
+        shapely.transform(
+            shape, lambda at: np.column_stack([(at[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg, at[:, 1:]])
+        )
+    )
 
 
 def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
@@ -136,12 +146,7 @@ def figures_of_plot(
     names: tuple[str, ...],
 ) -> PlotFigures:
     """Return the figures of a plot whose outline is in pixels of a (y, x) class map. Plots may overlap."""
-    bounds = np.zeros(4) if shape.is_empty else np.array(shape.bounds)
-    firsts = (
-        min(max(int(np.floor(low)), 0), most - 1) for low, most in zip(bounds[[1, 0]], classes.shape, strict=True)
-    )
-    lasts = (min(max(int(np.ceil(high)), 1), most) for high, most in zip(bounds[[3, 2]], classes.shape, strict=True))
-    rows, columns = (slice(first, max(last, first + 1)) for first, last in zip(firsts, lasts, strict=True))
+    rows, columns = _window(shape, classes.shape)
     drawn = classes[rows, columns]
     inside = pixels_inside([shape], drawn.shape, origin=(rows.start, columns.start))
     mapped = inside & (drawn != UNLABELLED)
@@ -159,3 +164,12 @@ def figures_of_plot(
         float(sure.mean(dtype=np.float64)) if sure.size else None,
         {name: float(one) / total if total else None for name, one in zip(names, by_class, strict=True)},
     )
+
+
+def _window(shape: BaseGeometry, size: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return the rows and columns of a map of ``size`` around a polygon, at least one each."""
+    bounds = np.zeros(4) if shape.is_empty else np.array(shape.bounds)
+    firsts = (min(max(int(np.floor(low)), 0), most - 1) for low, most in zip(bounds[[1, 0]], size, strict=True))
+    lasts = (min(max(int(np.ceil(high)), 1), most) for high, most in zip(bounds[[3, 2]], size, strict=True))
+    rows, columns = (slice(first, max(last, first + 1)) for first, last in zip(firsts, lasts, strict=True))
+    return rows, columns
