@@ -92,14 +92,8 @@ def windows(coordinates: NDArray[np.float64], kernel: Kernel) -> Windows:
     if kernel == "bilinear":
         np.subtract(1, t, out=weight[:, 0])
         weight[:, 1] = t
-    else:  # four taps around a fraction t in 0..1 (Keys, 1981, a = -1/2)
-        half = np.float32(0.5)
-        s = 1 - t
-        first, second, third, last = (weight[:, tap] for tap in range(4))
-        np.multiply(-half * t * s, s, out=first)
-        np.multiply(-half * s * t, t, out=last)
-        np.add(1, t * t * (np.float32(1.5) * t - np.float32(2.5)), out=second)
-        np.subtract(1 - first - second, last, out=third)
+    else:
+        _catmull_rom(t, weight)
         base -= 1
     return Windows(base, weight)
 
@@ -136,6 +130,17 @@ class Unlocked:
     def __init__(self, array: NDArray[np.float32]) -> None:
         self.array = array  # keeps the memory
         self.__array_interface__ = {**array.__array_interface__, "data": (array.__array_interface__["data"][0], False)}
+
+
+def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
+    """Write the weights of the four taps around a fraction t in 0..1, (2, n) -> (2, 4, n) (Keys, 1981, a = -1/2)."""
+    half = np.float32(0.5)
+    s = 1 - t
+    first, second, third, last = (weight[:, tap] for tap in range(4))
+    np.multiply(-half * t * s, s, out=first)
+    np.multiply(-half * s * t, t, out=last)
+    np.add(1, t * t * (np.float32(1.5) * t - np.float32(2.5)), out=second)
+    np.subtract(1 - first - second, last, out=third)
 
 
 @cache

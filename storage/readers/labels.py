@@ -180,15 +180,7 @@ def load_codes(
     if geobox is not None and own is not None:
         shift = shift_px(geobox, own) if own.crs == geobox.crs and own.shape == geobox.shape else None
         if shift is None or max(map(abs, shift)) > OFF_GRID_PX:
-            values, index = np.unique(codes, return_inverse=True)
-            near = np.full(tuple(geobox.shape), -1, np.int32)
-            odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), near, own, geobox, "nearest", -1, -1)
-            if (near < 0).all():
-                raise SceneError(
-                    f"labels {address} do not lie on the scene: {_extent(own)}, the scene {_extent(geobox)}; give the "
-                    "labels of this scene, or correct the CRS of one of them (gdal_edit -a_srs)"
-                )
-            codes = np.where(near < 0, NO_VALUE, values[near])
+            codes = _on_grid(codes, own, geobox, address)
             regridded = True
             notes.append(f"labels {address} have another grid than the scene: they are resampled by nearest neighbour")
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
@@ -213,6 +205,19 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
         f"labels {address} have shape {values.shape} and type {values.dtype}; expected whole numbers (y, x) or colours "
         f"(y, x, 3) of 8 bits"
     )
+
+
+def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:
+    """Return the nearest code to each pixel of a grid, `NO_VALUE` beside the labels (SceneError: all pixels are)."""
+    values, index = np.unique(codes, return_inverse=True)
+    found = np.full(tuple(grid.shape), -1, np.int32)
+    odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), found, own, grid, "nearest", -1, -1)
+    if (found < 0).all():
+        raise SceneError(
+            f"labels {address} do not lie on the scene: {_extent(own)}, the scene {_extent(grid)}; give the labels of "
+            "this scene, or correct the CRS of one of them (gdal_edit -a_srs)"
+        )
+    return np.where(found < 0, NO_VALUE, values[found])
 
 
 def _extent(grid: GeoBox) -> str:

@@ -91,22 +91,7 @@ def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Ef
 
 
 def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]:
-    ones = np.ones(len(probe.wavelength_nm))
-    both = np.ones((2, len(probe.wavelength_nm)))
-    loud = replace(
-        probe,
-        level=ones,
-        span=ones,
-        slope=both,
-        curvature=both,
-        spectral_slope=ones,
-        brightest_e=max(probe.brightest_e, rig.camera.full_scale_e),
-        slit_errors={},
-    )
-    present = [
-        effect.name in ALWAYS_ON or max(effect.bound(one, rig, OFF).value for one in (loud, probe)) > 0
-        for effect in effects
-    ]
+    present = [_is_present(effect, probe, rig) for effect in effects]
     ranges: list[GainRange | None] = [
         effect.gain_range(probe, rig) if there and hasattr(effect, "gain_range") else None
         for effect, there in zip(effects, present, strict=True)
@@ -146,6 +131,22 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
 
     exact = replace(option(effect.variants[0]), error=0.0, why="exact")
     return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present)
+
+
+def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
+    ones = np.ones(len(probe.wavelength_nm))
+    both = np.ones((2, len(probe.wavelength_nm)))
+    loud = replace(
+        probe,
+        level=ones,
+        span=ones,
+        slope=both,
+        curvature=both,
+        spectral_slope=ones,
+        brightest_e=max(probe.brightest_e, rig.camera.full_scale_e),
+        slit_errors={},
+    )
+    return effect.name in ALWAYS_ON or max(effect.bound(one, rig, OFF).value for one in (loud, probe)) > 0
 
 
 def error_growth(probe: Probe, rig: Rig, own: GainRange | None, others: float) -> float:

@@ -137,14 +137,7 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
         numbers = [number for number, sweep in enumerate(sweeps) if (sweep.along == "y") == along_y]
         oblique = sorted(numbers, key=lambda number: -abs(sweeps[number].swath_px))
         along, scan = (centred if along_y else centred[:, ::-1]).T
-        seen = np.full(len(along), -1)  # the first sweep that sees each place, or nearly
-        for number in oblique:
-            left = np.flatnonzero(seen < 0)
-            held = _held(sweeps[number])
-            line, sample = scene_to_sweep(held, camera, along[left], scan[left]).T
-            with np.errstate(invalid="ignore"):  # places that no ray reaches
-                inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
-            seen[left[inside]] = number
+        seen = _first_seeing(oblique, sweeps, camera, along, scan)
         for number in numbers:
             which = (seen == number) | ((seen < 0) if number == oblique[-1] else False)
             line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
@@ -157,6 +150,21 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
         np.concatenate([one.along_y for one in found]),
         found[0].binning,
     )
+
+
+def _first_seeing(
+    order: list[int], sweeps: tuple[Sweep, ...], camera: LineCamera, along: Floats, scan: Floats
+) -> NDArray[np.intp]:
+    """Return the number of the first sweep that sees each place, or nearly; -1 where none does."""
+    found = np.full(len(along), -1)
+    for number in order:
+        left = np.flatnonzero(found < 0)
+        held = _held(sweeps[number])
+        line, sample = scene_to_sweep(held, camera, along[left], scan[left]).T
+        with np.errstate(invalid="ignore"):  # places that no ray reaches
+            inside = (line > -2) & (line < held.lines + 1) & (sample > -3) & (sample < camera.samples + 2)
+        found[left[inside]] = number
+    return found
 
 
 def _held(sweep: Sweep) -> Sweep:
@@ -299,26 +307,25 @@ def _slit_errors(
 ) -> dict[str, float]:
     """Return the greatest change by every variant of the slit, and by leaving it out, over the unit.
 
-    It is against the finest variant, with the rig's blurs in the sweep where they are least: others hide more. Looked
-    at are the stored numbers that the slit, or one upright box in its place, changes most.
+    It is against the finest variant, with the rig's blurs.
     """
+    rough = _roughest(scene, rig, views, unit)
+    views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
+    moments = _least_blurs(rig, scene.wavelength_nm, sweeps)
+    boxes = {one: _footprint(one, rig, BOXES.get(one, (1, 1)), moments, scene) for one in (*SLIT.variants, OFF)}
+    finest = light_seen(scene, rig.camera, views, boxes.pop(SLIT.variants[0]), _PHASES)
+    scale = unit_at(_stored(finest, views), rig, unit, views.binning)
+    return {one: float(_changes(scene, rig, views, box, finest, scale).max(initial=0.0)) for one, box in boxes.items()}
+
+
+def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
+    """Return the stored numbers that the slit, or one upright box in its place, changes most."""
     close = light_seen(scene, rig.camera, views, _footprint(SLIT.variants[0], rig, _CLOSE, None, scene), _PHASES)
     scale = unit_at(_stored(close, views), rig, unit, views.binning)
     most = max(FINEST_SAMPLES // views.binning, 50)
     others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
     changes = [_changes(scene, rig, views, other, close, scale) for other in others]
-    rough = np.unique([np.argsort(-change, kind="stable")[:most] for change in changes])
-    views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
-    found = []
-    for sweep in sweeps:
-        normal = middle_normal(sweep, rig.camera)
-        blurs = [blur.moments(rig, scene.wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
-        found.append(Moments.together(blurs, len(scene.wavelength_nm)))
-    moments = min(found, key=lambda one: float((one.spread + (0.0 if one.waves is None else one.waves**2)).sum()))
-    boxes = {one: _footprint(one, rig, BOXES.get(one, (1, 1)), moments, scene) for one in (*SLIT.variants, OFF)}
-    finest = light_seen(scene, rig.camera, views, boxes.pop(SLIT.variants[0]), _PHASES)
-    scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-    return {one: float(_changes(scene, rig, views, box, finest, scale).max(initial=0.0)) for one, box in boxes.items()}
+    return np.unique([np.argsort(-change, kind="stable")[:most] for change in changes])
 
 
 def _changes(
@@ -334,6 +341,16 @@ def _footprint(
     variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: RasterScene
 ) -> Footprint:
     return fold(box_of(variant, rig), parts, 1, moments or Moments.together([], len(scene.wavelength_nm)))
+
+
+def _least_blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> Moments:
+    """Return all blurs and shifts of the rig's optics in the sweep where they are least: others hide more."""
+    found = []
+    for sweep in sweeps:
+        normal = middle_normal(sweep, rig.camera)
+        blurs = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
+        found.append(Moments.together(blurs, len(wavelength_nm)))
+    return min(found, key=lambda one: float((one.spread + (0.0 if one.waves is None else one.waves**2)).sum()))
 
 
 def _stored(values: Radiance, views: SampleViews) -> Radiance:
