@@ -47,8 +47,7 @@ def rows() -> list[Row]:
             began = time.process_time()
             found.append(judge_fold(Path(name), fold))
             table.append(_row(f"third {fold}", found[-1], f"{time.process_time() - began:.0f} s of processor"))
-    together = {way: np.sum([one[way] for one in found], axis=0) for way in found[0]}
-    return [*table, _row("all 20 tiles", together, "")]
+    return [*table, _row("all 20 tiles", {way: np.sum([one[way] for one in found], axis=0) for way in found[0]}, "")]
 
 
 def _row(what: str, counts: dict[str, Counts], words: str) -> Row:

@@ -98,8 +98,7 @@ def test_hysteresis_depends_on_the_unit_of_the_rig():
 def test_hysteresis_changes_sign_with_the_scan_direction():
     """A scan in the opposite direction has the same field with the other sign; a single position counts as forward."""
     forth = HYSTERESIS.aim(block(), "exact")
-    back = HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact")
-    np.testing.assert_array_equal(back, -forth)
+    np.testing.assert_array_equal(HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact"), -forth)
     alone = block(range(1), sweep=replace(HYSTERESIS_SWEEP, lines=1))
     np.testing.assert_array_equal(HYSTERESIS.aim(alone, "exact"), forth[:1])
     assert np.abs(forth).max() <= 50
