@@ -83,10 +83,14 @@ class Readings:
             before, after = (patch_pixels(self.seen.grid, one).sum(axis=(1, 2)) for one in wrong)
             return np.asarray(before - after, np.float64)
         if pooling == "maximum":
-            grid = self.seen.grid
-            pixels = PIXEL_SCORES[policy].of(self.seen)[: grid.height, : grid.width]
-            return np.asarray(patch_pixels(grid, pixels).max(axis=(1, 2)))
+            return patch_maxima(PIXEL_SCORES[policy].of(self.seen), self.seen.grid)
         return score_patches(policy, self.seen, seed=seed)
+
+
+def patch_maxima(pixels: Scores, grid: SceneGrid) -> Scores:
+    """Return the greatest score of each patch's pixels within the scene, (patch,)."""
+    greatest: Scores = patch_pixels(grid, pixels[: grid.height, : grid.width]).max(axis=(1, 2))
+    return greatest
 
 
 def read_scene(weights: Weights, columns: Image, labels: NDArray[np.uint8], grid: SceneGrid, factor: int) -> Readings:
