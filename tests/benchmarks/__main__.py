@@ -55,7 +55,12 @@ def main(arguments: Sequence[str]) -> int:
             continue
         print(f"\n{name} ({time.perf_counter() - began:.0f} s)")
         print(aligned(_cells_of(tables[name]), WIDTHS), flush=True)
-    _summarise(tables, failed)
+    goals = [row for rows in tables.values() for row in rows if row.met is not None]
+    missed = [row.what for row in goals if not row.met]
+    print(f"\n{len(goals) - len(missed)} of {len(goals)} goals met", end="")
+    print(f"; missed: {'; '.join(missed)}" if missed else "")
+    if failed:
+        print(f"crashed: {', '.join(failed)}")
     if asked.markdown:
         lines = markdown_lines(_cells_of([row for rows in tables.values() for row in rows]))
         asked.markdown.write_text("\n".join([*lines, "", _machine(), ""]), encoding="utf-8")
@@ -65,15 +70,6 @@ def main(arguments: Sequence[str]) -> int:
 
 def _cells_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:
     return [HEADINGS, *((row.what, row.figure, row.goal or "-", MET[row.met], row.peers or "-") for row in rows)]
-
-
-def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
-    goals = [row for rows in tables.values() for row in rows if row.met is not None]
-    missed = [row.what for row in goals if not row.met]
-    print(f"\n{len(goals) - len(missed)} of {len(goals)} goals met", end="")
-    print(f"; missed: {'; '.join(missed)}" if missed else "")
-    if failed:
-        print(f"crashed: {', '.join(failed)}")
 
 
 def _machine() -> str:

@@ -15,7 +15,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.geolocation import path_geolocation
 from pipeline.rectify.placed import TieTable, tie_table
-from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from pipeline.rectify.scan_paths import make_scan_paths
 from tests.pipeline.geometry.paper_equations import line_rotation
 
 CAMERA = LineCamera()
@@ -34,9 +34,23 @@ def rows() -> list[Row]:
     position = mirror.direction_to_position(mirror.scene_to_direction(tangents))
     (scan_path,) = make_scan_paths(position, CAMERA, step_px=1.0)
     truth = _by_reflected_rays(path_geolocation(scan_path, CAMERA, _pixels(), along="x"))
-    clocks = time_in_turn(_calls(scan_path), rounds=5)
+    samples = _samples()
+    pixels = _pixels()
+    tree = cKDTree(samples)
+    calls: dict[str, Callable[[], object]] = {
+        "tree": lambda: cKDTree(samples).query(pixels, workers=1),
+        "query": lambda: tree.query(pixels, workers=1),
+        "ties 16": lambda: _read(tie_table(scan_path, CAMERA, along="x", tie=16, tolerance_px=np.inf, **GRID)),
+    }
+    clocks = time_in_turn(calls, rounds=5)
     table = tie_table(scan_path, CAMERA, along="x", **GRID)
-    return [_error(table, truth), *_against_tree(scan_path, table, truth, clocks)]
+    off = _worst(_whole(table), truth)
+    ends = np.array([[SWATH, 0.0], [SWATH, LINES]]) * CAMERA.ifov_rad
+    turn = np.rad2deg(line_rotation(mirror.scene_to_direction(ends)))
+    what = f"geolocation grid of {PIXELS} px by ties, lines turned by {turn[0]:.1f}-{turn[1]:.1f} deg: error"
+    met = off < 2e-3 and off <= table.bound_px
+    error = Row(what, f"{off:.2g} px (bound {table.bound_px:.2g})", "< 2e-3 px", met)
+    return [error, *_against_tree(table, truth, clocks)]
 
 
 def _pixels() -> Floats:
@@ -48,17 +62,6 @@ def _samples() -> Floats:
     """Return the scene position of every sample of every line, (line * sample, 2) y and x [px], for the tree."""
     x, y = points_of_scan(SWATH, CAMERA, np.arange(float(LINES))[:, None], CAMERA.pixel_slopes()[None, :])
     return np.stack([y, x], axis=-1).reshape(-1, 2)
-
-
-def _calls(scan_path: ScanPath) -> dict[str, Callable[[], object]]:
-    samples = _samples()
-    pixels = _pixels()
-    tree = cKDTree(samples)
-    return {
-        "tree": lambda: cKDTree(samples).query(pixels, workers=1),
-        "query": lambda: tree.query(pixels, workers=1),
-        "ties 16": lambda: _read(tie_table(scan_path, CAMERA, along="x", tie=16, tolerance_px=np.inf, **GRID)),
-    }
 
 
 def _read(table: TieTable) -> None:
@@ -99,15 +102,7 @@ def _worst(found: Floats, truth: Floats) -> float:
     return float(np.nanmax(np.abs(found - truth))) if apart.mean() < 1e-4 else np.inf
 
 
-def _error(table: TieTable, truth: Floats) -> Row:
-    off = _worst(_whole(table), truth)
-    ends = np.array([[SWATH, 0.0], [SWATH, LINES]]) * CAMERA.ifov_rad
-    turn = np.rad2deg(line_rotation(mirror.scene_to_direction(ends)))
-    what = f"geolocation grid of {PIXELS} px by ties, lines turned by {turn[0]:.1f}-{turn[1]:.1f} deg: error"
-    return Row(what, f"{off:.2g} px (bound {table.bound_px:.2g})", "< 2e-3 px", off < 2e-3 and off <= table.bound_px)
-
-
-def _against_tree(scan_path: ScanPath, table: TieTable, truth: Floats, clocks: dict[str, Timing]) -> list[Row]:
+def _against_tree(table: TieTable, truth: Floats, clocks: dict[str, Timing]) -> list[Row]:
     _, nearest = cKDTree(_samples()).query(_pixels(), workers=1)
     tree_off = _worst(np.stack(np.divmod(nearest, CAMERA.samples), axis=-1).astype(np.float64), truth)
     faster, closer = ratio(clocks, "tree", "ties 16"), tree_off / _worst(_whole(table), truth)

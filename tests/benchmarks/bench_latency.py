@@ -14,7 +14,6 @@ from measure import Row, alone
 
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
-    from pipeline.rig.drivers import RigDevices
 
 PX = 2560
 MOST_S = 5.0
@@ -34,19 +33,15 @@ class Moments:
         """Return the time from the last coarse line in the spool to the first position that is sent for a fine line."""
         return self.first_request - self.last_line
 
-    @property
-    def read_s(self) -> float:
-        """Return the time from the camera's last coarse exposure to its line in the spool."""
-        return self.last_line - self.last_exposure
-
 
 def rows() -> list[Row]:
     found = alone(measure, PX)
     what = f"rig, {PX} x {PX} x 270: last coarse line to first patch request"
+    read_s = found.last_line - found.last_exposure
     fraction = f"{found.waited_s / found.coarse_s:.1%} of the coarse pass's {found.coarse_s:.0f} s"
     return [
         Row(what, f"{found.waited_s:.2f} s ({fraction})", f"<= {MOST_S:g} s", found.waited_s <= MOST_S),
-        Row("the same: last exposure to last coarse line (files over FTP, this machine)", f"{found.read_s:.2f} s"),
+        Row("the same: last exposure to last coarse line (files over FTP, this machine)", f"{read_s:.2f} s"),
     ]
 
 
@@ -108,11 +103,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
     line = stack.enter_context(InProcessRig(rig))
-
-    def open_devices(told: Settings, *_: object) -> RigDevices:
-        return line.devices(told.rig, told.cost.vector_pairs)
-
-    stack.enter_context(patch("flows.tasks.rig_field.open_devices", open_devices))
+    stack.enter_context(patch("flows.tasks.rig_field.open_devices", line.devices_of))
     try:
         draw_class_map(survey)
     except _AskedError:

@@ -47,8 +47,7 @@ def rows() -> list[Row]:
             began = time.process_time()
             found.append(judge_fold(Path(name), fold))
             table.append(_row(f"third {fold}", found[-1], f"{time.process_time() - began:.0f} s of processor"))
-    together = {way: np.sum([one[way] for one in found], axis=0) for way in found[0]}
-    return [*table, _row("all 20 tiles", together, "")]
+    return [*table, _row("all 20 tiles", {way: np.sum([one[way] for one in found], axis=0) for way in found[0]}, "")]
 
 
 def _row(what: str, counts: dict[str, Counts], words: str) -> Row:
@@ -88,19 +87,11 @@ def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
         frame = observe_frame(data.scene(name), name, weights, LineCamera(), fold)
         every = np.arange(len(frame.fine))
         found["network"] += confusion(frame.labels, segment(weights, frame.seen, frame.fine, every).classes, classes)
-    names = [name for name in data.train if name not in held]
-    return found | judge_classifiers(data, names, held, weights, fold)
-
-
-def judge_classifiers(
-    data: TrainingData, names: Sequence[str], held: Sequence[str], weights: Weights, seed: int
-) -> dict[str, Counts]:
-    """Fit classifiers to every labelled pixel of the training tiles; return their counts on the held-out ones."""
-    learnt, judged = (_pixels(data, some, weights, seed) for some in (names, held))
-    found = {}
-    for name, classifier in _classifiers().items():
+    others = [name for name in data.train if name not in held]
+    learnt, judged = (_pixels(data, some, weights, fold) for some in (others, held))
+    for name, classifier in _classifiers().items():  # each learns every labelled pixel of the training tiles
         drawn = classifier.fit(*learnt).predict(judged[0]).astype(np.uint8)
-        found[name] = confusion(judged[1], drawn, weights.config.classes)
+        found[name] = confusion(judged[1], drawn, classes)
     return found
 
 

@@ -140,19 +140,14 @@ class Reader:
             time.sleep(0.1)
 
     def _python(self, block: Block) -> None:
-        if block.file is not None:
-            self._add(block, block.text)
+        if block.file is not None:  # a new file in the copy of the folders
+            path = self.tree / block.file
+            assert path.parent.is_dir(), f"{block.place}: there is no folder {path.parent.relative_to(self.tree)}"
+            assert not path.exists(), f"{block.place}: {block.file} is there already"
+            path.write_text(block.text, encoding="utf-8")
             return
         code = compile("\n" * (block.line - 1) + block.text, str(block.page), "exec", dont_inherit=True)
         exec(code, self.names)
-
-    def _add(self, block: Block, text: str) -> None:
-        """Add a file of the page to the copy of the folders; a file of that name must not exist there."""
-        assert block.file is not None
-        path = self.tree / block.file
-        assert path.parent.is_dir(), f"{block.place}: there is no folder {path.parent.relative_to(self.tree)}"
-        assert not path.exists(), f"{block.place}: {block.file} is there already"
-        path.write_text(text, encoding="utf-8")
 
     def _change(self, block: Block) -> None:
         """Apply a diff to the file of the copy that its first line names; each part must match exactly one place."""

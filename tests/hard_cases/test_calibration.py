@@ -63,7 +63,6 @@ def test_smallest_frames_calibrate(samples: int, bands: int) -> None:
     values, valid = calibrate(raw, references, saturated_dn=FULL)
     np.testing.assert_allclose(values, (1060 - 60.5) / 2000, rtol=1e-6)
     assert valid.all()
-    everything = replace(references, bad=np.ones((samples, bands), np.bool_))
-    values, valid = calibrate(raw, everything, saturated_dn=FULL)
+    values, valid = calibrate(raw, replace(references, bad=np.ones((samples, bands), np.bool_)), saturated_dn=FULL)
     assert np.isnan(values).all()
     assert not valid.any()

@@ -154,8 +154,7 @@ def test_8_equal_scores_select_the_lowest_patch():
 
 def test_9_nan_scores_are_selected_last():
     """An infinite score comes first; NaN and minus infinity come last, together, by patch number."""
-    score = np.array([np.nan, 1.0, -np.inf, np.inf, 2.0, np.nan])
-    assert select_patches(score, 6).tolist() == [3, 4, 1, 0, 2, 5]
+    assert select_patches(np.array([np.nan, 1.0, -np.inf, np.inf, 2.0, np.nan]), 6).tolist() == [3, 4, 1, 0, 2, 5]
 
 
 def test_10_duplicate_patch_is_refused():

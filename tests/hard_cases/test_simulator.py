@@ -70,7 +70,6 @@ def test_zero_width_slit_is_the_limit_of_a_narrow_one() -> None:
 @pytest.mark.parametrize("tolerance", [5e-324, 1e-300, 1e300])
 def test_extreme_tolerances_are_kept(tolerance: float) -> None:
     """Errors stay within 5e-324, 1e-300 and 1e300; the fixed pattern (PRNU) is on for the first two only."""
-    scene = scene_of(np.ones((60, 80, 3)))
-    decision = decided(scene, replace(RIG, optics=Optics(stray_fraction=0.0)), tolerance)
+    decision = decided(scene_of(np.ones((60, 80, 3))), replace(RIG, optics=Optics(stray_fraction=0.0)), tolerance)
     assert decision.error <= tolerance
     assert ("prnu" in {one.name for one in decision.chosen}) == (tolerance < 1)

@@ -144,6 +144,5 @@ def test_bound_of_rotation_includes_turbulence() -> None:
     """Turbulence moves the view off the plan and so rotates a line of 640 samples, by more than 0.05 sigma."""
     air = Air(distance_m=300.0, visibility_km=1e6, airlight_fraction=0.0, vapour_g_per_m3=0.0)
     rig = Rig(air=air, optics=Optics(focus_m=300.0, aberration_px=0.0, stray_fraction=0.0))
-    scene = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 680, 1)))
-    change, counted = left_out(scene, rig)["rotation"]
+    change, counted = left_out(scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 680, 1))), rig)["rotation"]
     assert 0.05 < change <= counted

@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, PipelineError, RigError, SceneError, is_visible, visible
 
-anything = st.text(st.characters())  # surrogates included
 
-
-@given(anything)
+@given(st.text(st.characters()))  # surrogates included
 def test_visible_text_has_no_control_characters(text: str) -> None:
     """Line ends and tabs stay; direction marks and surrogates are escaped. A second pass changes nothing."""
     shown = visible(text)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from pathlib import Path
 from storage.remote.opening import open_archive
 from tests.faults.fault_table import Row
 from tests.faults.nursery import ROOT
+from tests.flows.schedule.prefect_server import free_port
 from tests.object_server import BUCKET, KEYS
 
 SIZE = "10240x10240"
@@ -71,12 +71,6 @@ def cluster(folder: Path) -> Iterator[tuple[str, list[int]]]:
         workers = [start("distributed.cli.dask_worker", scheduler, *asked, SPECTRALZOOM_WORK=copy) for copy in copies]
         create_bucket()
         yield scheduler, workers
-
-
-def free_port() -> int:
-    """Return a free port."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
 
 
 def create_bucket() -> None:

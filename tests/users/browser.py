@@ -46,16 +46,13 @@ class Tab:
             if told.get("id") == self._number:
                 assert "error" not in told, told["error"]
                 return dict(told["result"])
-            self._note(told)
-
-    def _note(self, told: dict[str, Any]) -> None:
-        facts = told.get("params", {})
-        if told.get("method") == "Network.requestWillBeSent":
-            self.asked.append(facts["request"]["url"])
-        elif told.get("method") == "Runtime.exceptionThrown":
-            self.troubles.append(facts["exceptionDetails"].get("exception", {}).get("description", "exception"))
-        elif told.get("method") == "Log.entryAdded" and facts["entry"]["level"] == "error":
-            self.troubles.append(facts["entry"]["text"])
+            facts = told.get("params", {})
+            if told.get("method") == "Network.requestWillBeSent":
+                self.asked.append(facts["request"]["url"])
+            elif told.get("method") == "Runtime.exceptionThrown":
+                self.troubles.append(facts["exceptionDetails"].get("exception", {}).get("description", "exception"))
+            elif told.get("method") == "Log.entryAdded" and facts["entry"]["level"] == "error":
+                self.troubles.append(facts["entry"]["text"])
 
     def run(self, script: str) -> Any:
         """Return the value of a script of one expression."""
@@ -101,18 +98,14 @@ def chromium(profile: Path) -> Iterator[Tab]:
     words = [CHROMIUM, *QUIETLY, f"--user-data-dir={profile}", "about:blank"]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            port = _port(profile / "DevToolsActivePort")
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=PATIENCE_S) as answer:
+            file = profile / "DevToolsActivePort"
+            end = time.monotonic() + PATIENCE_S
+            while not (file.exists() and (lines := file.read_text().split())):
+                assert time.monotonic() < end, "chromium did not start"
+                time.sleep(0.05)
+            with urllib.request.urlopen(f"http://127.0.0.1:{lines[0]}/json", timeout=PATIENCE_S) as answer:
                 (page, *_) = [one for one in json.load(answer) if one["type"] == "page"]
             with connect(page["webSocketDebuggerUrl"], max_size=None, compression=None) as line:
                 yield Tab(line)
         finally:
             process.terminate()
-
-
-def _port(file: Path) -> int:
-    end = time.monotonic() + PATIENCE_S
-    while not (file.exists() and (lines := file.read_text().split())):
-        assert time.monotonic() < end, "chromium did not start"
-        time.sleep(0.05)
-    return int(lines[0])

@@ -62,8 +62,11 @@ class Survey:
 
 def rows() -> list[Row]:
     """Return rate, ratio to a copy, savings and memory, then cost and error of the footprint's variants."""
-    survey = _survey()
-    decision = survey.decision
+    scene = farm_scene(0, (SIZE, SIZE))
+    rig = Rig()
+    sweeps = tuple(Sweep(f"swath{n}", "fine", "x", at, -(SIZE - 1) / 2, SIZE) for n, at in enumerate(SWATHS))
+    decision = decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE)
+    survey = Survey(scene, rig, sweeps, decision)
     blocks = survey.blocks()
     calls: dict[str, Callable[[], object]] = {
         "auto": partial(_simulated, survey, decision.chosen, blocks),
@@ -106,13 +109,6 @@ def rows() -> list[Row]:
         ),
         *_footprints(survey),
     ]
-
-
-def _survey() -> Survey:
-    scene = farm_scene(0, (SIZE, SIZE))
-    rig = Rig()
-    sweeps = tuple(Sweep(f"swath{n}", "fine", "x", at, -(SIZE - 1) / 2, SIZE) for n, at in enumerate(SWATHS))
-    return Survey(scene, rig, sweeps, decide(probe_scene(scene, rig, sweeps), rig, EFFECTS, TOLERANCE))
 
 
 def _simulated(survey: Survey, chosen: dict[Effect, str], blocks: list[SweepBlock]) -> None:

@@ -80,8 +80,7 @@ def test_a_visit_surveyed_again_is_one_point(tmp_path: Path) -> None:
 def test_a_visit_has_the_day_of_its_farm(settings: dict[str, Any], visited: str) -> None:
     """The time in a visit's name takes precedence; scenes from files have the time of their survey."""
     facts = {"created": "2026-11-23T00:00:00Z", "settings": settings}
-    run = Run(Path("x"), facts, {"started": "2026-11-22T08:00:00Z"}, None)
-    assert str(time_of_visit(run)).startswith(visited)
+    assert str(time_of_visit(Run(Path("x"), facts, {"started": "2026-11-22T08:00:00Z"}, None))).startswith(visited)
 
 
 def test_pages_load_nothing_and_link_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:

@@ -28,8 +28,7 @@ def small_mosaic(path: Path, bands: int = 8) -> Mosaic:
 
 def test_a_class_has_the_mean_spectrum_of_its_pixels(tmp_path: Path) -> None:
     """Values by hand: scores 1 and 3 of class 0, 7 of class 1, plus a mean of 5; class 2 has no valid pixel."""
-    classes = np.array([[0, 0], [1, 2]], np.uint8)
-    spectra = class_spectra(small_mosaic(tmp_path / "mosaic.zarr"), classes, 3)
+    spectra = class_spectra(small_mosaic(tmp_path / "mosaic.zarr"), np.array([[0, 0], [1, 2]], np.uint8), 3)
     assert spectra[0].tolist() == [7.0] * 8
     assert spectra[1].tolist() == [12.0] * 8
     assert np.isnan(spectra[2]).all()

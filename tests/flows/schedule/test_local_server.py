@@ -36,17 +36,6 @@ def sealed(statements: str) -> str:
     return HEAD.format(metadata.version("prefect"), hashlib.sha256(statements.encode()).hexdigest()) + statements
 
 
-def migrated_schema(folder: Path) -> str:
-    """Return the schema from Prefect's own migrations, as SQL, made in a process with its own settings."""
-    file = folder / "migrated.db"
-    settings = {"PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{file}", "PREFECT_HOME": str(folder)}
-    subprocess.run([sys.executable, "-c", MIGRATE], env={**os.environ, **settings}, check=True)
-    with sqlite3.connect(file) as made:
-        text = "\n".join(made.iterdump())
-    made.close()
-    return sealed(text + "\n")
-
-
 def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path) -> None:
     """This happens on a full disk; surveys then run without a server."""
     (tmp_path / "home").write_text("a file")
@@ -76,5 +65,11 @@ def test_the_server_needs_a_password(server: str) -> None:
 
 if __name__ == "__main__":
     os.environ["DO_NOT_SCAN_PATH"] = "1"
-    with tempfile.TemporaryDirectory() as folder:
-        SCHEMA.write_text(migrated_schema(Path(folder)))
+    with tempfile.TemporaryDirectory() as folder:  # Prefect's own migrations run in a process with its own settings
+        file = Path(folder) / "migrated.db"
+        settings = {"PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{file}", "PREFECT_HOME": folder}
+        subprocess.run([sys.executable, "-c", MIGRATE], env={**os.environ, **settings}, check=True)
+        with sqlite3.connect(file) as made:
+            text = "\n".join(made.iterdump())
+        made.close()
+        SCHEMA.write_text(sealed(text + "\n"))

@@ -20,14 +20,12 @@ from flows.cli.rig_commands import _write_survey, emulated_settings, run_emulate
 from flows.cli.survey_verbs import RenderingFlags
 from flows.settings.load import SURVEY, TABLES, load_settings
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
-from pipeline.rig.pro_mode import Command
 from tests.conftest import QUIET
 from tests.flows.conftest import CommandLine
 from tests.pipeline.rig.camera_faults import FaultyRig
 from tests.pipeline.rig.mirror_faults import make_fault
-from tests.pipeline.rig.small_rig import small_source
+from tests.pipeline.rig.small_rig import set_anything, small_source
 
-SETS = {Command.SET_VALUES, Command.SET_VECTOR}
 NOWHERE = "127.0.0.1:1:1"
 
 
@@ -37,11 +35,6 @@ def served(*faults: str) -> Iterator[ServedRig]:
     struck = [make_fault(name, at=0) for name in faults]
     with FaultyRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
         yield rig
-
-
-def still(rig: ServedRig) -> bool:
-    """Return whether the mirror received no command but that of its mode."""
-    return not any(request.command in SETS for request in rig.rig.mirror.requests)
 
 
 def test_rig_check_reads_addresses_from_a_settings_file(command_line: CommandLine, tmp_path: Path) -> None:
@@ -59,7 +52,7 @@ def test_rig_check_reads_addresses_from_a_settings_file(command_line: CommandLin
         assert [row["asked"] for row in record["rows"] if row["asked"].startswith("go to")][-1] == "go to 0; 0"
         assert record["port"] == rig.port
         assert record["camera"] == f"{rig.host}:{rig.camera_port}"
-        assert not still(rig)
+        assert set_anything(rig.rig.mirror)
 
 
 def test_rig_check_exits_with_3_if_one_of_two_devices_fails(command_line: CommandLine) -> None:
@@ -108,7 +101,7 @@ def test_rig_check_of_a_working_rig_moves_nothing(command_line: CommandLine) -> 
         assert ended.code == 0
         assert "MR-E-2" in ended.out
         assert "nothing to mend" in ended.out
-        assert still(rig)
+        assert not set_anything(rig.rig.mirror)
 
 
 def test_a_driver_that_cannot_be_imported_is_refused(command_line: CommandLine, tmp_path: Path) -> None:

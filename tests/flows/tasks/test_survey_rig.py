@@ -26,7 +26,6 @@ from flows.tasks.scene import open_scene
 from flows.tasks.stages.effects import chosen_effects
 from pipeline.errors import PoseError, RigError, SettingsError
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import RigDevices
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.transports import DeviceGone
@@ -67,11 +66,7 @@ def emulated(
     source = replace(make_source(seen, settings), chosen=effects)
     whole = FaultyRig(source, ManualClock(10.0), wired=settings.rig.pulses)
     with InProcessRig(whole) as line:
-
-        def open_devices(told: Settings, *_: object) -> RigDevices:
-            return line.devices(told.rig, told.cost.vector_pairs)
-
-        patch.setattr(flows.tasks.rig_field, "open_devices", open_devices)
+        patch.setattr(flows.tasks.rig_field, "open_devices", line.devices_of)
         yield whole
 
 

@@ -132,8 +132,7 @@ def test_a_log_gets_one_line_when_a_stage_ends(monkeypatch: pytest.MonkeyPatch) 
 def test_scene_names_are_not_markup(console: dict[str, Any]) -> None:
     """A name in square brackets is shown as it is and not read as a style."""
     assert "[red]field[/]" in progress_of(lambda one: one.show("looking", 1.0, "[red]field[/]", ended=True), **console)
-    bar = progress_of(lambda one: one.show("looking", 0.5, "[red]field[/]"), **TERMINAL)
-    assert "[red]field[/]" in bar
+    assert "[red]field[/]" in progress_of(lambda one: one.show("looking", 0.5, "[red]field[/]"), **TERMINAL)
 
 
 def test_messages_stand_beside_the_running_stage() -> None:

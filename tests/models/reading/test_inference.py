@@ -56,8 +56,7 @@ def test_a_patch_changes_only_its_own_pixels():
         for which, numbers in (([], NONE), ([0, 1], patch_index), ([1, 0], patch_index), ([1, 0], patch_index[::-1]))
     )
     for one, other in ((without, drawn), (drawn, moved)):
-        changed = (one != other).reshape(4, 8, 6, 8).any(axis=(1, 3))
-        assert np.flatnonzero(changed).tolist() == [3, 15]
+        assert np.flatnonzero((one != other).reshape(4, 8, 6, 8).any(axis=(1, 3))).tolist() == [3, 15]
     assert again == pytest.approx(drawn, abs=1e-6)
 
 
@@ -184,8 +183,7 @@ def test_a_patch_dead_in_most_of_its_pixels_counts_as_not_captured(dead: int, co
     drawn, without = (
         inference.segment(weights, seen, fine[which], np.array(which)).confidence for which in ([4, 5, 6], [4, 6])
     )
-    changed = (drawn != without).reshape(4, 8, 6, 8).any(axis=(1, 3))
-    assert np.flatnonzero(changed).tolist() == [5] * counts
+    assert np.flatnonzero((drawn != without).reshape(4, 8, 6, 8).any(axis=(1, 3))).tolist() == [5] * counts
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -174,8 +174,7 @@ def test_absent_classes_are_never_the_likeliest():
 def test_a_class_of_one_pixel_has_discriminants() -> None:
     """All discriminants are finite, and the library gives no warning."""
     features = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
-    labels = np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)
-    start = linear_discriminants(LabelledPixels(features, labels), 3)
+    start = linear_discriminants(LabelledPixels(features, np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)), 3)
     assert all(torch.isfinite(one).all() for one in start.values())
 
 

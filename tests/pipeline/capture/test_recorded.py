@@ -104,8 +104,7 @@ def test_an_invalid_line_is_used_only_without_a_valid_neighbour() -> None:
     source = simulated()
     lost = replace(record(source, FULL), valid_line=np.arange(80) != 5)
     recorded = recorded_source(source, [lost])
-    coarse = recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4))
-    assert coarse.line[:3].tolist() == [1, 6, 9]
+    assert recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)).line[:3].tolist() == [1, 6, 9]
     fine = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -35.5, 3)))
     assert [line.valid for line in fine] == [True, False, True]
 

@@ -54,8 +54,7 @@ def test_noise_and_lost_lines_do_not_move_the_fitted_sweep() -> None:
 @pytest.mark.parametrize(("first", "stop"), [(30, 50), (4, 24), (70, 71), (41, 44)])
 def test_a_gap_does_not_change_the_line_spacing(first: int, stop: int) -> None:
     """A scan that pauses anywhere, for 1 to 20 px, keeps its line spacing of 1 px, and the note names the gap."""
-    sweep = Sweep("s", "fine", "x", 0.0, -42.0, 84)
-    position = np.delete(line_positions(sweep, CAMERA), np.s_[first:stop], axis=0)
+    position = np.delete(line_positions(Sweep("s", "fine", "x", 0.0, -42.0, 84), CAMERA), np.s_[first:stop], axis=0)
     found = fit_sweep(position, CAMERA, name="s", samples=640)
     assert (found.sweep.step, found.sweep.lines) == (1, 84 - stop + first)
     assert found.distance_px == pytest.approx(1, abs=1e-6)
@@ -156,7 +155,6 @@ def test_positions_of_angles_view_along_these_angles() -> None:
 
 def test_angles_beyond_the_mirror_are_reported() -> None:
     """The rim is at 50 deg along the scan and at 35.6 deg across it. Angles beyond it, to 120 deg, become NaN."""
-    angles = np.array([[0, 50.01], [35.6, 0], [35.7, 0], [0, 90], [120, 0]], float)
-    positions, reached = angles_to_positions(angles)
+    positions, reached = angles_to_positions(np.array([[0, 50.01], [35.6, 0], [35.7, 0], [0, 90], [120, 0]], float))
     assert reached.tolist() == [False, True, False, False, False]
     assert np.isnan(positions[~reached]).all()

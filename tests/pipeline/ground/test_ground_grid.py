@@ -44,8 +44,7 @@ def test_mapped_area_is_the_sum_of_pixel_footprints(pose: dict[str, float]):
     """The map pixels of the field, times the ground area of each, equal the sum of exact areas to 0.2 %."""
     grid = map_grid.ground_grid(view(**pose), (300, 260))
     rig = grid.frame.view.pose
-    areal_scale = Proj(grid.frame.crs).get_factors
-    pixel_m2 = grid.geobox.resolution.x**2 / areal_scale(rig.lon_deg, rig.lat_deg).areal_scale
+    pixel_m2 = grid.geobox.resolution.x**2 / Proj(grid.frame.crs).get_factors(rig.lon_deg, rig.lat_deg).areal_scale
     exact = np.nansum(PosedField(grid).pixel_areas_m2(slice(None), slice(None)))
     assert np.isfinite(whole(grid)[..., 0]).sum() * pixel_m2 == pytest.approx(exact, rel=2e-3)
 

@@ -81,8 +81,7 @@ def test_distant_rows_of_a_swath_become_separate_runs() -> None:
     """Two distant rows of one swath become two runs, because the lines between them take longer than a set-up."""
     planner = second_pass(0.5 * FULL_S)
     gain = np.zeros(int(np.prod(GRID.patch_shape)))
-    count = planner.rows.first.shape[1]
-    gain[np.isin(planner.rows.row, [1, count - 2])] = 1.0
+    gain[np.isin(planner.rows.row, [1, planner.rows.first.shape[1] - 2])] = 1.0
     plan = planner.plan(gain)
     assert np.flatnonzero(gain).tolist() == plan.patch_index.tolist()
     assert len({sweep.name.rpartition("-")[0] for sweep in plan.sweeps}) == 2

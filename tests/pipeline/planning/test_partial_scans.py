@@ -50,8 +50,7 @@ def _patchy(rng: np.random.Generator) -> np.ndarray:
 
 def partial_scan(expected_gain: np.ndarray, seconds: float) -> PartialScan | None:
     """Return the runs of a partial scan in a number of seconds, at most one for each sweep."""
-    times = RunTimes.of_scan(ROWS.sweeps, CAMERA, COST, EXPOSURE_MS)
-    return choose_runs(ROWS, expected_gain, times, seconds=seconds)
+    return choose_runs(ROWS, expected_gain, RunTimes.of_scan(ROWS.sweeps, CAMERA, COST, EXPOSURE_MS), seconds=seconds)
 
 
 @pytest.mark.parametrize("along", ["x", "y"])

@@ -8,11 +8,10 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.planning import coverage
 
 CAMERA = LineCamera()
-COST = CostModel()
 
 
 def test_saving_entries_have_a_ratio_unless_full_is_zero():
@@ -49,10 +48,7 @@ def test_savings_are_relative_to_the_full_scan():
     assert [entry.ratio for entry in coverage.capture_savings([], full, CAMERA, grid).values()] == [0, 0]
 
 
-SCORES = st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=30)
-
-
-@given(SCORES, st.data())
+@given(st.lists(st.sampled_from([0.0, 1.0, 2.0, -1.0, np.nan, np.inf, -np.inf]), min_size=1, max_size=30), st.data())
 def test_a_smaller_choice_of_patches_begins_a_larger_one(values: list[float], data: st.DataObject):
     """The best K patches begin the best K + 1 for any scores, NaN included, and no patch occurs twice."""
     large = data.draw(st.integers(0, len(values)))

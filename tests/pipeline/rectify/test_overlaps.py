@@ -79,8 +79,7 @@ def test_narrow_overlaps_are_reported():
 def test_a_coarse_pass_is_registered_in_scene_pixels():
     """Lines 2 px apart of binned samples give corrections in px of the scene, like fine lines."""
     pointing = PointingErrors(offset_px=6, seed=5)
-    scan = uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)
-    sweeps = [replace(sweep, binning=2) for sweep in scan]
+    sweeps = [replace(sweep, binning=2) for sweep in uniform_sweeps(GRID, CAMERA, "x", step=2, overlap_px=84)]
     source = source_of(pointing)
     broad = [BroadSweep.read(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
     found = register_sweeps(broad, CAMERA, prior_px=8, window_px=300)
@@ -139,8 +138,7 @@ def test_saturated_samples_are_left_out(factor: int):
     sweep = Sweep("s", "fine", "x", 0.0, -40.0, 80 // factor, factor, factor)
     source = SimulatedSource(bright, Rig(CAMERA), 0, effects_on("rotation"))
     broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
-    middle = broad.image.shape[0] // 2, broad.image.shape[1] // 2
-    assert np.isnan(broad.image[middle])
+    assert np.isnan(broad.image[broad.image.shape[0] // 2, broad.image.shape[1] // 2])
     assert np.isfinite(broad.image[0]).all()
 
 

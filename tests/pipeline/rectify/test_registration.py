@@ -119,8 +119,7 @@ def windows_of(truth: list[SweepShift], rng: np.random.Generator, noise: float) 
 
 def farthest(found: tuple[SweepShift, ...], wanted: tuple[SweepShift, ...] | list[SweepShift]) -> float:
     """Return the largest difference of any line's shift."""
-    pairs = zip(found, wanted, strict=True)
-    return max(float(np.abs(a.of_lines(LINES) - b.of_lines(LINES)).max()) for a, b in pairs)
+    return max(float(np.abs(a.of_lines(LINES) - b.of_lines(LINES)).max()) for a, b in zip(found, wanted, strict=True))
 
 
 def test_offsets_and_drifts_are_recovered():

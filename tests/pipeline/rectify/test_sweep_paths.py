@@ -62,8 +62,7 @@ class PlaceLines:
 @pytest.mark.parametrize("step", [1, 2])
 def test_later_lines_and_first_pass_lines_become_one_sweep(step: int) -> None:
     """The run has every line of its spacing once, in order, with its own place and score and the mean exposure."""
-    later = lines_between([RUN], FIRST, step=step, exposure_ms=100.0)
-    lines = [PlaceLines(sweep) for sweep in (*later, *FIRST)]
+    lines = [PlaceLines(sweep) for sweep in (*lines_between([RUN], FIRST, step=step, exposure_ms=100.0), *FIRST)]
     placed = interlaced_paths(sweep_paths(lines, CAMERA), CAMERA)
     assert [one.lines.sweep.kind for one in placed] == ["coarse", "fine"]
     run = placed[1].lines

@@ -80,22 +80,18 @@ def in_tiles(
     return values, coverage
 
 
-def partly_lit(lines: Taken) -> Taken:
-    """Return the sweep with realistic references: each band is unlit somewhere, most in one part of the slit."""
-    sample, band = np.mgrid[: CAMERA.samples, : lines.raw.shape[2]]
-    white = lines.references.white.copy()
-    white[(sample + 20 * band) % 60 < 15] = 0
-    white[40:120, 1:] = 0
-    return replace(lines, references=replace(lines.references, white=white))
-
-
 def two_turned(grid: PixelGrid | None) -> list[PlacedSweep]:
     """Return two overlapping sweeps of turned lines with all kinds of faults, one with a partly lit slit."""
-    other = replace(TURNED, name="other", swath_px=-4600.0, start_px=3010.0)
+    sweep = replace(TURNED, name="other", swath_px=-4600.0, start_px=3010.0)
+    other = taken(sweep, seed=1, kind=Cropped, faults=True)
+    sample, band = np.mgrid[: CAMERA.samples, : other.raw.shape[2]]
+    white = other.references.white.copy()  # as real ones: each band is unlit somewhere, most in one part of the slit
+    white[(sample + 20 * band) % 60 < 15] = 0
+    white[40:120, 1:] = 0
     gain = np.array([1.0, 0.9, 1.1], np.float32)
     return [
         place(taken(TURNED, faults=True), CAMERA, grid=grid, gain=gain),
-        place(partly_lit(taken(other, seed=1, kind=Cropped, faults=True)), CAMERA, grid=grid),
+        place(replace(other, references=replace(other.references, white=white)), CAMERA, grid=grid),
     ]
 
 

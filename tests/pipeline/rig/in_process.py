@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass, field
 from itertools import count
+from typing import Any
 
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import FileServer, SurveyRig
@@ -201,6 +202,10 @@ class InProcessRig(Closing):
     def devices(self, rig: SurveyRig, vector_pairs: int = 1500) -> RigDevices:
         """Connect drivers to both devices."""
         return RigDevices(self.mirror(rig, vector_pairs), self.camera(), self.clock)
+
+    def devices_of(self, told: Any, *_: object) -> RigDevices:
+        """Connect drivers with a survey's settings, in place of `flows.tasks.rig_field.open_devices`."""
+        return self.devices(told.rig, told.cost.vector_pairs)
 
     def close(self) -> None:
         """Close the port for files."""

@@ -17,6 +17,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
+from pipeline.rig.emulator.mirror_device import MirrorDevice
+from pipeline.rig.pro_mode import Command
 from pipeline.rig.rig_source import RigSource
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
@@ -38,6 +40,11 @@ def small_source(**changed: Any) -> SimulatedSource:
     values = np.random.default_rng(11).uniform(20, 200, (40, 48, 3))
     scene = raster_from_values(values, CAMERA, name="small", wavelength_nm=np.array([460.0, 550.0, 640.0]))
     return replace(SimulatedSource(scene, Rig(CAMERA), 5, effects_on(*NAMES)), **changed)
+
+
+def set_anything(mirror: MirrorDevice) -> bool:
+    """Return whether any register or vector of the mirror was set."""
+    return any(request.command in (Command.SET_VALUES, Command.SET_VECTOR) for request in mirror.requests)
 
 
 @cache

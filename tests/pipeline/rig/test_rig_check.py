@@ -16,15 +16,12 @@ from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture_paths import capture_prefix
 from pipeline.rig.device_settings import FileServer, SurveyRig
 from pipeline.rig.mirror_controller import MirrorController, MotionLog
-from pipeline.rig.pro_mode import Command
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
 from pipeline.rig.transports import Clock, DeviceGone, DeviceRefused
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.mirror_faults import make_fault
-from tests.pipeline.rig.small_rig import FINE, small_source
-
-SETS = {Command.SET_VALUES, Command.SET_VECTOR}
+from tests.pipeline.rig.small_rig import FINE, set_anything, small_source
 
 
 @contextmanager
@@ -47,11 +44,6 @@ def told(rows: list[CheckRow], verdict: str) -> list[str]:
     return [row.asked for row in rows if row.verdict == verdict]
 
 
-def set_anything(line: InProcessRig) -> bool:
-    """Return whether any register or vector of the mirror was set."""
-    return any(request.command in SETS for request in line.rig.mirror.requests)
-
-
 def test_a_working_mirror_passes_the_check() -> None:
     """The rows are in order, nothing was set, and the port is closed."""
     with rig() as line:
@@ -61,7 +53,7 @@ def test_a_working_mirror_passes_the_check() -> None:
         assert rows[0].came == "MR-E-2, version EMULATOR 1.0, serial EMUL0001"
         assert works(rows, "mirror")
         assert not works(rows, "camera")
-        assert not set_anything(line)
+        assert not set_anything(line.rig.mirror)
         with pytest.raises(DeviceGone, match="closed"):
             line.transport.drain()
 
@@ -99,7 +91,7 @@ def test_mirror_faults_fail_the_check_and_nothing_moves(fault: str, asked: str, 
         assert told(rows, "fail") == [asked]
         assert mend in next(row.mend for row in rows if row.verdict == "fail")
         assert not works(rows, "mirror")
-        assert not set_anything(line)
+        assert not set_anything(line.rig.mirror)
         if asked != "connect":
             assert "move" in told(rows, "warn")
 

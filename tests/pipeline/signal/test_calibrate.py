@@ -33,8 +33,7 @@ def frames(samples: int = 4, bands: int = 3) -> References:
 
 def test_calibrated_values_are_those_worked_out_by_hand() -> None:
     """Dark gives 0, white the white reference, and values between are linear; below dark they are negative."""
-    raw = np.tile(np.array([60, 1060, 310, 10], np.uint16)[None, :, None], (2, 1, 3))
-    values = reflectance(raw, frames())
+    values = reflectance(np.tile(np.array([60, 1060, 310, 10], np.uint16)[None, :, None], (2, 1, 3)), frames())
     assert values.dtype == np.float32
     np.testing.assert_allclose(values[1, :, 0], [0, 2, 0.5, -0.1], atol=1e-6)
 

@@ -147,8 +147,7 @@ def test_one_of_two_bands_suffices() -> None:
 def test_a_run_of_missing_bands_is_restored_within_noise(missing: int) -> None:
     """Neighbouring saturated bands leave smooth directions open; the field's scores show the likely ones."""
     made = field_of(3, bands=60)
-    found = statistics_of(made.values)
-    law = components_of_field(found, np.linspace(400, 1000, 60), false_alarm=0.01, least=4)
+    law = components_of_field(statistics_of(made.values), np.linspace(400, 1000, 60), false_alarm=0.01, least=4)
     assert len(law) > 20
     run = np.s_[20 : 20 + missing]
     valid = np.ones(made.values.shape, np.bool_)
@@ -175,8 +174,7 @@ def test_the_residual_law_follows_shot_noise() -> None:
 def test_few_spectra_give_the_default_residual_law() -> None:
     """With fewer than 8 spectra per component the noise's own variance is expected of all."""
     made = field_of(2)
-    components = find_components(statistics_of(made.values))
-    law = ResidualLaw.learned(made.values[:2, :10].reshape(-1, 40), components)
+    law = ResidualLaw.learned(made.values[:2, :10].reshape(-1, 40), find_components(statistics_of(made.values)))
     assert (law.constant, law.freedom) == (1.0, 36.0)
     assert not law.slope.any()
 
@@ -255,8 +253,7 @@ def test_one_bright_spectrum_marks_only_itself(condensed: tuple) -> None:
 def test_windows_mark_all_of_their_own_spectra() -> None:
     """Blocks of 2 x 2 and lines of 8 in both directions are marked up to the image's corners, and nothing else is."""
     law = ResidualLaw(1.0, np.zeros(0), 200.0)
-    places = (np.s_[0:2, 0:2], np.s_[18:20, 28:30], np.s_[0, :8], np.s_[19, 22:], np.s_[12:, 29], np.s_[5, 9:17])
-    for place in places:
+    for place in (np.s_[0:2, 0:2], np.s_[18:20, 28:30], np.s_[0, :8], np.s_[19, 22:], np.s_[12:, 29], np.s_[5, 9:17]):
         ratio = np.ones((20, 30), np.float32)
         freedom = 200 * ratio[place].size
         ratio[place] = 1.001 * chi2.isf(1e-3 / 4 / 600 / ratio[place].size, freedom) / freedom  # a part is not enough

@@ -170,8 +170,7 @@ def test_up_to_8_bands_keep_all_components(bands: int) -> None:
 
 def test_few_bands_are_stored_in_steps_of_the_camera() -> None:
     """Whole multiples of such a step are exact. A missing band is predicted from the others."""
-    made = field_of(4, bands=3, materials=2)
-    values = np.rint(made.values / 0.01).astype(np.float32) * np.float32(0.01)
+    values = np.rint(field_of(4, bands=3, materials=2).values / 0.01).astype(np.float32) * np.float32(0.01)
     components = bands_alone(statistics_of(values), np.full(3, 0.01))
     np.testing.assert_allclose(restored(scored(values, components), components), values, atol=1e-5)
     holes = values.copy()
@@ -222,8 +221,7 @@ def test_smooth_directions_need_different_wavelengths(wavelength: np.ndarray) ->
 
 def test_lines_without_valid_spectra_have_no_component() -> None:
     """The mean is NaN in every band."""
-    found = statistics_of(np.full((8, 8, 12), np.nan, np.float32), np.zeros((8, 8), np.bool_))
-    components = find_components(found)
+    components = find_components(statistics_of(np.full((8, 8, 12), np.nan, np.float32), np.zeros((8, 8), np.bool_)))
     assert len(components) == 0
     assert np.isnan(components.mean).all()
 

@@ -76,8 +76,7 @@ def _cube(rng: np.random.Generator, kind: str) -> Floats:
 
 def _beside(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
     """Return even light under a sweep, with fields or pixels some px beside it, in every band or in one."""
-    bands = int(rng.choice([1, 3, 12]))
-    values = np.full((*SHAPE, bands), rng.choice([0.0, 0.1, 0.5]))
+    values = np.full((*SHAPE, int(rng.choice([1, 3, 12]))), rng.choice([0.0, 0.1, 0.5]))
     edge = int(np.floor(sweep.start_px + (SHAPE[0] - 1) / 2 - float(np.exp(rng.uniform(np.log(1.5), np.log(40))))))
     some = slice(None) if rng.random() < 0.5 else slice(0, 1)
     if kind == "beside fields":
@@ -90,8 +89,7 @@ def _beside(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
 
 def _line(rng: np.random.Generator, kind: str, sweep: Sweep) -> Floats:
     """Return dark land with one bright stripe across it, which has a dark gap."""
-    bands = int(rng.choice([1, 3, 12]))
-    values = np.full((*SHAPE, bands), rng.uniform(0, 0.2))
+    values = np.full((*SHAPE, int(rng.choice([1, 3, 12]))), rng.uniform(0, 0.2))
     row = int(rng.integers(20, 120))
     high = int(rng.integers(3, 12))
     values[row : row + high] = 1.0

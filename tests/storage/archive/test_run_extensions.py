@@ -213,8 +213,7 @@ def test_a_damaged_manifest_in_the_bucket_is_not_fetched(machine: Machine) -> No
     extend(archive, run_id(archive))
     name = f"runs/{run_id(archive)}/manifest.json"
     archive.objects.write(f"runs/{run_id(archive)}/{'0' * 16}/receipt.json", b"of before, and not cleared away yet")
-    text = archive.objects.read(name) or b""
-    archive.objects.write(name, text.replace(b'"survey": "farm"', b'"survey": "fern"'))
+    archive.objects.write(name, (archive.objects.read(name) or b"").replace(b'"survey": "farm"', b'"survey": "fern"'))
     again = machine(FIRST, create=False)
     assert figure_of(again) == 0.75
     assert any("its seal does not fit" in one for one in problems(again))

@@ -84,10 +84,11 @@ def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
     assert len(set(DEFAULT_COLOURS)) == len(DEFAULT_COLOURS) >= 64
 
 
-MANY = "alfalfa", "corn", "corn_notill", "grass_pasture", "oats", "soybean", "woods", "wheat"
-
-
-@pytest.mark.parametrize("names", [range(24), MANY], ids=["numbers", "words"])
+@pytest.mark.parametrize(
+    "names",
+    [range(24), ("alfalfa", "corn", "corn_notill", "grass_pasture", "oats", "soybean", "woods", "wheat")],
+    ids=["numbers", "words"],
+)
 def test_class_colours_are_distinguishable(names: Iterable[object]) -> None:
     """Colours differ by at least 15 in CIELAB, for class names of words and numbers alike."""
     colours = class_colours({str(name): number for number, name in enumerate(names)})

@@ -17,20 +17,10 @@ from pipeline.simulator.effects.effect import SweepBlock, survey_stream
 from pipeline.simulator.rig_model import Air, Rig
 from tests.pipeline.simulator.made_up_effects import steep_probe
 
-LONG = Sweep("long", "fine", "x", 0.0, -1500.0, 3000)
-
 
 def rig_at(distance_m: float | None, **air: float) -> Rig:
     """Return a rig at this distance from the scene."""
     return Rig(air=Air(distance_m, **air))
-
-
-def drawn(lines: range, seed: int = 0, rig: Rig | None = None) -> np.ndarray:
-    """Return the jitter of lines of the long sweep, (line, 2) [px]."""
-    block = SweepBlock(rig or rig_at(300.0), LONG, lines, np.array([700.0]), (10, 10), seed=seed)
-    jitter = TURBULENCE.aim(block, "jitter")
-    assert jitter.shape == (len(lines), 1, 2)
-    return jitter[:, 0]
 
 
 @pytest.mark.parametrize(("distance", "px"), [(30.0, 0.0365), (300.0, 0.1154)])
@@ -57,7 +47,11 @@ def test_turbulence_matches_the_structure_function():
 
 def test_turbulence_jitter_is_unbiased_and_uncorrelated():
     """The jitter has the stated deviation in both directions, without correlation between them or between lines."""
-    jitter = drawn(range(3000)) / turbulence_px(rig_at(300.0))
+    sweep = Sweep("long", "fine", "x", 0.0, -1500.0, 3000)
+    block = SweepBlock(rig_at(300.0), sweep, range(3000), np.array([700.0]), (10, 10), seed=0)
+    tilt = TURBULENCE.aim(block, "jitter")
+    assert tilt.shape == (3000, 1, 2)
+    jitter = tilt[:, 0] / turbulence_px(rig_at(300.0))
     assert jitter.mean(axis=0) == pytest.approx([0, 0], abs=0.06)
     assert jitter.std(axis=0) == pytest.approx([1, 1], abs=0.05)
     assert np.abs(np.corrcoef(np.column_stack([jitter[:-1], jitter[1:]]).T) - np.eye(4)).max() < 0.06

@@ -18,7 +18,7 @@ from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from tests.pipeline.simulator.made_up_effects import SWEEP, steep_probe
-from tests.pipeline.simulator.pupil_reference import Tile, autocorrelation, distances, random_tile
+from tests.pipeline.simulator.pupil_reference import autocorrelation, distances, random_tile
 from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig()
@@ -113,11 +113,6 @@ def test_bound_covers_every_tilt_of_the_sweeps():
     assert DIFFRACTION.bound(replace(probe, sweeps=(flat,)), RIG).value == pytest.approx(rest, rel=2e-3)
 
 
-def few(tile: Tile) -> Tile:
-    """Return the tile with one sample to compare: the integral over all waves takes seconds each."""
-    return replace(tile, samples=tile.samples[:1])
-
-
 def test_quadrature_over_chords_matches_the_closed_form() -> None:
     """The integrated contrast of a round pupil is Goodman's formula."""
     u, passed = autocorrelation()
@@ -130,4 +125,6 @@ def test_rendered_light_matches_the_integral_over_the_pupil(number: int, focus_m
 
     So is noise that is out of focus, 40 m away with the focus at infinity.
     """
-    assert distances(few(random_tile(number, focus_m))).max() < 0.1
+    tile = random_tile(number, focus_m)
+    one = replace(tile, samples=tile.samples[:1])  # the integral over all waves takes seconds each
+    assert distances(one).max() < 0.1

@@ -58,8 +58,7 @@ def test_bound_of_rotation_covers_the_ends_of_a_line() -> None:
     """The ends of a line of 640 samples lie 320 px times the sine of its rotation off the plan, and are stretched."""
     camera = LineCamera()
     sweep = Sweep("s", "fine", "x", swath_px=1500.0, start_px=800.0, lines=1)
-    scene = image_scene(np.ones((4, 4, 1)), camera, [550.0])
-    why = ROTATION.bound(probe_scene(scene, Rig(), [sweep]), Rig()).why
+    why = ROTATION.bound(probe_scene(image_scene(np.ones((4, 4, 1)), camera, [550.0]), Rig(), [sweep]), Rig()).why
     scan = float(why.split(" px along the scan")[0].split()[-1])
     psi = line_rotation(position_to_direction(line_positions(sweep, camera)))[0]
     assert scan == pytest.approx(320 * abs(np.sin(psi)), rel=0.12)

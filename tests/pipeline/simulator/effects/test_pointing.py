@@ -28,7 +28,7 @@ from pipeline.simulator.effects.pointing import (
 )
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
@@ -98,8 +98,7 @@ def test_hysteresis_depends_on_the_unit_of_the_rig():
 def test_hysteresis_changes_sign_with_the_scan_direction():
     """A scan in the opposite direction has the same field with the other sign; a single position counts as forward."""
     forth = HYSTERESIS.aim(block(), "exact")
-    back = HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact")
-    np.testing.assert_array_equal(back, -forth)
+    np.testing.assert_array_equal(HYSTERESIS.aim(block(sweep=Returning(**vars(HYSTERESIS_SWEEP))), "exact"), -forth)
     alone = block(range(1), sweep=replace(HYSTERESIS_SWEEP, lines=1))
     np.testing.assert_array_equal(HYSTERESIS.aim(alone, "exact"), forth[:1])
     assert np.abs(forth).max() <= 50
@@ -171,17 +170,12 @@ SLOPE = (8.0, 13.0)  # along x and along y [e-/px]
 MOVERS = [STAIRCASE, LAG, JITTER, HYSTERESIS, THERMAL_DRIFT, PARALLAX, WIND]
 
 
-def ramp() -> RasterScene:
-    """Return a scene that rises evenly along x and y, in two bands of which the second is half as bright."""
+def scan_pass(chosen: dict[Any, str], sweep: Sweep = SWATH, lines: range = range(40), **more: Any) -> np.ndarray:
+    """Return the light of some lines of a ramp along x and y, in two bands of which the second is half as bright."""
     y, x = np.mgrid[:161, :161]
     plane = (2000 + SLOPE[0] * (x - 80) + SLOPE[1] * (y - 80)).astype(np.float32)[..., None]
     electrons = np.array([[1.0, 0.5]], np.float32) * np.float32(DEFAULT_EXPOSURE_MS / MIRROR_EFFECTS_CAMERA.exposure_ms)
-    return made_scene(plane, electrons, [500.0, 600.0])
-
-
-def scan_pass(chosen: dict[Any, str], sweep: Sweep = SWATH, lines: range = range(40), **more: Any) -> np.ndarray:
-    """Return the light of some lines of the ramp."""
-    scene = ramp()
+    scene = made_scene(plane, electrons, [500.0, 600.0])
     block = SweepBlock(MIRROR_EFFECTS_RIG, sweep, lines, scene.wavelength_nm, scene.shape, **more)
     return expected_light(scene, block, {**chosen, **PLAIN})
 

@@ -32,15 +32,10 @@ CORNER = Sweep("corner", "fine", "x", swath_px=960.0, start_px=-1279.0, lines=25
 MIDDLE = Sweep("middle", "fine", "y", swath_px=0.0, start_px=-1279.0, lines=2560)
 
 
-def grain(bands: int = 3) -> RasterScene:
-    """Return a scene of independent pixels, the roughest possible, as large as needed."""
-    values = np.random.default_rng(0).uniform(0.05, 1, (120, 160, bands))
-    return image_scene(values, CAMERA, np.linspace(400, 1000, bands))
-
-
 def error(sweep: Sweep, line: int, variant: str, blurs: dict[Any, str]) -> float:
     """Return the greatest difference from the rays, over the light's standard deviation."""
-    scene = grain()
+    grain = np.random.default_rng(0).uniform(0.05, 1, (120, 160, 3))  # independent pixels, the roughest possible
+    scene = image_scene(grain, CAMERA, np.linspace(400, 1000, 3))
     # The scene moves to the line: the shape of a block sets the place of the scene's first pixel.
     block = SweepBlock(RIG, sweep, range(line, line + 1), scene.wavelength_nm, scene.shape)
     moved = Moved.to(block, scene)
