@@ -144,8 +144,8 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
         _heat_key(heat, (f"{low:.0%}", f"{high:.0%}"))
         mean = float(np.nanmean(data.score)) if len(data.patch_index) else 0.0
         again = "; dashed: captured again" if data.blocks else ""
-        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); {mean:.0%} of their pixels corrected{again}"
-        return _caption(axes, "2  Read by the full network, and corrected", words)
+        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); it changed {mean:.0%} of their pixels{again}"
+        return _caption(axes, "2  Read by the full network", words)
     _heat_key(heat, ("low", "high"))
     words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"
     if data.scan:

@@ -98,7 +98,7 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
     taken = receipt.get("scans", {}).get("taken")
     if taken and not is_foreign(receipt) and format_prediction(taken["expected_miou"], taken.get("expected_spread")):
         lost = receipt["scans"]["reference"]["expected_miou"] - taken["expected_miou"]
-        scan += f"; this scan is expected to lose {format_points(max(lost, 0.0))} points to it"
+        scan += f"; expected loss of this scan: {format_points(max(lost, 0.0))} points of mIoU"
     return f"{words} A uniform scan with nearly the best score takes {scan}."
 
 

@@ -155,7 +155,7 @@ def test_patches_beyond_max_age_come_first(visited: Path, visits: Any, survey_pn
     included = f"{scan_pass['due'] - scan_pass['due_left']} of {scan_pass['due']} included"
     assert f"patches beyond --max-age: {included}" in notes
     page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
-    assert f"due left {scan_pass['due_left']}" in page
+    assert f"{scan_pass['due_left']} patches beyond --max-age did not fit" in page
 
 
 def test_patches_without_data_are_never_due(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
     assert memory["agreement"] > 0.9  # it is the same picture
     page = (later.folder / "report.html").read_text(encoding="utf-8")
     assert first.folder.name in page
-    assert re.search("3.0 days earlier; .*the same class at [0-9.]+ %", page)
+    assert re.search("(?s)3.0 days earlier; .*the same class at [0-9.]+ %", page)
     assert "Captured and differing" in page
     store = out / later.receipt["products"]["class_probabilities"]
     manifest = json.loads((store.parent / "manifest.json").read_text())
