@@ -357,7 +357,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
     "days": format_days,
     "hectares": format_area,
-    "lines": lambda lines: f"lines {lines} (sweep:first-stop)" if isinstance(lines, str) else f"lines {lines}",
+    "lines": lambda lines: f"lines {_format_value(lines)}{' (sweep:first-stop)' * isinstance(lines, str)}",
     "patches_touched": lambda fraction: f"{format_percent(fraction)} of the patches",
     "expected_wrong": lambda fraction: f"the prior map expected {format_percent(fraction)} of its pixels to be wrong",
     "due_left": lambda count: f"{format_count(count)} patches beyond --max-age did not fit the time",
