@@ -131,10 +131,10 @@ def choose_extent(
         due_left=int(np.count_nonzero(extent_gains.due & ~captured)),
     )
     chosen = replace(layout, extent=format_extent(extent.runs), step=step, exposure_ms=exposure_ms)
-    due = f"; patches beyond --max-age: {choice.due - choice.due_left} of {choice.due} included" if choice.due else ""
+    aged = f"; patches beyond --max-age: {choice.due - choice.due_left} of {choice.due} included" if choice.due else ""
     sentence = (
         f"captures the lines of highest expected gain, {format_scan(step, exposure_ms)}, in {choice.seconds:.1f} s; by"
-        f" its own probabilities, the prior map is wrong at {format_percent(wrong)} of its pixels{due}"
+        f" its own probabilities, the prior map is wrong at {format_percent(wrong)} of its pixels{aged}"
     )
     return chosen, choice, sentence
 
