@@ -106,8 +106,8 @@ def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
         grey = np.repeat((0.25 + 0.6 * grey_of(data.rectified))[..., None], 3, axis=-1)
         shown = np.where(changed[..., None], class_rgb(data.class_map, data.class_colours), grey)
         _show(axes, data, shown.astype(np.float32), interpolation="nearest")
-        words = f"{np.count_nonzero(data.was != UNLABELLED)} px captured now differ from {data.days:.3g} days before"
-        return _caption(axes, "1  Differing", words)
+        words = f"{np.count_nonzero(data.was != UNLABELLED)} px have another class than {data.days:.3g} days before"
+        return _caption(axes, "1  Captured, and differing from the prior map", words)
     _show(axes, data, develop(data.rectified, data.caption))
     return _caption(axes, "1  Raster" if data.raster else "1  Rectified", data.caption)
 
@@ -143,13 +143,13 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     if data.changed:
         _heat_key(heat, (f"{low:.0%}", f"{high:.0%}"))
         mean = float(np.nanmean(data.score)) if len(data.patch_index) else 0.0
-        of_pixels = "changed class; dashed: captured again" if data.blocks else "of their pixels changed class"
-        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); {mean:.0%} {of_pixels}"
-        return _caption(axes, "2  Segmented at full resolution, and changes", words)
+        again = "; dashed: captured again" if data.blocks else ""
+        words = f"{len(data.patch_index)} patches by {data.policy} (cyan); it changed {mean:.0%} of their pixels{again}"
+        return _caption(axes, "2  Read by the full network", words)
     _heat_key(heat, ("low", "high"))
     words = f"{len(data.patch_index)} patches chosen by {data.policy} (cyan)"
     if data.scan:
-        return _caption(axes, "2  Segmented at full resolution", words)
+        return _caption(axes, "2  Read by the full network", words)
     return _caption(axes, "2  Captured again", f"{words}; captured in detail (dashed)")
 
 

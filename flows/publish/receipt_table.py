@@ -35,7 +35,7 @@ COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "multiply_adds": ("multiply-adds", format_count),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
-    "patches": ("patches at full resolution", format_count),
+    "patches": ("patches read in full", format_count),
 }
 BYTE_LABELS = {
     "kept": "bytes kept",
@@ -45,8 +45,10 @@ BYTE_LABELS = {
 }
 LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
 LEAST_REFERENCE = 100_000  # bytes; with a smaller reference, rows are not in MB
+SMALL_RUN = 2_000_000  # bytes kept, most of which do not depend on the field
 MOST_NAMED = 4  # changes of class in a row
 LEADING_CLASSES = 3  # of a plot
+LEAST_TURN_DEG = 0.05  # of a prior map; less is not shown
 FOREIGN = 0.2  # fraction of unknown pixels above which the weights do not fit the field
 FOREIGN_WORDS = (
     "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
@@ -75,11 +77,15 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def format_reference(receipt: Mapping[str, Any]) -> str:
-    """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record."""
-    if (capture := receipt["savings"].get("capture_s")) is None:
-        return "Reference: every pixel of the raster, segmented at full resolution."
-    usual = f"{receipt['settings']['camera']['exposure_ms']:g} ms"
-    words = f"Reference: every line at {usual}, kept as captured, every patch segmented at full resolution."
+    """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record.
+
+    With the points that the scan taken is expected to lose, and the reason why a small field keeps many bytes.
+    """
+    capture = receipt["savings"].get("capture_s", {})
+    lines = f"line at {receipt['settings']['camera']['exposure_ms']:g} ms, stored as captured" if capture else "pixel"
+    words = f"Reference: every {lines}, read by the full network."
+    if receipt["data_bytes"]["reference"] < receipt["data_bytes"]["kept"] < SMALL_RUN:
+        words += " Bytes kept exceed it: report, pictures and records take 0.5 MB or more, however small the field is."
     names = [stage["name"] for stage in receipt["stages"]]
     if "capture_fine" in names:
         between = receipt["stages"][names.index("capture_coarse") + 1 : names.index("capture_fine")]
@@ -89,7 +95,11 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
     if capture.get("uniform") is None:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
-    return f"{words} The cheapest uniform scan with nearly the best score takes {scan}."
+    taken = receipt.get("scans", {}).get("taken")
+    if taken and not is_foreign(receipt) and format_prediction(taken["expected_miou"], taken.get("expected_spread")):
+        lost = receipt["scans"]["reference"]["expected_miou"] - taken["expected_miou"]
+        scan += f"; expected loss of this scan: {format_points(max(lost, 0.0))} points of mIoU"
+    return f"{words} A uniform scan with nearly the best score takes {scan}."
 
 
 def format_score(receipt: Mapping[str, Any]) -> str:
@@ -97,12 +107,11 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     if (accuracy := shown_accuracy(receipt)) is not None:
         scene = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
         right = format_points(accuracy.get("overall_accuracy"))
-        score = (
-            f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)."
-        )
+        score = f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)"
         plan = receipt.get("plan", {})
         alone = accuracy["none"]["miou"] is None or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
-        return f"{score} {format_worst_class(accuracy, alone=alone)}".rstrip()
+        full = "" if alone else f"; the full network on every patch gives {format_points(accuracy['all']['miou'])}"
+        return f"{score}{full}. {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
         return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
     later = " The accuracy against the labels is added later." if is_pending(receipt) else ""
@@ -150,7 +159,8 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     console.print(escape(format_reference(receipt)))
     told = {part: receipt[part] for part in ("signal", "lines", "prior_map") if receipt.get(part)}
     for name, words in finding_rows(told):
-        console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
+        if verbose or name != COMPARISON:
+            console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
         return
     stages = [
@@ -225,7 +235,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """
     if is_foreign(found) and "scans" in found:
         found = {**found, "scans": {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}}
-    rows = [(label, _figures(found.get(part), names)) for part, (label, names) in _SHOWN.items()]
+    rows = [(label, _figures(found.get(part), names)) for label, (part, names) in _SHOWN.items()]
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping):
             rows.append((f"pointing, {name}", _figures(one, _OF_POINTING)))
@@ -239,7 +249,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _figures(found: Mapping[str, Any] | None, names: Sequence[str]) -> str:
     """Return the named figures of a part; None, most zeros and what is empty are left out."""
-    told = [(name, found[name]) for name in names if found and (found.get(name) or (name, found.get(name)) == ZERO)]
+    told = [(name, found[name]) for name in names if found and (found.get(name) or (name, found.get(name)) in ZEROS)]
     return "; ".join(words for name, value in told if (words := format_figure(name, value)))
 
 
@@ -247,8 +257,6 @@ def format_figure(name: str, value: Any) -> str:
     """Return a figure with its label, both by the name that it has in a receipt."""
     if name in _FORMATS:
         return _FORMATS[name](value)
-    if name in _VALUES:
-        return f"{spaced(name)} {_VALUES[name](value)}"
     label, _, unit = name.rpartition("_")
     if unit in _UNITS:
         return f"{spaced(label)} {_UNITS[unit](value)}"
@@ -317,29 +325,25 @@ def _scan(scan: Mapping[str, Any]) -> str:
     return f"{words}, expected mIoU {predicted}" if predicted else words
 
 
-# parts of a receipt: their label, and the figures that are shown, in order
-ZERO = ("differing_px", 0)  # shown although it is 0: the expected number stands beside it
+# rows of the findings: the part of the receipt, and its figures that are shown, in order
+COMPARISON = "comparison"
+ZEROS = (("differing_px", 0), ("changed_px", 0))  # shown although they are 0: the expected number stands beside them
 _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
     "plan": ("plan", ("reason", "lines")),
     "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
     "signal": ("signal", ("saturated",)),
     "pixels": ("pixels", ("px_no_reading", "map_without_a_class")),
-    "extent": ("captured", ("lines", "patches_touched", "expected_wrong", "due_left")),
-    "kept": ("at full resolution", ("patches", "multiply_adds")),
-    "prior_map": (
-        "prior map",
-        (
-            *("run", "days", "shift_px", "turned_deg", "put_aside", "agreement"),
-            *("compared_px", "differing_px", "expected_differing_px", "changed_px"),
-        ),
-    ),
+    "captured": ("extent", ("patches_touched", "lines", "expected_wrong", "due_left")),
+    "full network": ("kept", ("patches", "multiply_adds")),
+    "prior map": ("prior_map", ("run", "days", "shift_px", "turned_deg", "put_aside", "changed_px", "changes")),
+    COMPARISON: ("prior_map", ("agreement", "compared_px", "differing_px", "expected_differing_px")),
     "unknown": ("unknown", ("fraction", "rate")),
-    "expected": ("expected mIoU", ("miou", "error", "not_predicted")),
-    "scans": ("uniform scans", ("taken", "best_in_time", "reference")),
-    "areas": ("classes", ("ha",)),
+    "expected mIoU": ("expected", ("miou", "error", "not_predicted")),
+    "uniform scans": ("scans", ("taken", "best_in_time", "reference")),
+    "classes": ("areas", ("ha",)),
     "zones": ("zones", ("kept_px", "kept_m2", "no_go_px")),
-    "ground": ("on the ground", ("crs", "resolution_m", "changes_ha", "older_ha")),
+    "on the ground": ("ground", ("crs", "resolution_m", "changes_ha", "older_ha")),
 }
 _OF_POINTING = ("sweeps", "residual_rms_px", "not_found", "too_narrow", "partly_seen")
 _UNITS: Mapping[str, Callable[[Any], str]] = {
@@ -353,10 +357,30 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
     "days": format_days,
     "hectares": format_area,
-    "reference": lambda scan: f"cheapest near the best {_scan(scan)}",
+    "lines": lambda lines: f"lines {_format_value(lines)}{' (sweep:first-stop)' * isinstance(lines, str)}",
+    "patches_touched": lambda fraction: f"{format_percent(fraction)} of the patches",
+    "expected_wrong": lambda fraction: f"the prior map expected {format_percent(fraction)} of its pixels to be wrong",
+    "due_left": lambda count: f"{format_count(count)} patches beyond --max-age did not fit the time",
+    "taken": lambda scan: f"this one: {_scan(scan)}",
+    "best_in_time": lambda scan: f"best in the same time: {_scan(scan)}",
+    "reference": lambda scan: f"cheapest near the best: {_scan(scan)}",
     "shift_px": lambda px: f"shifted by {math.hypot(*px):.0f} px" if any(px) else "",
+    "turned_deg": lambda angle: f"turned by {angle:.3g} degrees" if abs(angle) >= LEAST_TURN_DEG else "",
     "put_aside": lambda value: f"not used: {value}",
-    "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of full resolution",
+    "changed_px": lambda px: f"{format_count(px)} px changed beyond errors of both maps",
+    "changes": lambda pairs: ", ".join(
+        f"{spaced(old)} to {spaced(new)} {format_count(px)} px" for px, _, old, new in pairs[:MOST_NAMED]
+    ),
+    "agreement": lambda fraction: f"this scan alone gives the same class at {format_percent(fraction)} of its pixels",
+    "compared_px": lambda px: f"both maps are confident at {format_count(px)} px",
+    "differing_px": lambda px: f"of these, {format_count(px)} px differ",
+    "expected_differing_px": lambda px: f"errors alone would make {format_count(px)} px differ",
+    "fraction": lambda fraction: f"{format_percent(fraction)} of the pixels are unlike the training data",
+    "rate": lambda rate: f"{format_percent(rate)} are usual on a field that the weights know",
+    "miou": lambda miou: f"{format_points(miou)} of 100, estimated from the map's own probabilities",
+    "error": lambda error: f"standard deviation {format_points(error)}",
+    "patches": lambda count: f"{format_count(count)} patches read in full",
+    "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of those for all",
     "ha": lambda areas: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area),
     "changes_ha": _changes,
     "older_ha": lambda areas: ", ".join(
@@ -370,9 +394,4 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "px_no_reading": lambda px: f"{format_count(px)} px with values out of the range of the weights",
     "map_without_a_class": lambda px: f"{format_count(px)} px without a class",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
-}
-_VALUES: Mapping[str, Callable[[Any], str]] = {
-    **dict.fromkeys(("fraction", "patches_touched", "rate", "agreement", "expected_wrong"), format_percent),
-    **dict.fromkeys(("miou", "error"), format_points),
-    **dict.fromkeys(("taken", "best_in_time"), _scan),
 }

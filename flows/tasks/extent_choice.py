@@ -47,15 +47,6 @@ class ExtentChoice:
     due: int  # patches that are too old
     due_left: int  # of these, patches without time
 
-    @property
-    def sentence(self) -> str:
-        """Return the choice in a sentence."""
-        due = f"; patches beyond --max-age: {self.due - self.due_left} of {self.due} included" if self.due else ""
-        return (
-            f"captures the lines of highest expected gain in {self.seconds:.1f} s; the prior map's expected error is"
-            f" {format_percent(self.expected_wrong)}{due}"
-        )
-
 
 @dataclass(frozen=True)
 class ExtentGains:
@@ -135,12 +126,17 @@ def choose_extent(
     choice = ExtentChoice(
         seconds=extent.seconds,
         expected_gain=float(extent_gains.gains(step, exposure_ms)[captured].sum()),
-        expected_wrong=expected_errors.expected_wrong(),
+        expected_wrong=wrong,
         due=int(np.count_nonzero(extent_gains.due)),
         due_left=int(np.count_nonzero(extent_gains.due & ~captured)),
     )
     chosen = replace(layout, extent=format_extent(extent.runs), step=step, exposure_ms=exposure_ms)
-    return chosen, choice, f"{choice.sentence} ({format_scan(step, exposure_ms)})"
+    aged = f"; patches beyond --max-age: {choice.due - choice.due_left} of {choice.due} included" if choice.due else ""
+    sentence = (
+        f"captures the lines of highest expected gain, {format_scan(step, exposure_ms)}, in {choice.seconds:.1f} s; by"
+        f" its own probabilities, the prior map is wrong at {format_percent(wrong)} of its pixels{aged}"
+    )
+    return chosen, choice, sentence
 
 
 def _best_extent(layout: PassLayout, extent_gains: ExtentGains, seconds: float) -> tuple[int, float, PartialScan]:

@@ -10,7 +10,7 @@ from storage.arrays.class_maps import unknown_name
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
 NOT_JUDGED: Mapping[str, Any] = {"miou": None, "per_class_iou": {}}  # of a map that was not drawn
-MAPS = {"this survey": None, "none": "none", "all": "all"}  # name: key in a receipt's accuracy
+MAPS = {"this survey": None, "small network": "none", "full network": "all"}  # name: key in a receipt's accuracy
 
 
 def format_prediction(miou: float | None, error: float | None) -> str:
@@ -43,8 +43,8 @@ def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> s
     words = f"Its worst class is {spaced(worst)} with {format_points(known[worst])}"
     if alone:
         return f"{words}."
-    full = "" if every.get(worst) is None else f", a full reading {format_points(every[worst])}"
-    return f"{words}: the overview alone gives {format_points(none.get(worst))}{full}."
+    full = "" if every.get(worst) is None else f", the full network on every patch {format_points(every[worst])}"
+    return f"{words}: the small network alone gives {format_points(none.get(worst))}{full}."
 
 
 def format_false_classes(accuracy: Mapping[str, Any]) -> str:

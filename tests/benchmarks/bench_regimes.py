@@ -197,8 +197,8 @@ def draw(measured: Sequence[Cell], picture: Path) -> None:
     """Draw the gain over the best uniform scan for each survey, light, seconds, and fraction of interest."""
     ways = {PLANNER: "planner", "always": "zoomed", "ideal": "known place"}
     figure = Figure((10, 3), dpi=150, layout="constrained")
-    shares, lights = ([str(Fraction(one)) for one in each] for each in (SHARES, LIGHTS))
-    budgets = [f"{light}, {exposure_ms:g} ms" for light, exposure_ms in itertools.product(lights, EXPOSURES_MS)]
+    shares = [str(Fraction(one)) for one in SHARES]
+    budgets = list(dict.fromkeys(f"light {Fraction(cell.light)}, {cell.seconds:.0f} s" for cell in measured))
     panels = figure.subplots(1, len(ways), sharey=True)
     for axes, (way, name) in zip(panels, ways.items(), strict=True):
         gains = [cell.gain(way) for cell in measured]  # by light, seconds, then share
@@ -206,12 +206,12 @@ def draw(measured: Sequence[Cell], picture: Path) -> None:
         axes.set_xticks(range(len(shares)), shares)
         axes.set_yticks(range(len(budgets)), budgets)
         axes.set_title(name)
-        axes.set_xlabel("share of interest")
+        axes.set_xlabel("interesting fraction of the field")
         for place, gain in enumerate(gains):
             y, x = divmod(place, len(SHARES))
             axes.text(x, y, f"{gain:+.1f}", ha="center", va="center", color="white" if abs(gain) > 3 else "black")
-    panels[0].set_ylabel("light; ms over the light")
-    figure.colorbar(image, ax=panels, label="points over uniform", shrink=0.7)
+    panels[0].set_ylabel("light of a clear sky, capture time")
+    figure.colorbar(image, ax=panels, label="mIoU over the best\nuniform scan [points]", shrink=0.7)
     figure.savefig(picture)
 
 

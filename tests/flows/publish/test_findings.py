@@ -73,8 +73,8 @@ def test_a_uniform_scan_has_the_expected_score_of_its_map(survey_png: Survey, we
     assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
     assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)
-    words = f"miou {100 * told.miou:.1f}; error {100 * told.error:.1f}"
-    assert words in dict(finding_rows(receipt))["expected mIoU"]
+    words = f"{100 * told.miou:.1f} of 100, .*; standard deviation {100 * told.error:.1f}"
+    assert re.fullmatch(words, dict(finding_rows(receipt))["expected mIoU"])
 
 
 def test_an_uncertain_expected_score_is_left_out(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
@@ -100,16 +100,21 @@ def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unknown: floa
     """It is left out if scenes differ too much, or if the weights do not know the field."""
     scan = {"step": 1, "exposure_ms": 25.0, "seconds": 9.0, "expected_miou": 0.927, "expected_spread": spread}
     found = {"scans": {"taken": scan, "reference": scan}, "unknown": {"pixels": 1, "fraction": unknown, "rate": 0.01}}
-    assert re.search(f"cheapest near the best {words}", dict(finding_rows(found))["uniform scans"])
+    assert re.search(f"cheapest near the best: {words}", dict(finding_rows(found))["uniform scans"])
 
 
 def test_changes_from_a_prior_map_exceed_the_expected_difference() -> None:
     """Two maps of unchanged ground differ in some pixels, and such a number is no change."""
     memory = {"run": "r", "days": 3.0, "differing_px": 950, "expected_differing_px": 810, "changed_px": 0}
-    words = "r; 3.0 days earlier; differing 950 px; expected differing 810 px"
-    assert dict(finding_rows({"prior_map": memory}))["prior map"] == words
-    assert dict(finding_rows({"prior_map": memory | {"changed_px": 700}}))["prior map"] == f"{words}; changed 700 px"
-    assert dict(finding_rows({"prior_map": memory | {"differing_px": 0}}))["prior map"] == words.replace("950", "0")
+    words = {
+        "prior map": "r; 3.0 days earlier; 0 px changed beyond errors of both maps",
+        "comparison": "of these, 950 px differ; errors alone would make 810 px differ",
+    }
+    assert dict(finding_rows({"prior_map": memory})) == words
+    changes = {"changed_px": 700, "changes": [[600, 650, "soil", "bare_weed"], [100, 120, "soil", "maize"]]}
+    changed = dict(finding_rows({"prior_map": memory | changes}))["prior map"]
+    assert changed == words["prior map"].replace("0 px", "700 px") + "; soil to bare weed 600 px, soil to maize 100 px"
+    assert "these, 0 px differ" in dict(finding_rows({"prior_map": memory | {"differing_px": 0}}))["comparison"]
 
 
 @pytest.mark.parametrize(

@@ -137,7 +137,7 @@ def test_a_later_visit_shows_the_changes(monkeypatch: pytest.MonkeyPatch, tmp_pa
     was[5:7, 10:20] = 1
     now = np.where(was == 255, data.class_map, 0).astype(np.uint8)
     (tmp_path / "picture.png").write_bytes(draw_quicklook(replace(data, was=was, days=7.0, class_map=now)))
-    assert ("1  Differing", "20 px captured now differ from 7 days before") in words
+    assert ("1  Captured, and differing from the prior map", "20 px have another class than 7 days before") in words
     changed = shown.call_args_list[0].args[2]
     assert (changed[was != 255] == np.float32(data.class_colours[0] / 255)).all()
     assert np.ptp(changed[was == 255], axis=-1).max() == 0

@@ -134,9 +134,9 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
     for why in (None, "turned"):
         receipt["prior_map"] = {"put_aside": why}
         text = render_report(receipt, b"")
-        told = [words in text for words in ("overview alone", "by random", "recovered", ">full resolution every")]
+        told = [words in text for words in (">small network", "at random", "recovered", ">full network on every")]
         assert told == 4 * [why is not None]
-        assert ("the overview alone gives" in format_score(receipt)) == (why is not None)
+        assert ("the small network alone gives" in format_score(receipt)) == (why is not None)
 
 
 def test_a_judged_map_needs_an_accuracy():
@@ -195,9 +195,9 @@ def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):
 def test_headline_is_one_paragraph_with_the_figures():
     """It has score, worst class, capture time and fraction captured again; without labels it has no score."""
     assert headline(make_receipt(), 0.23) == (
-        "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct). Its worst class is bare weed with 60.0: the"
-        " overview alone gives 20.0, a full reading 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured"
-        " again: 23 % of the field."
+        "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct); the full network on every patch gives 87.5."
+        " Its worst class is bare weed with 60.0: the small network alone gives 20.0, the full network on every patch"
+        " 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured again: 23 % of the field."
     )
     assert "labels (" not in headline(make_receipt(labels=False))
 
@@ -256,6 +256,8 @@ def test_the_cheapest_good_scan_is_named():
     receipt["savings"]["capture_s"] |= {"uniform": 40.0, "uniform_scan": "every line, 17 ms"}
     told = " ".join(printed(receipt).split())
     assert "uniform scan with nearly the best score takes 40 s (every line, 17 ms)." in told
+    receipt["scans"] = {name: {"expected_miou": miou} for name, miou in (("taken", 0.92), ("reference", 0.928))}
+    assert format_reference(receipt).endswith("17 ms); expected loss of this scan: 0.8 points of mIoU.")
 
 
 def test_a_report_begins_with_map_savings_and_score():
@@ -334,6 +336,6 @@ def test_the_time_between_passes_is_reported(scored_s: float | None, words: str)
     """It is the sum of the stages between them, and left out if one of them was cached."""
     times = {"capture_coarse": 9.0, "rectify": 0.5, "score": scored_s, "capture_fine": 9.0}
     stages = [{"name": name, "wall_s": seconds} for name, seconds in times.items()]
-    receipt = {"savings": {"capture_s": {}}, "settings": {"camera": {"exposure_ms": 100}}, "stages": stages}
+    receipt = {**make_receipt(), "stages": stages}
     assert words in format_reference(receipt)
     assert ("The decision" in format_reference(receipt)) == bool(words)

@@ -83,13 +83,13 @@ def test_receipts_give_score_worst_class_and_false_classes():
     """The worst class is one of the labels; each map with a false class is listed with its pixels."""
     assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
-    words = "Its worst class is bare weed with 60.0: the overview alone gives 20.0, a full reading 80.0."
-    assert format_worst_class(accuracy) == words
+    words = "bare weed with 60.0: the small network alone gives 20.0, the full network on every patch 80.0."
+    assert format_worst_class(accuracy) == f"Its worst class is {words}"
     accuracy["per_class_iou"] = {"wheat": None}
     assert format_worst_class(accuracy) == ""
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
     accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
-    words = "Shown although the truth has none: this survey wheat 2 px; none wheat 30 px, bare track 1 px."
+    words = "Shown although the truth has none: this survey wheat 2 px; small network wheat 30 px, bare track 1 px."
     assert format_false_classes(accuracy) == words
     accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
     assert format_false_classes(accuracy) == ""

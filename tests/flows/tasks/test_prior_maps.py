@@ -94,7 +94,7 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
     assert memory["agreement"] > 0.9  # it is the same picture
     page = (later.folder / "report.html").read_text(encoding="utf-8")
     assert first.folder.name in page
-    assert re.search("3.0 days earlier; .*agreement [0-9.]+ %", page)
+    assert re.search("(?s)3.0 days earlier; .*the same class at [0-9.]+ %", page)
     assert "Captured and differing" in page
     store = out / later.receipt["products"]["class_probabilities"]
     manifest = json.loads((store.parent / "manifest.json").read_text())
@@ -300,7 +300,7 @@ def test_a_rig_turned_by_four_degrees_is_detected(survey_png: Survey, tmp_path: 
     words, later = words_of(tmp_path / "a", survey_png, **now)
     assert later.receipt["prior_map"]["put_aside"] == "turned"
     assert abs(later.receipt["prior_map"]["turned_deg"]) == pytest.approx(4.0, abs=0.3)
-    assert re.search("turned -?(3.9|4|4.0)[0-9]* degrees; not used: turned", words)
+    assert re.search("turned by -?(3.9|4|4.0)[0-9]* degrees; not used: turned", words)
 
 
 def test_finding_a_prior_map_reads_the_newest_runs(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:

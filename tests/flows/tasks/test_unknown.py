@@ -136,7 +136,7 @@ def test_an_entirely_unknown_map_names_the_remedy(survey_png: Survey, judging: M
     assert receipt["unknown"]["fraction"] == 1
     assert receipt["accuracy"]["miou"] == 0
     words = dict(finding_rows(receipt))
-    assert "fraction 100 %" in words["unknown"]
+    assert "100 % of the pixels" in words["unknown"]
     assert "These weights do not know this field: train" in words["weights"]
     assert "--unknown off" in (published.folder / "report.html").read_text(encoding="utf-8")
     assert json.loads((published.folder / "receipt.json").read_text())["unknown"]["pixels"] == 96 * 128
