@@ -20,8 +20,8 @@ from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.publish.findings import field_figures
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
-from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.settings.values import KEEP_SIGNAL
+from flows.settings.survey_settings import ALWAYS, BUILT_IN_SCENES, Settings
+from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
 from flows.tasks.capture_plan import as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
@@ -32,6 +32,7 @@ from flows.terminal.figures import DASH, counted, format_bytes, format_count, fo
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out, table
 from pipeline.errors import IncompleteStoreError, PipelineError
+from pipeline.geometry.scan import exposing
 from pipeline.lazy import deferred
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
@@ -153,6 +154,13 @@ def plan_content(settings: Settings) -> dict[str, Any]:
             with suppress(PipelineError, OSError):  # the row of the stage that reads it has the error
                 fine = load_plan(attention)
         figures = field_figures(run, fine)
+        zoomed = None if run.plan.plain else run
+        if run.plan.plain and run.scans.two_passes is not None:  # which the planner considered
+            zoomed = open_run(replace(settings, zoom=ALWAYS), planning=True, archive=archive)
+    estimate = estimate_survey(run, fine)
+    whole = replace(run.settings, extent=EXTENT_WHOLE)
+    uniform = replace(run, settings=whole, plan=replace(run.plan, plain=True), extent=None)
+    work = uniform.work_done(uniform.likely_patches).total  # of each uniform scan
     content = {
         "archive": settings.out,
         "stages": [asdict(row) for row in planner.rows],
@@ -160,12 +168,20 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "refused": run.refused,  # why this machine would refuse the survey
         "notes": list(run.notes),
         "scans": {
-            "taken": as_figures(run.scans.chosen),
-            "reference": as_figures(run.scans.reference),
-            "candidates": [as_figures(one) for one in frontier(run.scans.offered)],
+            "taken": as_figures(run.scans.chosen, multiply_adds=work),
+            "reference": as_figures(run.scans.reference, multiply_adds=work),
+            "candidates": [as_figures(one, multiply_adds=work) for one in frontier(run.scans.offered)],
+            "two_passes": None
+            if zoomed is None
+            else {
+                "taken": zoomed is run,
+                "step": zoomed.plan.coarse[0].step,
+                "exposure_ms": exposing(run.camera, zoomed.plan.coarse[0]).exposure_ms,
+                **(estimate if zoomed is run else estimate_survey(zoomed, None)),
+            },
         },
         "field": figures,
-        "estimate": {name: asdict(one) for name, one in estimate_survey(run, fine).items()},
+        "estimate": estimate,
     }
     if run.plan.plain and run.chooses:  # expected, of a uniform scan that is segmented in part
         content["kept"] = run.reading_figures(run.likely_patches)
@@ -188,7 +204,10 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
     console.print(escape(f"field: {'; '.join(told)}"), soft_wrap=True)
     if content["to_make"]:
         console.print(f"{content['to_make']} stages to make")
-        console.print(estimate_table(content["estimate"]))
+        made = content["estimate"].items()
+        rows = [[LABELS[name][0], format_estimate(name, one), one["known_from"]] for name, one in made]
+        title = "Estimates: nothing of this has run"
+        console.print(table(("", "about", "from"), rows, left=3, title=title, whole=("", "about")))
     else:
         console.print("everything is stored: it would be published")
     if content["scans"]["candidates"]:
@@ -200,25 +219,31 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
 
 
 def scan_table(scans: Mapping[str, Any]) -> Table:
-    """Return the best uniform scans of other time budgets as a table: seconds, raw bytes and expected score."""
+    """Return two passes and the best uniform scans of other time budgets: seconds, bytes, multiply-adds and score."""
     named = {"this survey": scans["taken"], "cheapest near the best": scans["reference"]}
     every = scans["candidates"][:: math.ceil(len(scans["candidates"]) / MOST_SCANS)]
-    rows = {one["seconds"]: one for one in (*every, *named.values()) if one is not None}
-    cells = [
-        [
+    rows = {
+        one["seconds"]: [
             format_scan(one["step"], one["exposure_ms"]),
             ", ".join(name for name, marked in named.items() if marked == one),
-            format_seconds(seconds),
+            format_seconds(one["seconds"]),
             format_bytes(one["bytes_raw"]),
+            format_count(one["multiply_adds"]),
             format_prediction(one["expected_miou"], one["expected_spread"]) or DASH,
         ]
-        for seconds, one in sorted(rows.items())
-    ]
-    columns = ("uniform scan", "", "capture time", "bytes captured", "mIoU, about")
-    return table(columns, cells, left=2, whole=columns[2:])
+        for one in (*every, *named.values())
+        if one is not None
+    }
+    cells = [*rows.items()]
+    if (zoomed := scans["two_passes"]) is not None:
+        first = format_scan(zoomed["step"], zoomed["exposure_ms"])
+        mark = "this survey, two passes" if zoomed["taken"] else "two passes"
+        words = [format_estimate(name, zoomed[name]) for name in LABELS if name != "bytes_kept"]
+        cells.append((zoomed["capture_s"]["value"], [first, mark, *words]))
+    columns = ("scan or first pass", "", "capture time", "bytes captured", "multiply-adds", "mIoU, about")
+    return table(columns, [row for _, row in sorted(cells)], left=2, whole=columns[2:])
 
 
-TITLE = "Estimates: nothing of this has run"
 LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "capture_s": ("capture time", format_seconds),
     "bytes_captured": ("bytes captured", format_bytes),
@@ -241,11 +266,12 @@ class Estimate:
     value: float | None
     known_from: str
     at_most: bool = False
+    at_least: bool = False
     spread: float | None = None  # a standard deviation
 
 
-def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
-    """Return what a survey would take and score, by the names of `LABELS`; a raster has no seconds of a camera.
+def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, dict[str, Any]]:
+    """Return what a survey would take and score, `Estimate`s by the names of `LABELS`; a raster has no seconds.
 
     ``fine`` is the fine pass, where it is planned already.
     """
@@ -266,7 +292,8 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate
     kept = Estimate(kept_bytes, KEPT_FROM)
     if run.settings.keep != KEEP_SIGNAL:
         kept = Estimate(kept_bytes + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)
-    return {**camera, "bytes_kept": kept, "multiply_adds": work, "miou": _score(run)}
+    found = {**camera, "bytes_kept": kept, "multiply_adds": work, "miou": _score(run)}
+    return {name: asdict(one) for name, one in found.items()}
 
 
 def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
@@ -276,15 +303,12 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
     """
     camera = run.camera
     bands = len(run.scene.wavelength_nm)
-    second = run.second_pass
     captured = raw_bytes([*run.plan.coarse, *(fine.sweeps if fine else ())], camera, bands)
-    open_end = fine is None and second is not None
-    if fine is None and second is not None:
-        record = run.scan_record
+    open_end = fine is None and not run.plan.plain
+    if fine is None and (second := run.second_pass) is not None:
+        record = None if run.recorded else run.scan_record
         left = raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
-        shortest = (
-            camera if record is None or run.recorded else replace(camera, exposure_ms=record.offered_ms(camera)[0])
-        )
+        shortest = camera if record is None else replace(camera, exposure_ms=record.offered_ms(camera)[0])
         lines = int(run.plan.fine_s / (shortest.frame_ms * 1e-3))
         captured += min(lines * camera.samples * bands * BYTES_PER_SAMPLE, left)
     seconds = run.plan.coarse_s + (run.plan.fine_s if fine is None else fine.seconds)
@@ -303,6 +327,8 @@ def _score(run: SurveyRun) -> Estimate:
         if scan.spread is not None and scan.spread > MOST_ERROR:
             return Estimate(None, f"{source}; the scenes differ too much")
         return Estimate(scan.expected["mIoU"], source, at_most=run.budget is not None, spread=scan.spread)
+    if (zoomed := run.scans.two_passes) is not None and run.scan_record is not None:
+        return Estimate(zoomed.expected, "the weights' record of uniform scans and both passes", at_least=True)
     validation = run.described.record.get("validation") or {}
     whole = known_number((validation.get("all") or {}).get("miou"))
     if whole is None:
@@ -323,14 +349,8 @@ def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool, 
     return PAGE + PICTURE_SIDE * math.sqrt(pixels) + MAP_PIXEL * pixels + scores
 
 
-def estimate_table(estimates: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return the estimates as a table for the terminal: name, value and source."""
-    rows = []
-    for name, one in estimates.items():
-        label, show = LABELS[name]
-        words = show(one["value"])
-        if one["spread"] is not None and one["value"] is not None:
-            words = format_prediction(one["value"], one["spread"])
-        known = one["value"] is not None
-        rows.append([label, f"at most {words}" if one["at_most"] and known else words, one["known_from"]])
-    return table(("", "about", "from"), rows, left=3, title=TITLE, whole=("", "about"))
+def format_estimate(name: str, one: Mapping[str, Any]) -> str:
+    """Return an estimate of a name in `LABELS` as text, with its bound or spread."""
+    words = LABELS[name][1](one["value"]) if one["spread"] is None else format_prediction(one["value"], one["spread"])
+    bound = "at most {}" if one["at_most"] else "{} or more" if one["at_least"] else "{}"
+    return words if one["value"] is None else bound.format(words)

@@ -133,7 +133,7 @@ OF_THE_RUN = (
 )
 OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
-UNIFORM_ADVICE = "give --seconds or --scan-step, without --budget and --zoom always, or leave it out"
+LIMITS = ("kept_bytes", "macs")  # of a uniform scan, which they do not choose
 FLAGS = {  # of settings in tables; other keys of tables have none
     **{"camera.exposure_ms": "exposure_ms", "sky.light": "sky", "sky.light_fraction": "light_fraction"},
     **{f"zones.{name}": name for name in ("area", "no_go", "plots", "plots_name")},
@@ -155,14 +155,14 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     if found is not None:
         run, shape, _ = found
         uniform = any(run.settings.get(name) is not None for name in UNIFORM)
-        another_plan = requested if uniform else requested & set(UNIFORM)
+        another_plan = requested - {*LIMITS} if uniform else requested & {*UNIFORM, *LIMITS}
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
         usual |= {"name": str(run.receipt.get("survey") or run.folder.name), "visit": time_of_visit(run)}
         usual |= {} if shape is None else {"size": shape[::-1]}
         if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
             usual["weights"] = BUILT_IN_WEIGHTS
-    elif not requested:
+    elif not requested - {*LIMITS}:
         usual["scan"] = RECORDED
     return usual
 
@@ -185,6 +185,7 @@ def load_settings(
     stated = {key for key, value in table.items() if value is not None}
     listed = stated - {key for key, place in origin.items() if place == "flag"}  # a file may list defaults
     stated -= {key for key in listed & {*OF_TWO_PASSES} if table[key] == SURVEY[key].item.default}
+    stated -= {*OF_CHOOSING} if "macs" in stated else set()
     if "sweeps" in stated and not isinstance(table["sweeps"], str | Path):
         raise SettingsError(f"{place_of('sweeps', origin.get('sweeps'))} must be a path, got {table['sweeps']!r}")
     recorded = usual_of_recording(table) if "sweeps" in stated else {}
@@ -319,7 +320,7 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
     uniform = named(key for key in UNIFORM if not (zooms and key in OF_ZOOM))
     if zooms and uniform:
         yield f"{uniform[0]} selects one uniform scan of the field, --zoom always two passes; leave one out"
-    passes = named(key for key in OF_TWO_PASSES if not (key in OF_CHOOSING and "macs" in stated))
+    passes = named(OF_TWO_PASSES)
     if uniform and passes:
         yield (
             f"{uniform[0]} asks for one uniform scan of the field, and {passes[0]} is for a survey that captures "
@@ -469,13 +470,12 @@ def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
         )
     if settings.kept_bytes is not None and settings.is_map:
         yield f"{at('kept_bytes')} is for a uniform scan, and the scene {settings.scene} is a raster: leave it out"
-    elif settings.kept_bytes is not None and not settings.plain:
-        yield f"{at('kept_bytes')} is for a uniform scan: {UNIFORM_ADVICE}"
-    if settings.macs is None:
-        return
-    if not settings.plain:
-        yield f"{at('macs')} is for a raster or a uniform scan: {UNIFORM_ADVICE}"
-    if settings.extent != EXTENT_WHOLE:
+    for name in (one for one in LIMITS if settings.zooms and getattr(settings, one) is not None):
+        yield (
+            f"{at(name)} is for a uniform scan, and the survey takes two passes: leave it out, or --budget, "
+            "--zoom always, --coarse-exposure-ms and --policy"
+        )
+    if settings.macs is not None and settings.extent != EXTENT_WHOLE:
         yield f"{at('macs')} chooses among the patches of a whole field, {at('extent')} covers a part: leave one out"
 
 

@@ -257,9 +257,9 @@ class Settings:
     )
     macs: Compute | None = stated(
         None,
-        "MAC budget, as a fraction of full-resolution inference (25%) or as a number (4e9), beside the fusion of a"
+        "MAC budget, as a fraction of full-resolution inference (50%) or as a number (4e9), beside the fusion of a"
         " prior map; patches with the highest expected gain come first, the rest is the overview",
-        example="25%",
+        example="50%",
     )
     expected_loss: float = stated(
         0.3,

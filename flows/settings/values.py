@@ -96,14 +96,14 @@ def parse_bytes(value: object) -> int:
 
 
 def parse_compute(value: object) -> str:
-    """Return a fraction of the multiply-adds of a full reading, such as 25%, or a number such as 4e9."""
+    """Return a fraction of the multiply-adds of a full reading, such as 50%, or a number such as 4e9."""
     percent = _amount(value, {"%": 1.0})
     if percent is not None and 0 < percent <= 100:
         return f"{percent!r}%".replace(".0%", "%")
     number = None if str(value).strip().endswith("%") else _to_float(value)
     if number is None or number < 1:
         raise BudgetError(
-            "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, "
+            "must be a fraction of the multiply-adds of reading everything, above 0% and at most 100%, such as 50%, "
             f"or a number of them such as 4e9; got {value!r}"
         )
     return f"{number!r}"

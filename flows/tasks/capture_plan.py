@@ -184,6 +184,7 @@ class ScanChoice:
 
     offered: tuple[UniformScan, ...] = ()  # empty without a table
     chosen: UniformScan | None = None  # None of two passes, or beyond the table
+    two_passes: FirstPass | None = None  # considered or taken, with an expected score
 
     @property
     def reference(self) -> UniformScan | None:
@@ -252,20 +253,26 @@ def choose_uniform_scan(
 
 def lay_out_passes(
     layout: PassLayout, scans: ScanChoice, weights: Description, settings: Settings
-) -> tuple[PassLayout, CapturePlan, Settings, tuple[str, ...]]:
+) -> tuple[CapturePlan, ScanChoice, Settings, tuple[str, ...]]:
     """Lay out the chosen uniform scan, or the first of two passes.
 
-    Returns layout, plan, settings that request exactly this plan, and notes. Without settings or a table, every line
-    is captured. Raises what `PassLayout.plan` raises.
+    Returns plan, scans with the two passes that were considered, settings that request exactly this plan, and notes.
+    Without settings or a table, every line is captured. Raises what `PassLayout.plan` raises.
     """
     chosen = scans.chosen
     content = weights.record.get("scans")
     first = None
-    if content is not None and (settings.zooms or zoom_may_pay(layout, scans, settings)):
+    may_pay = (
+        settings.may_zoom
+        and chosen is not None
+        and chosen.expected[MIOU] < max(one.expected[MIOU] for one in scans.offered) - NEARLY
+        and len(layout.sweeps()[2]) >= LEAST_SWATHS
+    )
+    seconds = settings.seconds if settings.coarse_exposure_ms is None else None
+    if content is not None and seconds is not None and (settings.zooms or may_pay):
         record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
-        if settings.seconds is not None and settings.coarse_exposure_ms is None:
-            steps = FIRST_STEPS if settings.scan_step is None else (settings.scan_step,)
-            first = choose_first_pass(layout, record, settings.seconds, steps)
+        first = choose_first_pass(layout, record, seconds, (settings.scan_step,) if settings.scan_step else FIRST_STEPS)
+    scans = replace(scans, two_passes=first if first is not None and first.expected else None)
     notes = tuple[str, ...]()
     if settings.zoom == AUTO:
         pays = first is not None and chosen is not None and first.expected >= chosen.expected[MIOU] - NEARLY
@@ -283,23 +290,15 @@ def lay_out_passes(
             layout = replace(layout, first_step=first.step, coarse_exposure_ms=exposure_ms)
             settings = replace(settings, coarse_exposure_ms=exposure_ms)
         settings = replace(settings, scan_step=layout.first_step if settings.zoom == ALWAYS else None)
-        return layout, layout.plan(settings.budget, settings.seconds), settings, notes
+        return layout.plan(settings.budget, settings.seconds), replace(scans, chosen=None), settings, notes
     if chosen is not None and (layout.step is None or (layout.recorded is not None and not layout.as_taken)):
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
-    settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms)
+    settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms, extent=layout.extent)
     if layout.step is not None or settings.plain:
-        return layout, layout.plan(None), settings, ()
-    every = layout.uniform(1)
+        return layout.plan(None), scans, settings, ()
     why = "have no record of scans to choose by" if content is None else "know no scan of this exposure or shorter"
-    return every, every.plan(None), replace(settings, scan_step=1), (f"every line is captured: the weights {why}",)
-
-
-def zoom_may_pay(layout: PassLayout, scans: ScanChoice, settings: Settings) -> bool:
-    """Return whether two passes may score more than the uniform scan: on wide fields, if the time limits it."""
-    if scans.chosen is None or not settings.may_zoom:
-        return False
-    best = max(one.expected[MIOU] for one in scans.offered)
-    return scans.chosen.expected[MIOU] < best - NEARLY and len(layout.sweeps()[2]) >= LEAST_SWATHS
+    note = f"every line is captured: the weights {why}"
+    return layout.uniform(1).plan(None), scans, replace(settings, scan_step=1), (note,)
 
 
 @dataclass(frozen=True)
@@ -350,9 +349,9 @@ def choose_first_pass(
     return max(good, key=lambda one: (-one.step, one.exposure_ms), default=fastest)
 
 
-def as_figures(scan: UniformScan | None) -> dict[str, Any] | None:
-    """Return a scan for receipts, with its expected mIoU."""
+def as_figures(scan: UniformScan | None, **more: int) -> dict[str, Any] | None:
+    """Return a scan for receipts and plans, with its expected mIoU and ``more`` figures."""
     if scan is None:
         return None
     figures = {"expected_miou": scan.expected[MIOU], "expected_spread": scan.spread}
-    return {name: value for name, value in asdict(scan).items() if name not in ("expected", "spread")} | figures
+    return {name: value for name, value in asdict(scan).items() if name not in ("expected", "spread")} | figures | more

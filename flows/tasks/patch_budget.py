@@ -66,7 +66,7 @@ class PatchBudget:
     costs: ReadingCosts
     patch_index: NDArray[np.intp]  # (patch,) that zones leave
     policy: str
-    macs: str  # a fraction such as 25%, or a number
+    macs: str  # a fraction such as 50%, or a number
 
     @staticmethod
     def asked(costs: ReadingCosts, shown: NDArray[np.bool_] | None, policy: str, macs: str) -> PatchBudget | None:

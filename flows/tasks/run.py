@@ -528,9 +528,8 @@ def _plan_capture(
             note = f"a survey would skip this visit: {str(known).removeprefix('nothing is captured: ')}; else it {note}"
         extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
-    layout, plan, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
-    scans = replace(scans, chosen=None) if settings.zooms else scans
-    return _PlannedCapture(replace(settings, extent=layout.extent), plan, scans, extent, (*plan_notes, *extent_notes))
+    plan, scans, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
+    return _PlannedCapture(settings, plan, scans, extent, (*plan_notes, *extent_notes))
 
 
 def _scene_for(

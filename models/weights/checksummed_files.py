@@ -23,6 +23,7 @@ ABOUT = "about"  # name of the text in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors, and its own
 DAMAGED = (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, RuntimeError)
 CHECKPOINT = "spectralzoom-checkpoint/2"
+REMEDY = "restore a copy of it, name another file, or move it elsewhere and train or measure it again"
 
 
 def write_checksummed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -53,19 +54,18 @@ def refusing(path: Path) -> Iterator[None]:
     except DAMAGED as error:
         other = type(error) in (TypeError, RuntimeError)  # of sizes and layers that this version does not know
         why = "it is of another version" if other else " ".join(str(error).split())[:300]
-        raise WeightsError(
-            f"cannot read {path}: {why}; restore a copy of it, name another file, or move it elsewhere and train or "
-            "measure it again"
-        ) from error
+        raise WeightsError(f"cannot read {path}: {why}; {REMEDY}") from error
 
 
-def read_about(path: Path, kind: str) -> dict[str, Any]:
-    """Read the description of a file of a ``kind``, without torch. Raises WeightsError: it is damaged, or another."""
+def read_about(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:
+    """Read the description of a file of a ``kind``, without torch. Raises WeightsError: it is damaged, or another.
+
+    ``remedy`` is the advice for one of another kind.
+    """
     with refusing(path), path.open("rb"), safe_open(path, framework="np") as file:  # which takes refusal for absence
         about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
         if (written := about.get("format", "no format mark")) != kind:
-            made = dict(about.get("record") or {}).get("command")
-            raise ValueError(f"it holds {written}, expected {kind}" + (f"; it was made by: {made}" if made else ""))
+            raise WeightsError(f"cannot read {path}: it holds {written}, expected {kind}; {remedy}")
         if about.get(SEAL) != _seal(about):
             raise ValueError("it is damaged: its description is not what was written")
     return dict(about)

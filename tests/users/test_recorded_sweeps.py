@@ -114,6 +114,7 @@ def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.Monk
     plan = asked if "budget" in asked else {}
     of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=f"{SIZE[0]}x{SIZE[1]}", **plan)
     assert digest_of_map(tmp_path / "files", of_files.receipt) == expected
+    assert load_settings(None, {"sweeps": str(folder), "macs": "60%"}).scan == "recorded"  # as without a limit
     of_run = survey_sweeps(tmp_path / "again", published.folder)
     assert digest_of_map(tmp_path / "again", of_run.receipt) == expected
     assert of_run.receipt["survey"] == published.receipt["survey"]

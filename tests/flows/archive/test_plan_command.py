@@ -220,6 +220,19 @@ def test_a_zoomed_farm_may_take_every_line_and_read_every_patch(tmp_path: Path) 
     assert "cheapest near the best" in shown.getvalue()  # not the reference, which is every line at 100 ms
 
 
+@pytest.mark.parametrize(("seconds", "taken"), [("27", True), ("14", False)])
+def test_a_plan_shows_two_passes_beside_uniform_scans(tmp_path: Path, seconds: str, taken: bool) -> None:
+    """Their expected mIoU is a lower bound, also if the planner takes a uniform scan; they need more multiply-adds."""
+    wide = {"scene": "farm", "size": "640x512", "camera.samples": "80", "out": str(tmp_path), "seconds": seconds}
+    found = plan_content(load_settings(None, wide))
+    zoomed = found["scans"]["two_passes"]
+    assert (zoomed["taken"], zoomed["miou"] == found["estimate"]["miou"]) == (taken, taken)
+    assert zoomed["miou"]["at_least"]
+    assert zoomed["multiply_adds"]["value"] > found["scans"]["candidates"][0]["multiply_adds"] > 0
+    show_plan(found, Console(file=(shown := io.StringIO()), width=160))
+    assert ("this survey, two passes" in shown.getvalue()) == taken
+
+
 def test_a_partial_scan_has_no_expected_miou_and_reads_captured_patches(settings: Settings, tmp_path: Path) -> None:
     """Other patches keep the prior map, and scan performance does not cover their accuracy."""
     one_scan = {"budget": None, "scan_step": 1, "out": str(tmp_path)}
