@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     import flows.archive.reprocess_command as reprocess_command
     import flows.cli.model_verbs as model_verbs
     import flows.evaluate.command as evaluate_command
-    import flows.publish.survey_command as survey_command
+    import flows.survey_command as survey_command
     from flows.settings.survey_settings import Settings
 else:
     reprocess_command = deferred("flows.archive.reprocess_command")
     model_verbs = deferred("flows.cli.model_verbs")
     evaluate_command = deferred("flows.evaluate.command")
-    survey_command = deferred("flows.publish.survey_command")
+    survey_command = deferred("flows.survey_command")
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 Told = Callable[[str, float, float], None]

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
-from flows.publish import survey_command
+from flows import survey_command
 from flows.publish.run_folder import Published
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis

@@ -15,16 +15,16 @@ from rich.markup import escape
 from rich.tree import Tree
 
 from flows.archive.stale_runs import can_capture, weights_now
-from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.publish.receipt import is_pending
 from flows.publish.retention import RawClearance, clear_raw_lines
+from flows.settings.flags import ArchiveName, AsJson, Switch
 from flows.settings.load import OF_THE_PLAN, of_this_version, parse_settings
 from flows.settings.survey_settings import ALWAYS, OF_THE_MACHINE, RECORDED, Settings
 from flows.tasks.open_survey import versions
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out, table
+from flows.terminal.progress import StageProgress, put_out, stderr, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
@@ -36,9 +36,9 @@ from storage.maintenance.verification import Finding, plan_repair, repair
 from storage.remote.opening import open_archive, verify_archive
 
 if TYPE_CHECKING:
-    import flows.publish.survey_command as survey_command
+    import flows.survey_command as survey_command
 else:
-    survey_command = deferred("flows.publish.survey_command")
+    survey_command = deferred("flows.survey_command")
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded

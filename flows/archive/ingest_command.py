@@ -11,9 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.cli.app import ArchiveName, AsJson, parse_numbers, stderr
+from flows.settings.flags import ArchiveName, AsJson, parse_numbers
 from flows.terminal.processes import DONE
-from flows.terminal.progress import StageProgress, print_json
+from flows.terminal.progress import StageProgress, print_json, stderr
 from pipeline.errors import SceneError
 from pipeline.ground.georeference import georeference_record
 from storage.archive.archive import Archive

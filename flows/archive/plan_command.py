@@ -15,10 +15,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.cli.app import AsJson
-from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.publish.findings import field_figures
 from flows.publish.receipt_table import finding_rows
+from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import KEEP_SIGNAL

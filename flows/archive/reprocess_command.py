@@ -24,11 +24,11 @@ from flows.archive.stale_runs import (
     is_current,
     newest_runs,
 )
-from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
-from flows.publish.survey_command import run_survey, show_published
+from flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey, show_published
 from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
 from flows.tasks.prefect_tasks import Observer
 from flows.tasks.run import SurveyRun, open_run
@@ -37,7 +37,7 @@ from flows.tasks.scores import score_of
 from flows.tasks.stages.accuracy import evaluate
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out
+from flows.terminal.progress import StageProgress, put_out, stderr
 from models.network.machine import keep_freed_memory, use_one_thread
 from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError

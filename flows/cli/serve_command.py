@@ -32,7 +32,6 @@ from pydantic import ValidationError
 from rich.markup import escape
 
 from flows.archive.reprocess_flow import deployment, reprocess
-from flows.cli.app import stderr
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey import survey
@@ -41,6 +40,7 @@ from flows.tasks.open_survey import RIG_LIMIT
 from flows.tasks.run import open_run
 from flows.tasks.survey_model import weights_path
 from flows.terminal.processes import DONE, terminable
+from flows.terminal.progress import stderr
 from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, NoSceneYet, NothingToMend, PipelineError, SettingsError
 from storage.archive.staging import read_toml, take_lock

@@ -42,6 +42,14 @@ def on_stderr() -> Terminal:
     return Terminal(stderr=True, highlight=False)
 
 
+stderr = on_stderr()
+
+
+def say(message: str) -> None:
+    """Print an error on stderr, as one message."""
+    stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
+
+
 def on_stdout() -> Terminal:
     """Return the console for results."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)

@@ -17,10 +17,10 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.cli.app import AsJson, Switch, stderr
+from flows.settings.flags import AsJson, Switch
 from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
-from flows.terminal.progress import StageProgress, put_out
+from flows.terminal.progress import StageProgress, put_out, stderr
 from pipeline.errors import PipelineError, SceneError, SeriesError, SettingsError, list_some
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.whole_files import write_whole

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from flows.tasks.scene import masks_contain
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, check_out, masks_contain, open_training_data, read_farm_name
+from flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
 from flows.training.figures import (
     FEW_PIXELS,
     better_reading,

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.tasks.scene import pack_mask
 from flows.terminal.figures import counted
-from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, scene_notes, trained_pixels
+from flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
 from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
 from models.network.sizes import SegmenterConfig
