@@ -301,5 +301,5 @@ def _wait_for_server() -> None:
         time.sleep(AGAIN_S)
 
 
-def _say(words: str) -> None:
-    stderr.print(escape(words), soft_wrap=True)
+def _say(text: str) -> None:
+    stderr.print(escape(text), soft_wrap=True)

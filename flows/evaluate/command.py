@@ -51,7 +51,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     return content
 
 
-def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done, words: None) -> dict[str, Any]:
+def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
     Raises SettingsError: invalid fractions, policies or weights; SceneError: no frame is left, a named frame has no

@@ -27,8 +27,8 @@ from models.evaluation.metrics import (
     judge_confidence,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from models.network.spectral import LineSpec
+from models.policies.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example

@@ -26,9 +26,9 @@ from flows.training.figures import (
     validate,
 )
 from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
-from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
+from models.policies.placement import CascadeTable
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.ood_fit import fit_ood

@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from models.network.ood import Exact, Limits, OodDetector
 from models.network.spectral import Normalisation
-from models.reading.ood import Exact, Limits, OodDetector
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
 from models.training.examples import Example
 from pipeline.errors import SceneError

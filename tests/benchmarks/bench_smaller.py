@@ -27,11 +27,11 @@ from flows.training.data import farm_test_data, open_training_data
 from flows.training.figures import read_twice
 from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import ReadTwice, run_controls
 from models.network.machine import choose_device
 from models.network.segmenter import Segmenter
 from models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths, multiply_adds
 from models.network.spectral import Normalisation
+from models.policies.placement import ReadTwice, run_controls
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
