@@ -312,18 +312,14 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
     labels = np.frombuffer(bytearray(scene.labels.data).translate(order.tobytes()), np.uint8).reshape(scene.shape)
     trained = weights.record.get("split", {}).get("pixels", {}).get(scene.clear_key)
     if trained is not None:
-        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
+        bits = np.unpackbits(_packed_bits(trained), count=labels.size)
+        labels[bits.reshape(labels.shape).astype(bool)] = UNLABELLED
     return labels
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:
     """Encode a mask for the record of weights: bits, deflated, base64."""
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
-
-
-def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Decode a mask of `pack_mask`."""
-    return np.unpackbits(_packed_bits(text), count=shape[0] * shape[1]).reshape(shape).astype(bool)
 
 
 def masks_contain(mask: str, other: str | None) -> bool:

@@ -50,6 +50,11 @@ def say(message: str) -> None:
     stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
 
 
+def show_text(text: str, console: Console = stderr) -> None:
+    """Print text without markup, and leave the folding of its line to the terminal."""
+    console.print(escape(text), soft_wrap=True)
+
+
 def on_stdout() -> Terminal:
     """Return the console for results."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
