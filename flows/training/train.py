@@ -111,7 +111,7 @@ def train_weights(
             scenes.train.examples,
             scenes.validation.examples,
             weights.normalisation,
-            darkest_ms=trained.exposure_ms[0],
+            min_exposure_ms=trained.exposure_ms[0],
             bands=trained.bands,
             seed=settings.seed,
             report=lambda done: report("fitting the out-of-distribution detector", done, ""),
@@ -123,13 +123,13 @@ def train_weights(
     return record
 
 
-def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
+def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
     nm = scenes.common.wavelength_nm
     trained = TrainedOn(
         bands=len(nm),
         wavelength_nm=(float(nm.min()), float(nm.max())),
-        exposure_ms=(darkest_ms, max(darkest_ms, data.camera.exposure_ms)),
+        exposure_ms=(min_exposure_ms, max(min_exposure_ms, data.camera.exposure_ms)),
         scenes=len(data.train),
         classes=scenes.common.names,
         bands_nm=tuple(nm.tolist()),

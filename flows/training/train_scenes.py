@@ -209,6 +209,8 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
 
 
-def training_capture(normalisation: Normalisation, darkest_ms: float) -> CaptureAugmentation | None:
+def training_capture(normalisation: Normalisation, min_exposure_ms: float) -> CaptureAugmentation | None:
     """Return the simulation of shorter exposures and wider spacings; None for the reference exposure alone."""
-    return CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
+    return (
+        CaptureAugmentation(normalisation, min_exposure_ms=min_exposure_ms) if min_exposure_ms < REFERENCE_MS else None
+    )
