@@ -260,8 +260,8 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         for scores in (readings["miou"], record.get("baselines") or {})
     )
-    words = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
-    console.print(f"{words}kept: {readings['kept']}", soft_wrap=True)
+    text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
+    console.print(f"{text}kept: {readings['kept']}", soft_wrap=True)
     if of_baselines:
         console.print(f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}", soft_wrap=True)
     figures = record["validation"]

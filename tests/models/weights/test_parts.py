@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.models.reading.test_ood import some_limits
 
 from models.network.ood import OodDetector
 from models.network.sizes import TemporalSizes
@@ -17,6 +16,7 @@ from models.network.temporal_reader import TemporalReader
 from models.weights import files
 from pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
+from tests.models.network.test_ood import some_limits
 
 SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
 
