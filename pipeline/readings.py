@@ -25,7 +25,7 @@ class Beyond:
     place: tuple[int, ...]  # (y, x, band)
     value: np.number[Any]
 
-    def words(self) -> str:
+    def text(self) -> str:
         """Format count, place and value."""
         y, x, band = self.place
         return f"{self.count} value{'s' * (self.count > 1)}, the first {self.value!s} at y {y}, x {x}, band {band}"

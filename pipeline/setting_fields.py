@@ -37,8 +37,8 @@ assumed = partial(stated, source="assumed")  # the default is not confirmed on a
 
 def format_number(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
     """Return the allowed range of a number, for a message."""
-    words = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
-    return words + (f" {unit}" if unit else "") + (" or inf" if endless else "")
+    text = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
+    return text + (f" {unit}" if unit else "") + (" or inf" if endless else "")
 
 
 def span_of(item: Field[Any]) -> tuple[float, float]:
@@ -55,8 +55,8 @@ def misfits(part: Any) -> Iterator[tuple[str, str]]:
             continue
         endless = item.default in (None, math.inf)
         if isinstance(value, bool) or not low <= value <= high or (math.isinf(value) and not endless):
-            words = format_number(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
-            yield item.name, f"must be {words}, got {value!r}"
+            allowed = format_number(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
+            yield item.name, f"must be {allowed}, got {value!r}"
 
 
 def numbers_of(item: object) -> Sequence[object]:

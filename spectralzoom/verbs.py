@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -15,7 +15,7 @@ import spectralzoom.opened as opened
 from flows.archive.plan_command import plan_content
 from flows.settings.load import load_settings
 from flows.terminal.processes import place_caches
-from flows.terminal.progress import heard_by, on_stderr
+from flows.terminal.progress import Listener, heard_by, on_stderr
 from pipeline.errors import SettingsError
 from pipeline.lazy import deferred
 from spectralzoom.opened import OpenedRun
@@ -26,20 +26,19 @@ if TYPE_CHECKING:
     import flows.archive.reprocess_command as reprocess_command
     import flows.cli.model_verbs as model_verbs
     import flows.evaluate.command as evaluate_command
-    import flows.publish.survey_command as survey_command
+    import flows.survey_command as survey_command
     from flows.settings.survey_settings import Settings
 else:
     reprocess_command = deferred("flows.archive.reprocess_command")
     model_verbs = deferred("flows.cli.model_verbs")
     evaluate_command = deferred("flows.evaluate.command")
-    survey_command = deferred("flows.publish.survey_command")
+    survey_command = deferred("flows.survey_command")
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
-Told = Callable[[str, float, float], None]
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
 
 
-def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
+def survey(settings: Asked = None, *, progress: Listener | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
     """Survey a field as `spectralzoom survey` does, publish the run and return it.
 
     Stores in the archive are reused, so that the same call continues a stopped survey.
@@ -92,7 +91,7 @@ def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
     return content
 
 
-def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, **flags: Any) -> dict[str, Any]:
+def evaluate(dataset: str | Path | OpenedRun, *, progress: Listener | None = None, **flags: Any) -> dict[str, Any]:
     """Evaluate weights on scenes that they were not trained on, or the map of a run against labels.
 
     Parameters
@@ -126,13 +125,13 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
     request = _flags(model_verbs.EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
     with _working(progress):
         content: dict[str, Any] = evaluate_command.evaluate_weights(
-            request, lambda what, done, words: None if progress is None else progress(what, done, 1.0)
+            request, lambda what, done, figure: None if progress is None else progress(what, done, 1.0)
         )
     return content
 
 
 def train(
-    dataset: str | Path, out: str | Path, *, progress: Told | None = None, quiet: bool = True, **flags: Any
+    dataset: str | Path, out: str | Path, *, progress: Listener | None = None, quiet: bool = True, **flags: Any
 ) -> Path:
     """Train weights on a data set as `spectralzoom train` does, and return their file.
 
@@ -154,10 +153,10 @@ def train(
     Error
         A value or a file is not valid.
     """
-    words = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
+    arguments = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
     asked = _flags(model_verbs.TrainFlags, "train", flags)
     with _working(progress, quiet=quiet) as console:
-        model_verbs.run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(words)})", console)
+        model_verbs.run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(arguments)})", console)
     return Path(out)
 
 
@@ -185,7 +184,7 @@ def _plain(value: Any) -> Any:
 
 
 @contextmanager
-def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
+def _working(progress: Listener | None, *, quiet: bool = True) -> Iterator[Console]:
     """Set up caches, progress and one BLAS thread as for a command, and yield a console."""
     place_caches()
     console = on_stderr()
@@ -196,7 +195,7 @@ def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
 
 
 def _judge(
-    run: OpenedRun, progress: Told | None, labels: str | Path | None = None, controls: bool | None = None
+    run: OpenedRun, progress: Listener | None, labels: str | Path | None = None, controls: bool | None = None
 ) -> dict[str, Any]:
     """Add the accuracy to a run, and return it."""
     asked = None if labels is None else str(labels)

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
-from flows.publish import survey_command
+from flows import survey_command
 from flows.publish.run_folder import Published
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
@@ -181,7 +180,7 @@ def survey_png(scene_files: Path, flags_png: Flags) -> Survey:
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
         labels = str(scene_files / "labels.png")
         given = flags_png(out, labels=labels, engine="plain", budget="0.8", controls=False)
-        return run_survey(load_settings(None, given | flags), console or QUIET)
+        return survey_command.run_survey(load_settings(None, given | flags), console or QUIET)
 
     return survey
 

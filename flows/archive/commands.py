@@ -15,16 +15,16 @@ from rich.markup import escape
 from rich.tree import Tree
 
 from flows.archive.stale_runs import can_capture, weights_now
-from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.publish.receipt import is_pending
 from flows.publish.retention import RawClearance, clear_raw_lines
+from flows.settings.flags import ArchiveName, AsJson, Switch
 from flows.settings.load import OF_THE_PLAN, of_this_version, parse_settings
 from flows.settings.survey_settings import ALWAYS, OF_THE_MACHINE, RECORDED, Settings
 from flows.tasks.open_survey import versions
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out, table
+from flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
@@ -36,9 +36,9 @@ from storage.maintenance.verification import Finding, plan_repair, repair
 from storage.remote.opening import open_archive, verify_archive
 
 if TYPE_CHECKING:
-    import flows.publish.survey_command as survey_command
+    import flows.survey_command as survey_command
 else:
-    survey_command = deferred("flows.publish.survey_command")
+    survey_command = deferred("flows.survey_command")
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
@@ -329,7 +329,7 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
     count = counted(sum(map(len, content["stages"].values())), "store")
     shared = f", {format_bytes(content['shared_bytes'])} shared by several runs" if content["shared_bytes"] else ""
-    _say(console, f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}")
+    show_text(f"{counted(len(content['runs']), 'run')}, {count}, {format_bytes(content['bytes'])}{shared}", console)
 
 
 def _shown_run(run: Mapping[str, Any]) -> list[str]:
@@ -360,17 +360,17 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
     """Print what `gc` removed or would remove."""
     verb = "would go" if content["dry_run"] else "went"
     for removal in content["removals"][:MOST_ROWS]:
-        _say(console, f"{removal['uri']}  {format_bytes(removal['size'])}  {removal['why']}")
+        show_text(f"{removal['uri']}  {format_bytes(removal['size'])}  {removal['why']}", console)
     if len(content["removals"]) > MOST_ROWS:
-        _say(console, f"and {len(content['removals']) - MOST_ROWS} more")
+        show_text(f"and {len(content['removals']) - MOST_ROWS} more", console)
     for reason in dict.fromkeys(content["kept"].values()):
         count = sum(why == reason for why in content["kept"].values())
-        _say(console, f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}")
+        show_text(f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}", console)
     for uri, why in content["raw_kept"].items():
         console.print(f"[bold yellow]{escape(f'raw lines stay: {uri}: {why}')}[/]", soft_wrap=True)
     if content["obstacle"] is not None:
         console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", soft_wrap=True)
-    _say(console, f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}")
+    show_text(f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}", console)
 
 
 def show_explanation(content: dict[str, Any], console: Console) -> None:
@@ -378,16 +378,16 @@ def show_explanation(content: dict[str, Any], console: Console) -> None:
     run = content.get("run")
     if run is not None:
         where = f"{content['product']}: {run['scene']}, seed {run['seed']}, budget {run['budget']}, {run['state']}"
-        _say(console, run["problem"] or where)
+        show_text(run["problem"] or where, console)
         if run["command"]:
-            _say(console, run["command"])
+            show_text(run["command"], console)
     for node in content["lineage"]:
         console.print(_branch(node, None))
     if run is not None:
         return
-    _say(console, f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}")
+    show_text(f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}", console)
     if content["before"] is None:
-        _say(console, "this archive has no other version of it before this one")
+        show_text("this archive has no other version of it before this one", console)
         return
     shown = content["changes"][:MOST_ROWS]
     more = len(content["changes"]) - MOST_ROWS
@@ -427,13 +427,13 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
     for finding in content["problems"]:
         console.print(f"[bold red]{escape(finding['uri'])}[/]: {escape(finding['problem'])}", soft_wrap=True)
     for uri, why in content.get("hopeless", {}).items():
-        _say(console, f"{uri} cannot be remade: {why}")
+        show_text(f"{uri} cannot be remade: {why}", console)
     if content.get("to_remake") or content.get("surveys"):
         broken = counted(len(content["to_remake"]), "broken store") if content["to_remake"] else "broken runs"
-        _say(console, f"verify --repair makes {broken} anew by:")
+        show_text(f"verify --repair makes {broken} anew by:", console)
         for survey in content["surveys"]:
-            _say(console, f"  {survey['run']}: {survey['command']}")
-    _say(console, f"{content['whole']} stores and runs are as published, out of {content['checked']}")
+            show_text(f"  {survey['run']}: {survey['command']}", console)
+    show_text(f"{content['whole']} stores and runs are as published, out of {content['checked']}", console)
 
 
 def show_repair(content: dict[str, Any], console: Console) -> None:
@@ -443,11 +443,7 @@ def show_repair(content: dict[str, Any], console: Console) -> None:
         for uri, why in part.items():
             console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", soft_wrap=True)
     left = "nothing broken is left" if done["complete"] else "some could not be made anew"
-    _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run names removed; {left}")
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(escape(text), soft_wrap=True)
+    show_text(f"{len(done['remade'])} remade, {len(done['dropped'])} that no run names removed; {left}", console)
 
 
 def _age(seconds: float | None) -> str:

@@ -28,9 +28,9 @@ from flows.archive.export_layers import (
 )
 from flows.archive.export_values import CSV, spectral_layers, write_areas
 from flows.archive.export_zones import check_zones, write_zones
-from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
+from flows.settings.flags import ArchiveName, AsJson, OutFile, Switch, check_outside
 from flows.terminal.processes import DONE
-from flows.terminal.progress import print_json
+from flows.terminal.progress import print_json, stderr
 from pipeline.errors import ArchiveError, PipelineError
 from pipeline.ground.georeference import pixel_side_m
 from storage.archive.manifests import read_manifest

@@ -15,8 +15,8 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from flows.cli.app import Switch, split_list
 from flows.publish.receipt import Receipt, check_receipt
+from flows.settings.flags import Switch, split_list
 from flows.settings.load import time_of_visit
 from flows.settings.survey_settings import RIG
 from flows.tasks.stages.maps import colours_of

@@ -14,14 +14,14 @@ from urllib.parse import quote
 from rich.markup import escape
 
 from flows.archive.stale_runs import called, generations
-from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import check_receipt
+from flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
 from flows.settings.load import time_of_visit
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
 from flows.terminal.figures import counted, format_area, format_percent
 from flows.terminal.processes import DONE
-from flows.terminal.progress import print_json
+from flows.terminal.progress import print_json, stderr
 from pipeline.errors import PipelineError, SettingsError, ShapeError, visible
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive

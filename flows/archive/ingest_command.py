@@ -11,9 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.cli.app import ArchiveName, AsJson, parse_numbers, stderr
+from flows.settings.flags import ArchiveName, AsJson, parse_numbers
 from flows.terminal.processes import DONE
-from flows.terminal.progress import StageProgress, print_json
+from flows.terminal.progress import StageProgress, print_json, show_text, stderr
 from pipeline.errors import SceneError
 from pipeline.ground.georeference import georeference_record
 from storage.archive.archive import Archive
@@ -58,7 +58,7 @@ def ingest(
     """
     nm = parse_numbers(wavelengths, "--wavelengths")
     record = run_ingest(source, archive, stderr, name=name, dark=dark, white=white, wavelengths=nm)
-    stderr.print(escape(f"next: {_next(record, source, wavelengths)}"), soft_wrap=True)
+    show_text(f"next: {_next(record, source, wavelengths)}")
     if as_json:
         print_json(record)
     return DONE

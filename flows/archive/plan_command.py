@@ -15,10 +15,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.cli.app import AsJson
-from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.publish.findings import field_figures
 from flows.publish.receipt_table import finding_rows
+from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import ALWAYS, BUILT_IN_SCENES, Settings
 from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
@@ -196,12 +195,12 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
     ]
     console.print(table(("stage", "state", "why"), rows, left=3, whole=("stage", "state")))
     size = f"{' x '.join(map(format_count, content['field']['size_px']))} px"
-    told = [size, *(text for _, text in finding_rows({"field": content["field"]}))]
+    parts = [size, *(text for _, text in finding_rows({"field": content["field"]}))]
     if content["field"]["ground_pixel_m"] is None:
-        told.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
+        parts.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
     if content["field"]["camera_s"] is None:
-        told.append("no camera: the pixels of the raster are taken as they are")
-    console.print(escape(f"field: {'; '.join(told)}"), soft_wrap=True)
+        parts.append("no camera: the pixels of the raster are taken as they are")
+    console.print(escape(f"field: {'; '.join(parts)}"), soft_wrap=True)
     if content["to_make"]:
         console.print(f"{content['to_make']} stages to make")
         made = content["estimate"].items()

@@ -24,11 +24,11 @@ from flows.archive.stale_runs import (
     is_current,
     newest_runs,
 )
-from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
-from flows.publish.survey_command import run_survey, show_published
+from flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey, show_published
 from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
 from flows.tasks.prefect_tasks import Observer
 from flows.tasks.run import SurveyRun, open_run
@@ -37,7 +37,7 @@ from flows.tasks.scores import score_of
 from flows.tasks.stages.accuracy import evaluate
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out
+from flows.terminal.progress import StageProgress, put_out, show_text, stderr
 from models.network.machine import keep_freed_memory, use_one_thread
 from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError
@@ -132,7 +132,7 @@ def reprocess_fields(
             except PipelineError as error:
                 row |= {"message": str(error)}
             rows.append(row | {"seconds": time.perf_counter() - begun})
-            console.print(escape(_format_row(rows[-1])), soft_wrap=True)
+            show_text(_format_row(rows[-1]), console)
     return {"archive": opened.name, "dry_run": dry_run, "fields": rows}
 
 
@@ -173,7 +173,7 @@ def _show(content: Mapping[str, Any], console: Console) -> None:
     counts = ", ".join(f"{count} {state}" for state, count in Counter(row["state"] for row in rows).items())
     total = f"{counted(len(rows), 'run')}: {counts}" if rows else "no field matches: nothing to do"
     for line in (*map(_format_row, rows), total):
-        console.print(escape(line), soft_wrap=True)
+        show_text(line, console)
 
 
 def run_judge(
@@ -197,7 +197,7 @@ def run_judge(
     there = "accuracy" in receipt and labels is None
     placed = not settings.plain or settings.is_map  # patches, which are compared with other placements
     if there and (receipt["accuracy"]["controls"] or not (placed and settings.controls)):
-        console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
+        show_text(f"{found.uri} has its accuracy already", console)
         return receipt
     use_one_thread()
     keep_freed_memory()

@@ -1,4 +1,4 @@
-"""Build the command line: its verbs, shared parameters and parsers of lists."""
+"""Build the command line from its verbs, each loaded on demand."""
 
 from __future__ import annotations
 
@@ -6,14 +6,8 @@ import ast
 import importlib.metadata
 import importlib.util
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import App, Parameter
-from rich.markup import escape
-
-from flows.terminal.progress import on_stderr
-from pipeline.errors import SettingsError
-from pipeline.setting_fields import numbers_of
+from cyclopts import App
 
 VERBS = {  # verb: module of its function, loaded on demand
     "survey": "flows.cli.survey_verbs",
@@ -36,17 +30,6 @@ VERBS = {  # verb: module of its function, loaded on demand
     "tradeoff": "flows.tradeoff.command",
 }
 GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve")  # verbs that resume
-stderr = on_stderr()
-
-ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
-AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]
-Switch = Annotated[bool, Parameter(negative="")]  # without a --no- form
-OutFile = Annotated[Path, Parameter(name=("--out", "-o"))]
-OutFolder = Annotated[Path | None, Parameter(name=("--out", "-o"))]
-Scheduler = Annotated[
-    str, Parameter(help="Worker pool: `threads`, `processes`, or the address of a dask scheduler, tcp://host:port.")
-]
-Workers = Annotated[int | None, Parameter(help="Number of workers; default: one per core.")]
 
 
 def build_app(*, listed: bool) -> App:
@@ -76,37 +59,3 @@ def _summary(module: str, function: str) -> str:
     parts = ast.parse(Path(found.origin).read_bytes()).body
     own = next(part for part in parts if isinstance(part, ast.FunctionDef) and part.name == function)
     return (ast.get_docstring(own) or "").partition("\n\n")[0]
-
-
-def say(message: str) -> None:
-    """Print an error on stderr, as one message."""
-    stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
-
-
-def check_outside(out: Path, root: Path) -> Path:
-    """Return the absolute folder ``out``. Raises SettingsError: it lies in the archive at ``root``."""
-    folder = out.resolve()
-    if folder.is_relative_to(root.resolve()):
-        raise SettingsError(f"--out {folder} lies in the archive, where nothing else belongs; choose another folder")
-    return folder
-
-
-def split_list(text: str | None) -> tuple[str, ...]:
-    """Return the parts of a list with commas."""
-    return tuple(part.strip() for part in str(text).split(",") if part.strip()) if text else ()
-
-
-def parse_numbers(text: str | None, flag: str) -> list[float] | None:
-    """Return numbers with commas. Raises SettingsError: names the flag."""
-    try:
-        return None if text is None else [float(part) for part in split_list(text)]
-    except ValueError:
-        raise SettingsError(f"{flag} expects numbers with commas, got {text!r}") from None
-
-
-def parse_wholes(text: str | None, flag: str) -> list[int] | None:
-    """Return whole numbers with commas; 4-7 is a range. Raises SettingsError: names the flag."""
-    try:
-        return None if text is None else [int(str(one)) for part in split_list(text) for one in numbers_of(part)]
-    except ValueError:
-        raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None

@@ -9,9 +9,10 @@ import sys
 
 from cyclopts import CycloptsError, UnknownOptionError
 
-from flows.cli.app import GOES_ON, VERBS, build_app, say, stderr
+from flows.cli.app import GOES_ON, VERBS, build_app
 from flows.settings.renamed import RENAMED
 from flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
+from flows.terminal.progress import say, stderr
 from pipeline.errors import SettingsError
 
 INTERRUPTED = 130

@@ -12,10 +12,10 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from flows.archive.reprocess_command import run_judge
-from flows.cli.app import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list, stderr
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
-from flows.terminal.progress import print_json
+from flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
+from flows.terminal.progress import print_json, stderr
 from flows.training.train import CROPS_PX, asked_command, check_counts, run_train
 from flows.training.train_scenes import TrainRequest
 from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember

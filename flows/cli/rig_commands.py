@@ -20,15 +20,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.cli.app import AsJson, OutFolder, Switch, stderr
 from flows.cli.simulate_command import open_simulation
-from flows.cli.survey_verbs import NO_RENDERING_FLAGS, RenderingFlags, by_setting
 from flows.settings.documents import as_toml
+from flows.settings.flags import NO_RENDERING_FLAGS, AsJson, OutFolder, RenderingFlags, Switch, by_setting
 from flows.settings.load import anchor_paths, load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.tasks.stages.effects import choose_effects, chosen_effects
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import on_stdout, print_json
+from flows.terminal.progress import on_stdout, print_json, stderr
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import SurveyRig

@@ -29,10 +29,8 @@ from prefect.runner import Runner
 from prefect.states import Cancelled, Crashed
 from prefect.types.entrypoint import EntrypointType
 from pydantic import ValidationError
-from rich.markup import escape
 
 from flows.archive.reprocess_flow import deployment, reprocess
-from flows.cli.app import stderr
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey import survey
@@ -41,6 +39,7 @@ from flows.tasks.open_survey import RIG_LIMIT
 from flows.tasks.run import open_run
 from flows.tasks.survey_model import weights_path
 from flows.terminal.processes import DONE, terminable
+from flows.terminal.progress import show_text
 from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, NoSceneYet, NothingToMend, PipelineError, SettingsError
 from storage.archive.staging import read_toml, take_lock
@@ -100,11 +99,11 @@ def serve(
             )
             held.callback(setattr, tempfile, "tempdir", None)
             when = cron or f"every {every}".removesuffix(", 0:00:00")
-            _say(f"serving {', '.join(one.name for one in served)}, {when}; Ctrl-C stops it")
-            _say(f"Prefect's pages: {pages}")
+            show_text(f"serving {', '.join(one.name for one in served)}, {when}; Ctrl-C stops it")
+            show_text(f"Prefect's pages: {pages}")
             _serve(served, schedule, limit or len(served) + 1, shared=shared)
     except KeyboardInterrupt:
-        _say("stopped: no run starts from now on; the same command serves again")
+        show_text("stopped: no run starts from now on; the same command serves again")
     return DONE
 
 
@@ -157,10 +156,10 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
         try:
             open_run(replace(settings, name=name), planning=True)
         except NothingToMend as known:
-            _say(f"{name}: {known}")
+            show_text(f"{name}: {known}")
         except NoSceneYet as error:
             describe_weights(weights_path(settings))  # raises where they are invalid
-            _say(f"{name}: {error}; each due run looks for it again")
+            show_text(f"{name}: {error}; each due run looks for it again")
         except PipelineError as error:
             raise type(error)(f"{file}: {error}") from error
         fields[name] = ServedField(name, file.absolute(), settings)
@@ -220,7 +219,7 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int, *, shared: 
                 break
             except Exception as error:  # the runner gives up after three tries, also while it stops
                 if not asked_to_stop.is_set():
-                    _say(
+                    show_text(
                         f"Prefect's server does not answer ({type(error).__name__}); serving continues when it answers"
                     )
                     with terminable():  # the handler of SIGTERM ended with the event loop
@@ -232,7 +231,7 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int, *, shared: 
                 for one in fields:
                     client.pause_deployment(client.read_deployment_by_name(f"survey/{one.name}").id)
         except Exception as error:
-            _say(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
+            show_text(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
 
 
 async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
@@ -299,7 +298,3 @@ def _wait_for_server() -> None:
             check_answers(os.environ["PREFECT_API_URL"])
             return
         time.sleep(AGAIN_S)
-
-
-def _say(words: str) -> None:
-    stderr.print(escape(words), soft_wrap=True)

@@ -12,9 +12,8 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
-from flows.cli.app import AsJson, Switch, stderr
-from flows.cli.survey_verbs import NO_SIMULATION_FLAGS, SimulationFlags, by_setting
 from flows.publish.receipt_table import print_effects
+from flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.capture_plan import PassLayout
@@ -24,7 +23,7 @@ from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.capture import capture_coarse
 from flows.tasks.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import counted, format_bytes, format_seconds
-from flows.terminal.progress import StageProgress, print_json
+from flows.terminal.progress import StageProgress, print_json, stderr
 from models.network.machine import keep_freed_memory
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid

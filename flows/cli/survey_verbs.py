@@ -1,75 +1,27 @@
-"""Define the verb `survey`, and flags of settings for the verbs that take them."""
+"""The verb `survey`: surveys by settings files and flags, one after the other."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, say, stderr
-from flows.settings.documents import about, toml_value
-from flows.settings.load import FLAGS, SURVEY, TABLES, load_settings
+from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
+from flows.settings.load import load_settings
 from flows.terminal.processes import format_failure
-from flows.terminal.progress import print_json
+from flows.terminal.progress import print_json, say, stderr
 from pipeline.errors import NothingToMend
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
-    import flows.publish.survey_command as survey_command
+    import flows.survey_command as survey_command
 else:
-    survey_command = deferred("flows.publish.survey_command")
+    survey_command = deferred("flows.survey_command")
 
-IN_TABLES = {flag: setting for setting, flag in FLAGS.items()}
-_IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
-_DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_TABLES.items()}
-
-
-def _flags(names: Iterable[str]) -> Any:
-    """Return a dataclass of flags for these settings; None stands for a flag that is not given."""
-    made = []
-    for name in names:
-        one = _DECLARED[name]
-        kind: Any = bool if one.kind is bool else str
-        help_text = about(one) + ("" if one.item.default is None else f"; default: {toml_value(one).strip(chr(34))}")
-        made.append((name, Annotated[kind | None, Parameter(help=help_text)], None))
-    return make_dataclass("Flags", made, frozen=True, kw_only=True)
-
-
-_RENDERING = ("effects", "seed", "day", "hour", "interest", "sky", "light_fraction", "bands", "wavelengths")
-_Every: Any = _flags(name for name in _DECLARED if name not in TABLES or name in IN_TABLES)
-_OfRendering: Any = _flags(_RENDERING)
-_OfSimulation: Any = _flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))
-
-
-@Parameter(name="*")
-class SurveyFlags(_Every):  # type: ignore[misc]
-    """Flags of all settings of a survey."""
-
-
-@Parameter(name="*")
-class RenderingFlags(_OfRendering):  # type: ignore[misc]
-    """Flags of the simulated rig and its light."""
-
-
-@Parameter(name="*")
-class SimulationFlags(_OfSimulation):  # type: ignore[misc]
-    """Flags of a simulated scan."""
-
-
-def by_setting(flags: Any) -> dict[str, object]:
-    """Return the values of flags by setting, for `load_settings`."""
-    return {IN_TABLES.get(name, name): value for name, value in asdict(flags).items()}
-
-
-NO_FLAGS = SurveyFlags()
 Verbose = Annotated[
     bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages and effects.")
 ]
-NO_SIMULATION_FLAGS = SimulationFlags()
-NO_RENDERING_FLAGS = RenderingFlags()
 
 
 def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False) -> int:

@@ -23,7 +23,7 @@ from flows.evaluate.frames import (
 from flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
 from flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from flows.terminal.processes import writing
-from flows.terminal.progress import StageProgress, put_out, table
+from flows.terminal.progress import StageProgress, put_out, show_text, table
 from flows.training.data import Report, TrainingData
 from models.evaluation.metrics import LEVEL
 from models.network.machine import choose_device, keep_freed_memory
@@ -51,7 +51,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     return content
 
 
-def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done, words: None) -> dict[str, Any]:
+def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
     Raises SettingsError: invalid fractions, policies or weights; SceneError: no frame is left, a named frame has no
@@ -127,7 +127,7 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
         together = "; ".join(" + ".join(names) for names in content["seeds"])
         lines.append(f"  seeds of the training: {len(content['seeds'])} ({together})")
     for line in lines:
-        console.print(escape(line), soft_wrap=True)
+        show_text(line, console)
     console.print(_accuracy(content))
     console.print(_classes(content))
     console.print(escape(CAPTION.format(draws=content["settings"]["draws"])), soft_wrap=True, style="dim")

@@ -24,8 +24,8 @@ from models.evaluation.metrics import (
     overall_accuracy,
     paired_interval,
 )
-from models.evaluation.placement import RANDOM_DRAWS, ReadTwice, gain_sums, oracle_gain
 from models.network.sizes import multiply_adds
+from models.policies.placement import RANDOM_DRAWS, ReadTwice, gain_sums, oracle_gain
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
 from models.weights.files import Weights

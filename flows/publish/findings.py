@@ -225,7 +225,7 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     if score is None or not np.isfinite(score.miou):
         return None
     if score.error > MOST_ERROR:
-        words = f"it would be off by {format_points(score.error)} points (one standard deviation)"
-        return {"not_predicted": f"{words}; judge the map by labels"}
+        text = f"it would be off by {format_points(score.error)} points (one standard deviation)"
+        return {"not_predicted": f"{text}; judge the map by labels"}
     of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
     return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}

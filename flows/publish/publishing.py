@@ -158,7 +158,7 @@ def _show_artifact(survey: OpenSurvey, published: Published) -> None:
             survey=published.receipt["survey"],
             headline=headline(published.receipt, published.captured_again),
             picture=base64.b64encode(small_jpeg((published.folder / "quicklook.png").read_bytes())).decode("ascii"),
-            findings=[f"{name}: {words}" for name, words in finding_rows(published.receipt)],
+            findings=[f"{name}: {text}" for name, text in finding_rows(published.receipt)],
             where=where,
         )
         prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)

@@ -157,8 +157,8 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     columns = ("", "this survey", "reference", "fraction")
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
-    told = {part: receipt[part] for part in ("signal", "lines", "prior_map") if receipt.get(part)}
-    for name, words in finding_rows(told):
+    shown = {part: receipt[part] for part in ("signal", "lines", "prior_map") if receipt.get(part)}
+    for name, words in finding_rows(shown):
         if verbose or name != COMPARISON:
             console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
@@ -249,8 +249,8 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _figures(found: Mapping[str, Any] | None, names: Sequence[str]) -> str:
     """Return the named figures of a part; None, most zeros and what is empty are left out."""
-    told = [(name, found[name]) for name in names if found and (found.get(name) or (name, found.get(name)) in ZEROS)]
-    return "; ".join(words for name, value in told if (words := format_figure(name, value)))
+    shown = [(name, found[name]) for name in names if found and (found.get(name) or (name, found.get(name)) in ZEROS)]
+    return "; ".join(words for name, value in shown if (words := format_figure(name, value)))
 
 
 def format_figure(name: str, value: Any) -> str:

@@ -129,7 +129,7 @@ def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: 
         survey.run.archive,
         draft,
         receipt,
-        lambda told: render_report(told, drawn.quicklook, drawn.pictures, captured_again=again, field=drawn.field),
+        lambda final: render_report(final, drawn.quicklook, drawn.pictures, captured_again=again, field=drawn.field),
         rests_on=survey.run.archive.manifest_hashes(survey.products.values()),
         of_earlier=() if survey.run.prior is None else survey.run.archive.manifest_hashes(survey.run.prior.stores),
         written=survey.take_written(),
@@ -197,7 +197,7 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], prior: Mapp
     entries = capture_savings([*run.plan.coarse, *plan.sweeps], run.plan.full, run.camera, run.grid)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
     if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
-        capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.words}
+        capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.summary}
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": capture,
@@ -370,12 +370,12 @@ def publish_counted(
     longest = {RECEIPT: 0, REPORT: 0}
     folder = 0
     while True:
-        told = {
+        measured = {
             "written": before["written"] + written + folder,
             "kept": sum(stores.values()) + folder,
             "moved_bucket": before["moved_bucket"] + (moved + folder if archive.in_bucket else 0),
         }
-        receipt = check_receipt(receipt | {"data_bytes": before | told})
+        receipt = check_receipt(receipt | {"data_bytes": before | measured})
         for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):
             content = text.encode()
             longest[name] = max(longest[name], len(content))

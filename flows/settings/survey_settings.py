@@ -35,8 +35,8 @@ from flows.settings.values import (
     parse_tolerance,
 )
 from models.network.machine import PROCESSOR, Device
+from models.network.ood import RATE
 from models.policies.policies import Policy
-from models.reading.ood import RATE
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose

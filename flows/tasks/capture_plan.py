@@ -280,7 +280,7 @@ def lay_out_passes(
         if pays and first is not None and chosen is not None:
             notes = (
                 f"two passes: {format_scan(first.step, first.exposure_ms)} first, then lines of the highest expected "
-                f"gain; expected mIoU {100 * first.expected:.1f} or more, one uniform scan {chosen.words} "
+                f"gain; expected mIoU {100 * first.expected:.1f} or more, one uniform scan {chosen.summary} "
                 f"{100 * chosen.expected[MIOU]:.1f} (--zoom never)",
             )
     if settings.zooms:

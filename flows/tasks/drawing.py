@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse_region, overview_file, seen_patches
+from models.network.ood import OodDetector
 from models.network.spectral import LineSpec
 from models.policies.policies import class_errors, gain_of
 from models.reading.inference import CoarsePass, CoarsePrediction, load_overview, read_coarse_prediction, segment
-from models.reading.ood import OodDetector
 from models.reading.prior_map import (
     CurrentVisit,
     TemporalAgreement,

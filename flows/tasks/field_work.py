@@ -17,9 +17,10 @@ import scipy
 from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
-from models.evaluation.placement import COMPARED, classes_by
 from models.network.machine import PROCESSOR, give_back_freed_memory
+from models.network.ood import OodDetector
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
+from models.policies.placement import COMPARED, classes_by
 from models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
 from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.inference import (
@@ -29,7 +30,6 @@ from models.reading.inference import (
     read_coarse_prediction,
     save_overview,
 )
-from models.reading.ood import OodDetector
 from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights

@@ -42,10 +42,10 @@ from flows.tasks.stages.placement import tile_budget
 from flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
-from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.sizes import MultiplyAdds
 from models.network.spectral import LineSpec
+from models.policies.placement import CascadeTable
 from models.reading.prior_map import EVERY_PX
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import glob
 import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -15,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, SIM, Settings
-from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import NoSceneYet, NothingToMend, SceneError, SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.built_in import built_in_scene
 from pipeline.simulator.scenes.daylight import sun_elevation_deg
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.archive.keys import published_runs
@@ -131,6 +133,23 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
     )
     file = _judged_by_known(file, known)
     return _with_notes(scene_of_file(file, settings.camera), file, settings, "given their band's median")
+
+
+def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
+    """Turn a scene file into a scene of the simulator."""
+    scene = raster_from_values(
+        file.values,
+        camera,
+        name=file.name,
+        wavelength_nm=file.wavelength_nm,
+        fwhm_nm=file.fwhm_nm,
+        labels=file.labels,
+        class_names=file.class_names,
+        class_colours=file.class_colours,
+        key=file.light_hash,
+        geobox=file.geobox,
+    )
+    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
 
 
 def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -293,8 +312,23 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
     labels = np.frombuffer(bytearray(scene.labels.data).translate(order.tobytes()), np.uint8).reshape(scene.shape)
     trained = weights.record.get("split", {}).get("pixels", {}).get(scene.clear_key)
     if trained is not None:
-        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
+        bits = np.unpackbits(_packed_bits(trained), count=labels.size)
+        labels[bits.reshape(labels.shape).astype(bool)] = UNLABELLED
     return labels
+
+
+def pack_mask(mask: NDArray[np.bool_]) -> str:
+    """Encode a mask for the record of weights: bits, deflated, base64."""
+    return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
+
+
+def masks_contain(mask: str, other: str | None) -> bool:
+    """Return whether a mask of `pack_mask` contains all pixels of another one; None, every pixel, is in no mask."""
+    return other is not None and not (_packed_bits(other) & ~_packed_bits(mask)).any()
+
+
+def _packed_bits(text: str) -> NDArray[np.uint8]:
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
 
 
 class FieldSource:

@@ -59,7 +59,7 @@ def format_refusal(error: BaseException) -> str | None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     limited = limit != resource.RLIM_INFINITY
     known = (*_OF_MEMORY, *(_OF_LIMITED_MEMORY if limited else ()))
-    if isinstance(error, MemoryError) or any(words in text.lower() for words in known):
+    if isinstance(error, MemoryError) or any(sign in text.lower() for sign in known):
         allowed = f"; this process may take {limit / 1e9:.1f} GB (ulimit -v)" if limited else ""
         cause = text.partition(". ")[0].rstrip(".") or "the machine has no more"
         return (

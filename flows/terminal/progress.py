@@ -42,6 +42,19 @@ def on_stderr() -> Terminal:
     return Terminal(stderr=True, highlight=False)
 
 
+stderr = on_stderr()
+
+
+def say(message: str) -> None:
+    """Print an error on stderr, as one message."""
+    stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)
+
+
+def show_text(text: str, console: Console = stderr) -> None:
+    """Print text without markup, and leave the folding of its line to the terminal."""
+    console.print(escape(text), soft_wrap=True)
+
+
 def on_stdout() -> Terminal:
     """Return the console for results."""
     return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
@@ -107,14 +120,14 @@ BARS = (8, 24)  # columns of a bar: narrow, wide
 TIME = 7
 
 
-class _WordsOrLeft(TimeRemainingColumn):
-    """The time that is left, after the words of the task; a narrow line cuts it off."""
+class _TextOrLeft(TimeRemainingColumn):
+    """The time that is left, after the text of the task; a narrow line cuts it off."""
 
     def render(self, task: Task) -> Text:
-        words = task.fields["words"]
-        if words and (task.fields["ended"] or task.time_remaining is None):
-            return Text(words)
-        return Text(f"{words}  left " if words else "left ") + super().render(task)
+        text = task.fields["text"]
+        if text and (task.fields["ended"] or task.time_remaining is None):
+            return Text(text)
+        return Text(f"{text}  left " if text else "left ") + super().render(task)
 
 
 class StageProgress:
@@ -124,7 +137,7 @@ class StageProgress:
         self.console = console
         self.titles = titles or {}
         self._tasks: dict[str, TaskID] = {}
-        self._said: dict[str, float] = {}
+        self._printed: dict[str, float] = {}
         self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is
         self._listener = _listener.get()
         bar = BARS[console.width >= NARROW]
@@ -135,7 +148,7 @@ class StageProgress:
             ),
             BarColumn(bar, table_column=Column(width=bar)),
             TimeElapsedColumn(table_column=Column(width=TIME)),
-            _WordsOrLeft(table_column=Column(max_width=room, no_wrap=True, overflow="ellipsis")),
+            _TextOrLeft(table_column=Column(max_width=room, no_wrap=True, overflow="ellipsis")),
             console=console,
             disable=not console.is_terminal,
         )
@@ -149,31 +162,31 @@ class StageProgress:
     ) -> None:
         self._bars.stop()
 
-    def show(self, stage: str, done: float, words: str = "", *, ended: bool = False) -> None:
+    def show(self, stage: str, done: float, text: str = "", *, ended: bool = False) -> None:
         """Show the progress of a stage, 0..1, with a word or number; ``ended`` also where it failed."""
         self._now = None if ended else (stage, done)
         if self._listener is not None:
             self._listener(stage, done, 1.0)
         title = self.titles.get(stage, stage)
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(title, total=1.0, words="", ended=False)
-            self._said[stage] = time.monotonic()
-        self._bars.update(self._tasks[stage], completed=done, words=words, ended=ended)
-        if not self.console.is_terminal and (ended or time.monotonic() - self._said[stage] > LINE_EVERY_S):
-            self._said[stage] = time.monotonic()
+            self._tasks[stage] = self._bars.add_task(title, total=1.0, text="", ended=False)
+            self._printed[stage] = time.monotonic()
+        self._bars.update(self._tasks[stage], completed=done, text=text, ended=ended)
+        if not self.console.is_terminal and (ended or time.monotonic() - self._printed[stage] > LINE_EVERY_S):
+            self._printed[stage] = time.monotonic()
             left = None if ended else self._bars.tasks[self._tasks[stage]].time_remaining
             time_left = "" if left is None else f", {format_seconds(left)} left"
-            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip() + time_left, soft_wrap=True)
+            self.console.print(f"{title}: {done:.0%} {escape(text)}".rstrip() + time_left, soft_wrap=True)
 
     def watch(self, stage: str, state: str, done: float) -> None:
         """Show the progress of a running stage, or its end: ran, cached, skipped, failed."""
         running = state == "running"
         self.show(stage, done, "" if running else state, ended=not running)
 
-    def say(self, words: str) -> None:
-        """Show words beside the running stage; do nothing where none runs."""
+    def say(self, text: str) -> None:
+        """Show text beside the running stage; do nothing where none runs."""
         if self._now is not None:
-            self.show(*self._now, words)
+            self.show(*self._now, text)
 
 
 @contextmanager

@@ -16,10 +16,10 @@ from matplotlib.patheffects import withStroke
 from rich.console import Console
 from rich.markup import escape
 
-from flows.cli.app import AsJson, OutFile, stderr
 from flows.publish.panels import GRID, INK, PAPER, png
+from flows.settings.flags import AsJson, OutFile
 from flows.terminal.processes import writing
-from flows.terminal.progress import on_stdout, print_json, table
+from flows.terminal.progress import on_stdout, print_json, stderr, table
 from flows.tradeoff.entries import Point, Result, Setting, Tradeoff, measure_tradeoff
 from flows.tradeoff.stages import SEGMENT, SURVEY, TRADEOFFS, segment_tradeoff, survey_tradeoff
 from flows.tradeoff.store import STORE, store_tradeoff

@@ -261,14 +261,14 @@ def plan_every_way(seed: int, scene: str | None = None, weights: Path | None = N
     grid = SceneGrid(*run.scene.shape, run.described.config.patch)
     along, _, _ = cheapest_full(grid, run.camera, run.settings.cost)
     passes: dict[Setting, PlannedPass] = {}
-    for words, (step, exposure_ms) in SCANS.items():
+    for name, (step, exposure_ms) in SCANS.items():
         sweeps = uniform_sweeps(grid, run.camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        passes[words] = uniform_pass(run.weights, run.simulated, sweeps, grid, run.settings.cost, scan)
+        passes[name] = uniform_pass(run.weights, run.simulated, sweeps, grid, run.settings.cost, scan)
     whole = passes[format_scan(*PART_OF)]
     scores = score_patches(POLICY, whole.coarse)
-    for words, fraction in PARTS.items():
-        passes[words] = replace(whole, patch_index=np.sort(frame_patches(scores, fraction)))
+    for name, fraction in PARTS.items():
+        passes[name] = replace(whole, patch_index=np.sort(frame_patches(scores, fraction)))
     assert run.labels is not None
     return PlannedField(run.labels, run.costs, passes, check_labels(run.scene, run.described))
 

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import SignalChoice
-from flows.tasks.scene import check_labels, judged_labels
+from flows.tasks.scene import check_labels, judged_labels, scene_of_file
 from flows.tasks.stages.condense import with_shared_directions
 from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Figures, Setting, Tradeoff
-from flows.training.data import scene_of_file
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import LineSpec
 from models.reading.inference import CoarsePrediction, read_coarse_pass, read_coarse_prediction, segment

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import os
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,13 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.tasks.scene import scene_of_file
 from flows.terminal.figures import counted
 from pipeline.errors import SceneError, SettingsError, list_some
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
-from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.readers.label_files import (
     MatchedFiles,
     classes_of_files,
@@ -253,23 +252,6 @@ class TrainingData:
         return scene_of_file(self.files.load(name, "train"), self.camera)
 
 
-def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
-    """Turn a scene file into a scene of the simulator."""
-    scene = raster_from_values(
-        file.values,
-        camera,
-        name=file.name,
-        wavelength_nm=file.wavelength_nm,
-        fwhm_nm=file.fwhm_nm,
-        labels=file.labels,
-        class_names=file.class_names,
-        class_colours=file.class_colours,
-        key=file.light_hash,
-        geobox=file.geobox,
-    )
-    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
-
-
 def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:
     """Return built-in scenes to judge weights on, all in ``train``."""
     laws = built_in_laws(dataset)
@@ -350,25 +332,6 @@ def open_training_data(
         files=files,
         notes=files.notes,
     )
-
-
-def pack_mask(mask: NDArray[np.bool_]) -> str:
-    """Encode a mask for the record of weights: bits, deflated, base64."""
-    return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
-
-
-def unpack_mask(text: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Decode a mask of `pack_mask`."""
-    return np.unpackbits(_packed_bits(text), count=shape[0] * shape[1]).reshape(shape).astype(bool)
-
-
-def masks_contain(mask: str, other: str | None) -> bool:
-    """Return whether a mask of `pack_mask` contains all pixels of another one; None, every pixel, is in no mask."""
-    return other is not None and not (_packed_bits(other) & ~_packed_bits(mask)).any()
-
-
-def _packed_bits(text: str) -> NDArray[np.uint8]:
-    return np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
 
 
 def only_class(scene: RasterScene) -> str | None:

@@ -27,8 +27,8 @@ from models.evaluation.metrics import (
     judge_confidence,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from models.network.spectral import LineSpec
+from models.policies.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
@@ -97,7 +97,7 @@ def judge_scans(
         return None
     steps = [step for step in STEPS if all(len(one.labels) % step == 0 for one in known)]
     usual = [fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES]
-    exposures = [*(ms for ms in usual if ms > augmentation.darkest_ms), augmentation.darkest_ms]
+    exposures = [*(ms for ms in usual if ms > augmentation.min_exposure_ms), augmentation.min_exposure_ms]
     miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
     of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
     maps: dict[tuple[int, float], list[ScoredMap]] = {}

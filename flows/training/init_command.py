@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
-from flows.cli.app import AsJson, Switch, stderr
+from flows.settings.flags import AsJson, Switch
 from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
-from flows.terminal.progress import StageProgress, put_out
+from flows.terminal.progress import StageProgress, put_out, show_text, stderr
 from pipeline.errors import PipelineError, SceneError, SeriesError, SettingsError, list_some
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.whole_files import write_whole
@@ -257,7 +256,7 @@ def _show(record: dict[str, Any], console: Console) -> None:
         f"{'then' if first else 'next'}: {record['next']}",
     ]
     for line in lines:
-        console.print(escape(line), soft_wrap=True)
+        show_text(line, console)
 
 
 def _printable(text: str) -> str:

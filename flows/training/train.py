@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from flows.tasks.scene import masks_contain
 from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, check_out, masks_contain, open_training_data, read_farm_name
+from flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
 from flows.training.figures import (
     FEW_PIXELS,
     better_reading,
@@ -25,9 +26,9 @@ from flows.training.figures import (
     validate,
 )
 from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
-from models.evaluation.placement import CascadeTable
 from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
+from models.policies.placement import CascadeTable
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.ood_fit import fit_ood
@@ -110,7 +111,7 @@ def train_weights(
             scenes.train.examples,
             scenes.validation.examples,
             weights.normalisation,
-            darkest_ms=trained.exposure_ms[0],
+            min_exposure_ms=trained.exposure_ms[0],
             bands=trained.bands,
             seed=settings.seed,
             report=lambda done: report("fitting the out-of-distribution detector", done, ""),
@@ -122,13 +123,13 @@ def train_weights(
     return record
 
 
-def _trained_on(data: TrainingData, scenes: Scenes, darkest_ms: float) -> TrainedOn:
+def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
     nm = scenes.common.wavelength_nm
     trained = TrainedOn(
         bands=len(nm),
         wavelength_nm=(float(nm.min()), float(nm.max())),
-        exposure_ms=(darkest_ms, max(darkest_ms, data.camera.exposure_ms)),
+        exposure_ms=(min_exposure_ms, max(min_exposure_ms, data.camera.exposure_ms)),
         scenes=len(data.train),
         classes=scenes.common.names,
         bands_nm=tuple(nm.tolist()),
@@ -259,8 +260,8 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         for scores in (readings["miou"], record.get("baselines") or {})
     )
-    words = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
-    console.print(f"{words}kept: {readings['kept']}", soft_wrap=True)
+    text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
+    console.print(f"{text}kept: {readings['kept']}", soft_wrap=True)
     if of_baselines:
         console.print(f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}", soft_wrap=True)
     figures = record["validation"]

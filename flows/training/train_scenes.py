@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.tasks.scene import pack_mask
 from flows.terminal.figures import counted
-from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, scene_notes, trained_pixels
+from flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
 from flows.training.observed_scenes import observe_scene
 from models.network.machine import PROCESSOR
 from models.network.sizes import SegmenterConfig
@@ -208,6 +209,8 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
 
 
-def training_capture(normalisation: Normalisation, darkest_ms: float) -> CaptureAugmentation | None:
+def training_capture(normalisation: Normalisation, min_exposure_ms: float) -> CaptureAugmentation | None:
     """Return the simulation of shorter exposures and wider spacings; None for the reference exposure alone."""
-    return CaptureAugmentation(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
+    return (
+        CaptureAugmentation(normalisation, min_exposure_ms=min_exposure_ms) if min_exposure_ms < REFERENCE_MS else None
+    )

@@ -43,7 +43,7 @@ IN_SPRING = 0.4  # fraction of lands that are first visited then in any case
 GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
 HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
 SPACINGS = {1: 0.3, 2: 0.5, 4: 0.2}  # line spacing [px] -> fraction of the passes
-DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
+MIN_EXPOSURE_MS, MAX_EXPOSURE_MS = 3.0, 50.0
 PASSES = 2  # of each visit
 JUDGED_DAY = 172
 JUDGED_AFTER = (1, 3, 7)  # days
@@ -131,7 +131,7 @@ def _visit(
     drawn = []
     for _ in range(PASSES):
         step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
-        exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
+        exposure_ms = float(np.exp(rng.uniform(np.log(MIN_EXPOSURE_MS), np.log(MAX_EXPOSURE_MS))))
         observation = seen.observe(weights, augmentation, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
         drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))

@@ -1,1 +1,1 @@
-"""Scores of maps and of placements, with their uncertainty."""
+"""Scores of maps, with their uncertainty."""

@@ -231,10 +231,10 @@ class Segmenter(nn.Module):
         index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
         return overview.logits, self.read_patches(overview, cells.gather(1, index), patch_index)
 
-    def read_overview(self, image: Tensor, origin: Tensor | None = None, living: Tensor | None = None) -> Overview:
+    def read_overview(self, image: Tensor, origin: Tensor | None = None, valid: Tensor | None = None) -> Overview:
         """Compute the overview of an image (B, J + PLANES, H, W).
 
-        Tokens that are not ``living``, (tokens,) bool of a single scene, take no part in the attention.
+        Tokens that are not ``valid``, (tokens,) bool of a single scene, take no part in the attention.
         """
         height, width = image.shape[2:]
         gap = -width % TOKEN_PX, -height % TOKEN_PX
@@ -247,11 +247,11 @@ class Segmenter(nn.Module):
         if origin is not None:
             places = places + origin.cpu().double()[:, None]
         tokens = grid.flatten(2).transpose(1, 2) + code_2d(places, self.config.dim).to(grid.device)
-        if living is None:
+        if valid is None:
             read = self.encoder(tokens)
         else:
             read = torch.zeros_like(tokens)
-            read[:, living] = self.encoder(tokens[:, living])
+            read[:, valid] = self.encoder(tokens[:, valid])
         features[-1] = features[-1] + F.pixel_shuffle(self.from_token(read.transpose(1, 2).reshape(grid.shape)), BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
         columns = image[:, : self.config.columns].permute(0, 2, 3, 1)

@@ -20,7 +20,7 @@ SPREAD_FLOOR = 1e-3  # least spread of a column, as a fraction of the median spr
 VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a fraction of the largest
 Kind = TypeVar("Kind", bound=np.generic)
 PLANE_SCALES = np.array([4.0, 2.0, 2.0])  # of the logarithms of exposure, line spacing, binned samples
-MOST_DEAD = 0.5  # largest fraction of invalid pixels in a token or patch
+MOST_INVALID = 0.5  # largest fraction of invalid pixels in a token or patch
 MOST_COLUMN = 1e12  # of valid normalised columns; squares of larger values would overflow float32
 
 
@@ -69,12 +69,12 @@ def project(values: NDArray[np.floating], matrix: NDArray[np.float32]) -> NDArra
         seen = np.asarray(exact @ matrix, np.float32)
     broken = ~np.isfinite(exact).all(axis=-1)
     if broken.any():
-        living = np.isfinite(exact[broken])
-        weight = living.astype(np.float32) @ matrix
-        total = np.where(living, exact[broken], np.float32(0)) @ matrix
+        finite = np.isfinite(exact[broken])
+        weight = finite.astype(np.float32) @ matrix
+        total = np.where(finite, exact[broken], np.float32(0)) @ matrix
         mean = np.divide(total, weight, out=np.zeros_like(weight), where=weight > 0)
         mean[(weight <= 0) & (matrix.sum(axis=0) > 0)] = np.nan
-        mean[2 * living.sum(axis=1) < len(matrix)] = np.nan
+        mean[2 * finite.sum(axis=1) < len(matrix)] = np.nan
         seen[broken] = mean
     return seen
 
@@ -246,32 +246,32 @@ def with_planes(columns: NDArray[np.floating], capture: Capture, *, fainter: flo
     return np.concatenate([columns, planes], axis=-1, dtype=np.float32)
 
 
-def all_alive(columns: NDArray[np.floating]) -> bool:
+def all_valid(columns: NDArray[np.floating]) -> bool:
     """Return whether all pixels are valid, without a copy of the columns."""
     return not columns.size or bool(columns.min() >= -MOST_COLUMN and columns.max() <= MOST_COLUMN)
 
 
-def dead_pixels(columns: NDArray[np.floating]) -> NDArray[np.bool_]:
+def invalid_pixels(columns: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Return the invalid pixels, (..., column) -> (...): a column is not finite, or larger than any valid value."""
-    if all_alive(columns):
+    if all_valid(columns):
         return np.zeros(columns.shape[:-1], np.bool_)
-    alive = columns <= MOST_COLUMN  # avoids a copy of the columns
-    alive &= columns >= -MOST_COLUMN
-    return np.asarray(~alive.all(axis=-1), np.bool_)
+    valid = columns <= MOST_COLUMN  # avoids a copy of the columns
+    valid &= columns >= -MOST_COLUMN
+    return np.asarray(~valid.all(axis=-1), np.bool_)
 
 
-def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray[np.float32]:
+def fill_invalid(patches: NDArray[np.floating], invalid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Fill invalid pixels of patches (P, y, x, column) by the mean of the patch's valid ones, or by 0 without one."""
     filled = np.array(patches, np.float32)
-    for patch, holes in zip(filled, dead, strict=True):  # one by one saves memory
+    for patch, holes in zip(filled, invalid, strict=True):  # one by one saves memory
         if holes.any():
             patch[holes] = 0 if holes.all() else patch[~holes].mean(axis=0, dtype=np.float64)
     return filled
 
 
-def readable(dead: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def readable(invalid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which patches have enough valid pixels, (P, y, x) invalid pixels -> (P,)."""
-    return np.asarray(dead.mean(axis=(1, 2)) <= MOST_DEAD, np.bool_)
+    return np.asarray(invalid.mean(axis=(1, 2)) <= MOST_INVALID, np.bool_)
 
 
 def patches_of(image: NDArray[Kind], patch: int) -> NDArray[Kind]:

@@ -1,1 +1,1 @@
-"""Attention policies: which patches a fine look is worth, by the model, by the coarse image, or by nothing."""
+"""Attention policies: which patches to read in full, by the model, the coarse image or nothing; placements compared."""

@@ -17,9 +17,9 @@ from models.network.spectral import (
     Capture,
     CaptureMap,
     LineSpec,
-    all_alive,
-    dead_pixels,
-    fill_dead,
+    all_valid,
+    fill_invalid,
+    invalid_pixels,
     patches_of,
     readable,
     with_planes,
@@ -50,7 +50,7 @@ class CoarsePass:
     columns: NDArray[np.float32]  # (y, x, column) normalised
     capture: Capture = field(default=LineSpec(), kw_only=True)
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of its first patch in the field
-    living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) tokens that are read; None: all
+    valid_tokens: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) that are read; None: all
     out_of_range: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: captured, invalid
     filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) pixels without data; None: no pixel
 
@@ -119,30 +119,30 @@ def read_coarse_pass(
     if isinstance(capture, CaptureMap):
         gap = [(0, whole - size) for whole, size in zip(grid.padded_shape, capture.number.shape, strict=True)]
         capture = CaptureMap(capture.specs, np.pad(capture.number, gap, mode="edge"))
-    wild = dead_pixels(columns) & known
+    wild = invalid_pixels(columns) & known
     columns = np.ascontiguousarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
-    dead = dead_pixels(columns)
+    invalid = invalid_pixels(columns)
     return CoarsePass(
         grid,
         columns,
         capture=capture,
         origin=origin,
-        living=_mend(columns, grid.patch),
+        valid_tokens=_mend(columns, grid.patch),
         out_of_range=wild if wild.any() else None,
-        filled=dead if dead.any() else None,
+        filled=invalid if invalid.any() else None,
     )
 
 
 def _mend(columns: NDArray[np.float32], p: int) -> NDArray[np.bool_] | None:
     """Fill invalid pixels from their patch, in place; return which tokens are valid (None: all)."""
-    dead = dead_pixels(columns)
-    if not dead.any():
+    invalid = invalid_pixels(columns)
+    if not invalid.any():
         return None
-    holes = patches_of(dead, p)
+    holes = patches_of(invalid, p)
     for number in np.flatnonzero(holes.any(axis=(1, 2))):  # one by one: a copy of a field is large
         y, x = (p * int(at) for at in divmod(number, columns.shape[1] // p))
-        columns[y : y + p, x : x + p] = fill_dead(columns[None, y : y + p, x : x + p], holes[number][None])[0]
-    return readable(patches_of(np.pad(dead, [(0, -size % TOKEN_PX) for size in dead.shape], mode="edge"), TOKEN_PX))
+        columns[y : y + p, x : x + p] = fill_invalid(columns[None, y : y + p, x : x + p], holes[number][None])[0]
+    return readable(patches_of(np.pad(invalid, [(0, -size % TOKEN_PX) for size in invalid.shape], "edge"), TOKEN_PX))
 
 
 def coarse_prediction_of_columns(
@@ -153,9 +153,9 @@ def coarse_prediction_of_columns(
 ) -> CoarsePrediction:
     """Predict from normalised columns of the padded grid, (y, x, column); invalid pixels are filled."""
     given = np.ascontiguousarray(columns, np.float32)
-    mended = given if all_alive(given) else given.copy()
-    living = _mend(mended, grid.patch)
-    return read_coarse_prediction(weights, CoarsePass(grid, mended, capture=capture, living=living))
+    mended = given if all_valid(given) else given.copy()
+    valid_tokens = _mend(mended, grid.patch)
+    return read_coarse_prediction(weights, CoarsePass(grid, mended, capture=capture, valid_tokens=valid_tokens))
 
 
 def read_coarse_prediction(
@@ -200,7 +200,7 @@ def segment(
 
     ``patches`` (patch, p, p, column) are normalised columns and ``patch_index`` (patch,) their numbers on the grid,
     each once; without patches the map is the overview's. ``capture`` describes their capture; None is that of the
-    overview. Invalid pixels (`dead_pixels`) take the mean of their patch; a patch with more than half of its pixels
+    overview. Invalid pixels (`invalid_pixels`) take the mean of their patch; a patch with more than half of its pixels
     invalid is left out. With ``every_class`` the map has the log-probabilities of all classes.
 
     Raises ShapeError for a patch given twice or outside the grid.
@@ -263,11 +263,11 @@ def captured(
     patches: NDArray[np.floating], patch_index: NDArray[np.int64]
 ) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
     """Keep the patches with enough valid pixels, the others filled, and their numbers."""
-    dead = dead_pixels(patches)
-    if not dead.any():
+    invalid = invalid_pixels(patches)
+    if not invalid.any():
         return patches, patch_index
-    shown = readable(dead)
-    return fill_dead(patches[shown], dead[shown]), patch_index[shown]
+    shown = readable(invalid)
+    return fill_invalid(patches[shown], invalid[shown]), patch_index[shown]
 
 
 def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
@@ -286,10 +286,10 @@ def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
         return coarse_pass.overview
     network = weights.segmenter.eval()
     image = with_planes(coarse_pass.columns, coarse_pass.capture, fainter=FAINTER)
-    living = None if coarse_pass.living is None else torch.from_numpy(coarse_pass.living).to(network.device)
+    valid = None if coarse_pass.valid_tokens is None else torch.from_numpy(coarse_pass.valid_tokens).to(network.device)
     patches = TOKEN_PX / coarse_pass.grid.patch  # of a token
     origin = torch.tensor([coarse_pass.origin], dtype=torch.float64) / patches
-    return network.read_overview(torch.from_numpy(image[None]).permute(0, 3, 1, 2).to(network.device), origin, living)
+    return network.read_overview(torch.from_numpy(image[None]).permute(0, 3, 1, 2).to(network.device), origin, valid)
 
 
 def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:

@@ -113,9 +113,9 @@ class CaptureAugmentation:
     `models.network.spectral.LineSpec` after the spectral features.
     """
 
-    def __init__(self, normalisation: Normalisation, *, darkest_ms: float = 3.0) -> None:
+    def __init__(self, normalisation: Normalisation, *, min_exposure_ms: float = 3.0) -> None:
         self.normalisation = normalisation
-        self.darkest_ms = darkest_ms
+        self.min_exposure_ms = min_exposure_ms
         self.unwhiten = np.linalg.inv(normalisation.whitening.astype(np.float64)).astype(np.float32)
 
     def draw(self, columns: Tensor, noise: ColumnNoise, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
@@ -135,7 +135,7 @@ class CaptureAugmentation:
 
     def _light(self, rng: np.random.Generator) -> float:
         """Draw an exposure between the darkest and the reference, as a fraction of the latter."""
-        return float(np.exp(rng.uniform(np.log(self.darkest_ms / REFERENCE_MS), 0.0)))
+        return float(np.exp(rng.uniform(np.log(self.min_exposure_ms / REFERENCE_MS), 0.0)))
 
     def scan(
         self,

@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from models.network.ood import Exact, Limits, OodDetector
 from models.network.spectral import Normalisation
-from models.reading.ood import Exact, Limits, OodDetector
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation, ColumnNoise
 from models.training.examples import Example
 from pipeline.errors import SceneError
@@ -33,7 +33,7 @@ def fit_ood(
     validation: Sequence[Example],
     normalisation: Normalisation,
     *,
-    darkest_ms: float,
+    min_exposure_ms: float,
     bands: int,
     seed: int,
     report: Callable[[float], None] = lambda done: None,
@@ -47,7 +47,7 @@ def fit_ood(
             "no scene was kept for validation, which the false-alarm rate needs; train with --validation 1 or more"
         )
     rng = np.random.default_rng([seed, 0xFA3])
-    augmentation = CaptureAugmentation(normalisation, darkest_ms=darkest_ms)
+    augmentation = CaptureAugmentation(normalisation, min_exposure_ms=min_exposure_ms)
     gathered = []
     for number, example in enumerate(train):
         gathered += _drawn_spectra(example, normalisation, rng, SPECTRA // len(train) + 1)
@@ -130,8 +130,8 @@ def measured_limits(
 ) -> Limits:
     """Return quantiles of the distances of labelled pixels, for each line spacing and exposure."""
     noisy = all(example.noise is not None for example in examples)
-    light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.darkest_ms] if noisy else [1.0]
-    varied = noisy and augmentation.darkest_ms < REFERENCE_MS
+    light = [one for one in LIGHT if one * REFERENCE_MS >= augmentation.min_exposure_ms] if noisy else [1.0]
+    varied = noisy and augmentation.min_exposure_ms < REFERENCE_MS
     steps = tuple(step for step in STEPS if all(len(one.labels) % step == 0 for one in examples)) if varied else (1,)
     fine = np.empty((len(steps), len(light), len(RATES)))
     for j, fraction in enumerate(light):

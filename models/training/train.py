@@ -50,7 +50,7 @@ class TrainingSettings:
     average: float = 0.998  # decay of the averaged weights
     noise: float = 0.3  # largest added noise [spreads of the columns]
     weight_cap: float = 5.0
-    darkest_ms: float = REFERENCE_MS  # shortest simulated exposure of crops
+    darkest_ms: float = REFERENCE_MS  # shortest simulated exposure of crops; weights store the name
 
 
 @dataclass(frozen=True)

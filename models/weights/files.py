@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.evaluation.expected_scores import MapScores
+from models.network.ood import Limits, OodDetector
 from models.network.sizes import SegmenterConfig, TemporalSizes
 from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
-from models.reading.ood import Limits, OodDetector
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
 from pipeline.errors import WavelengthError, WeightsError
 from pipeline.lazy import Tensor, deferred, torch

@@ -37,9 +37,9 @@ class RecordedPasses:
     def uniform_scan(self) -> list[Sweep]:
         """Return all recorded sweeps as a uniform scan; SceneError where they differ in axis, step or binning."""
         if len(self._kinds) > 1:
-            words = "; ".join(f"along {along}, step {step}, binning {binning}" for along, step, binning in self._kinds)
+            kinds = "; ".join(f"along {along}, step {step}, binning {binning}" for along, step, binning in self._kinds)
             raise SceneError(
-                f"the recording holds lines of {len(self._kinds)} kinds ({words}), which are not one uniform scan; "
+                f"the recording holds lines of {len(self._kinds)} kinds ({kinds}), which are not one uniform scan; "
                 "give the --budget of a zoomed survey, or name sweeps of one kind"
             )
         return [one.sweep for one in self.source.sweeps]

@@ -67,8 +67,8 @@ class RigPose:
     elevation_m: float = stated(0.0, "Height of the ground below the rig above the ellipsoid", "m", -500, 9000)
 
     def __post_init__(self) -> None:
-        for name, words in misfits(self):
-            raise PoseError(f"the rig's pose: {name} {words}")
+        for name, fault in misfits(self):
+            raise PoseError(f"the rig's pose: {name} {fault}")
         if (self.height_m is None) == (self.range_m is None):
             raise PoseError(
                 "the rig's pose needs height_m or range_m, one of the two; got "

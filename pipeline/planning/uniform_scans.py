@@ -38,7 +38,7 @@ class UniformScan:
     spread: float | None = None  # standard deviation of the mIoU from scene to scene; None if unknown
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """Return a summary, such as "every 2nd line, 25 ms"."""
         return format_scan(self.step, self.exposure_ms)
 
@@ -197,23 +197,23 @@ def choose_scan(
         fastest = min(scans, key=lambda scan: scan.seconds)
         raise BudgetError(
             f"no uniform scan that the weights know ends within --seconds {seconds:g}; the least is "
-            f"{fastest.seconds + 0.005:.2f} s ({fastest.words})"
+            f"{fastest.seconds + 0.005:.2f} s ({fastest.summary})"
         )
     if not goals:
         best = max(scan.expected[MIOU] for scan in paid)
         return min((scan for scan in paid if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
     reaching = [scan for scan in scans if all(scan.expected[name] >= least for name, least in goals.items())]
     if not reaching:
-        told = " and ".join(
+        asked = " and ".join(
             f"{'' if name == MIOU else f'{name}='}{100 * least:g}, where the best scan has "
             f"{math.floor(1000 * max(scan.expected[name] for scan in scans)) / 10}"
             for name, least in goals.items()
         )
-        raise BudgetError(f"no scan of these weights reaches --goal {told}; ask for less")
+        raise BudgetError(f"no scan of these weights reaches --goal {asked}; ask for less")
     cheapest = min(reaching, key=lambda scan: scan.price)
     if seconds is not None and cheapest.seconds > seconds:
         raise BudgetError(
-            f"--goal takes {cheapest.seconds + 0.005:.2f} s ({cheapest.words}), --seconds is {seconds:g}; give more"
+            f"--goal takes {cheapest.seconds + 0.005:.2f} s ({cheapest.summary}), --seconds is {seconds:g}; give more"
         )
     return cheapest
 

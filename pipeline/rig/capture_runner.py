@@ -157,7 +157,7 @@ def _crc32(text: bytes) -> bytes:
     return b"%08x" % zlib.crc32(text)
 
 
-def say_nothing(words: str) -> None:
+def say_nothing(step: str) -> None:
     """Report no progress of the rig."""
 
 

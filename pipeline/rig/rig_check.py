@@ -124,12 +124,12 @@ def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
             rows.append(failed("mirror", asked, error))
             return
         off = math.dist((x, y), found)
-        words = f"read back {found[0]:.4f}; {found[1]:.4f}, {off:.1g} off"
+        text = f"read back {found[0]:.4f}; {found[1]:.4f}, {off:.1g} off"
         if not off <= FAR:
             mend = "it is not where it was sent: look at the mirror head and its cable before it moves again"
-            rows.append(CheckRow("mirror", asked, words, "fail", mend))
+            rows.append(CheckRow("mirror", asked, text, "fail", mend))
             return
-        rows.append(CheckRow("mirror", asked, words))
+        rows.append(CheckRow("mirror", asked, text))
 
 
 def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:

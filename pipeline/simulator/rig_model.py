@@ -145,8 +145,8 @@ class Rig:
             if not math.isfinite(value):
                 raise SettingsError(f"camera.{name} must be a finite number, got {value:g}")
         for place in ("optics", "mirror", "detector", "air", "sky"):
-            for name, words in misfits(getattr(self, place)):
-                raise SettingsError(f"{place}.{name} {words}")
+            for name, fault in misfits(getattr(self, place)):
+                raise SettingsError(f"{place}.{name} {fault}")
         if self.sky.started is not None and self.sky.started.tzinfo is None:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
 

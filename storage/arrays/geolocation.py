@@ -78,8 +78,8 @@ def _write_scan_path(sweep: zarr.Group, name: str, scan_path: ScanPath, table: T
         "starts": ("knot", scan_path.starts.astype(np.int64), {"long_name": "first member of each knot"}),
         "seen": ("knot", scan_path.seen, {"long_name": "whether any line saw the knot"}),
     }
-    for array, (dim, values, words) in columns.items():
-        write_small(group, array, (dim,), values, words)
+    for array, (dim, values, attributes) in columns.items():
+        write_small(group, array, (dim,), values, attributes)
     about = {"long_name": "knot coordinate and sample of every spacing-th pixel", "units": "1"}
     write_image(group, "tie_points", ("tie_y", "tie_x", "coordinate"), table.tie_points, about)
 

@@ -181,8 +181,8 @@ def geobox_of_group(group: zarr.Group) -> GeoBox | None:
         return None
     with damage_named(f"the grid of {group.store_path}"):
         sizes = {name: array.shape[0] for name, array in group.arrays() if name in ("x", "y")}
-        said = {**dict(group.attrs), "grid_mapping": GRID_MAPPING}
-        geobox = find_geobox(said, dict(group.arrays()), (sizes["y"], sizes["x"]), ("y", "x"))
+        attributes = {**dict(group.attrs), "grid_mapping": GRID_MAPPING}
+        geobox = find_geobox(attributes, dict(group.arrays()), (sizes["y"], sizes["x"]), ("y", "x"))
         if geobox is None:
             raise KeyError(f"{GRID_MAPPING}, x and y give none")
     return geobox
@@ -202,10 +202,10 @@ def find_geobox(
     single = [about for about in single if {"crs_wkt", "spatial_ref"} & set(about)]
     mapping = dict(arrays[named].attrs) if named in arrays else single[0] if len(single) == 1 else {}
     places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
-    said = next((about[name] for about, names in places for name in names if about.get(name)), None)
-    if said is None:
+    crs_name = next((about[name] for about, names in places for name in names if about.get(name)), None)
+    if crs_name is None:
         return None
-    crs = odc_crs.CRS(said)
+    crs = odc_crs.CRS(crs_name)
     numbers = str(mapping.get("GeoTransform", "")).split()
     if len(numbers) == 6:
         upright = Affine.from_gdal(*map(float, numbers))

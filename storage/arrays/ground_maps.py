@@ -112,10 +112,10 @@ class GroundMapWriter:
         if goes_on:
             images |= {"changed": ("<f4", CHANGED), OLD_CLASS: ("|u1", old_class_flags(legend))}
         self._images: dict[str, zarr.Array[Any]] = {}
-        for name, (kind, words) in images.items():
+        for name, (kind, attributes) in images.items():
             rest = {"rgb": 3} if name == PICTURE else {}
             spec = image_spec(("y", "x", *rest), (*geobox.shape, *rest.values()), kind)
-            self._images[name] = create_array(self._group, name, spec, {**words, **place, **ON_THE_MAP})
+            self._images[name] = create_array(self._group, name, spec, {**attributes, **place, **ON_THE_MAP})
 
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
         """Store one block of all images, by name.

@@ -221,10 +221,10 @@ def read_components(group: zarr.Group) -> Components:
     return Components(mean, axes, noise, spread=read_array(group, "spread") if "spread" in group else None)
 
 
-def step_of(group: zarr.Group, said: str = "scale_factor") -> float:
+def step_of(group: zarr.Group, attribute: str = "scale_factor") -> float:
     """Return the step of a store's scores, or another numeric attribute (IncompleteStoreError: damaged)."""
     with damage_named(str(group.store_path)):
-        return float(array_of(group, "scores").attrs[said])  # type: ignore[arg-type]
+        return float(array_of(group, "scores").attrs[attribute])  # type: ignore[arg-type]
 
 
 def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -193,8 +193,8 @@ def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, s
     yield from file.more.items()
 
 
-def _listed(words: list[str]) -> str:
-    return "{" + ", ".join(words) + "}"
+def _listed(items: list[str]) -> str:
+    return "{" + ", ".join(items) + "}"
 
 
 def write_recorded_files(cube: RawCube, folder: Path) -> Path:

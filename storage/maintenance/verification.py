@@ -62,15 +62,15 @@ def verify_everything(
         else:
             found.append(Finding(uri, "expected a folder with a manifest; take it out of the archive", "stray"))
     there = set(catalogue.stores)
-    told: set[str] = set()
+    reported: set[str] = set()
     for run in catalogue.runs:
-        for uri in sorted(run.names - there - told):
-            told.add(uri)
+        for uri in sorted(run.names - there - reported):
+            reported.add(uri)
             found.append(Finding(uri, f"is not there, but {run.uri} names it", "missing"))
     for uri in catalogue.stores:
         for given in catalogue.inputs_of(uri):
-            if given not in there | told:
-                told.add(given)
+            if given not in there | reported:
+                reported.add(given)
                 found.append(Finding(given, f"is not there, but {uri} was made of it", "missing"))
     return found
 

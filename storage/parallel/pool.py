@@ -195,13 +195,13 @@ def _send_away(
         if isinstance(error, WorkerError):
             raise
         if isinstance(error, CancelledError):
-            words = "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
+            advice = "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
         else:
-            words = (
+            advice = (
                 "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
                 "--scheduler threads"
             )
-        raise WorkerError(f"{team.name}: {words}") from None
+        raise WorkerError(f"{team.name}: {advice}") from None
 
 
 def _itself(make: Callable[[Any], Any]) -> Callable[[Any], Any]:

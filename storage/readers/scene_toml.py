@@ -159,11 +159,11 @@ def settle_wavelengths(
     if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
         centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
         return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
-    told = "nothing says their wavelengths"
+    why = "nothing says their wavelengths"
     if known.wavelength_nm is not None:
-        told = f"its header has {len(known.wavelength_nm)} wavelengths; correct that list"
+        why = f"its header has {len(known.wavelength_nm)} wavelengths; correct that list"
     raise WavelengthError(
-        f"{path} has {file_bands} bands and {told}; write wavelengths_nm or wavelengths_file into a scene.toml beside "
+        f"{path} has {file_bands} bands and {why}; write wavelengths_nm or wavelengths_file into a scene.toml beside "
         f"it, or give survey --wavelengths in nm (axes are y, x, band)"
     )
 

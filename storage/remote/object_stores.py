@@ -157,7 +157,7 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
     except (BaseError, FileNotFoundError, PermissionError) as error:
         if isinstance(error, FileNotFoundError) and "NoSuchBucket" not in str(error):
             raise
-        known = (words for signs, words in _MEANINGS if any(sign in str(error) for sign in signs))
+        known = (advice for signs, advice in _MEANINGS if any(sign in str(error) for sign in signs))
         at = "" if place.endpoint is None else f" at {place.endpoint}"
         raise UnreachableError(f"{place.url}{at}: {next(known, _first_line(error))}") from error
 

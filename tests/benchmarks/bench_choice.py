@@ -17,7 +17,7 @@ from flows.training.figures import read_twice
 from flows.training.observed_scenes import observe_scene
 from flows.training.train_scenes import training_capture
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import COMPARED, ReadTwice
+from models.policies.placement import COMPARED, ReadTwice
 from models.training.examples import Example, normalised
 from models.weights.files import load_weights
 from pipeline.geometry.camera import LineCamera

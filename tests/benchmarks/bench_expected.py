@@ -33,7 +33,7 @@ from pipeline.geometry.grid import SceneGrid
 
 SCENES = 32
 SEED = 4
-DARKEST_MS = 3.0
+MIN_EXPOSURE_MS = 3.0
 GOAL = 0.85
 SCANS = [(step, light * REFERENCE_MS) for step in STEPS for light in SCAN_EXPOSURES]
 LIKELIEST = (-3.92, 1.32, 0.89, 0.48, 0.87)  # numbers of `PRESENT` by the likelihood of presence: the start of the fit
@@ -49,7 +49,7 @@ def scenes() -> dict[str, Scans]:
     weights = load_weights(shipped_weights())
     camera = LineCamera()
     found: dict[str, Scans] = {}
-    augmentation = training_capture(weights.normalisation, DARKEST_MS)
+    augmentation = training_capture(weights.normalisation, MIN_EXPOSURE_MS)
     reached = np.ones(weights.basis.columns, bool)
     assert augmentation is not None
     data = open_training_data("farm@2,scouting@1", SCENES, 2, camera)

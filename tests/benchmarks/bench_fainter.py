@@ -13,8 +13,8 @@ from unittest import mock
 from measure import Row
 from rich.console import Console
 
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from models.reading.inference import FAINTER
 
 SEEDS = (51, 52, 53, 0, 41, 42, 43)

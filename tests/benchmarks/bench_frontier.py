@@ -135,7 +135,7 @@ def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None 
 
 
 def _promise(scan: UniformScan) -> str:
-    return f"{scan.words} (expected {100 * scan.expected[MIOU]:.1f})"
+    return f"{scan.summary} (expected {100 * scan.expected[MIOU]:.1f})"
 
 
 def _mean(judged: Judged) -> float:

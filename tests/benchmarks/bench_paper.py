@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from paper_sets import CAMERA, INPUTS, PATCH, DataSet, Image, Say, coarse_image, farm_all, farm_four, folder
 
 from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
-from models.evaluation.placement import CONTROL_FRACTION, RANDOM_DRAWS
 from models.network.machine import keep_freed_memory, one_thread
 from models.network.sizes import multiply_adds
 from models.network.spectral import LineSpec, patches_of
+from models.policies.placement import CONTROL_FRACTION, RANDOM_DRAWS
 from models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from models.training.examples import normalised, observe

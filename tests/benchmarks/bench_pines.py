@@ -206,7 +206,8 @@ def _settings() -> TrainingSettings:
 
 
 def _scene(folder: Path) -> RasterScene:
-    from flows.training.data import load_data_set, scene_of_file
+    from flows.tasks.scene import scene_of_file
+    from flows.training.data import load_data_set
     from pipeline.geometry.camera import LineCamera
 
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())

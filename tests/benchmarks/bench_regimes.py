@@ -30,9 +30,9 @@ from measure import Row
 from numpy.typing import NDArray
 from rich.console import Console
 
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey
 from flows.tasks import scene as scenes
 from flows.tasks.run import open_run
 from pipeline.geometry.grid import patch_pixels

@@ -27,11 +27,11 @@ from flows.training.data import farm_test_data, open_training_data
 from flows.training.figures import read_twice
 from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import ReadTwice, run_controls
 from models.network.machine import choose_device
 from models.network.segmenter import Segmenter
 from models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths, multiply_adds
 from models.network.spectral import Normalisation
+from models.policies.placement import ReadTwice, run_controls
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
@@ -125,14 +125,14 @@ def rows(steps: int = STEPS) -> list[Row]:
 CUT: tuple[Sizes, ...] = ((8, 12, 64), (12, 12, 64))
 CUT_ON = 176  # scenes
 CUT_RATE = 6e-4  # learning rate
-DARKEST_MS = 3.0  # shortest exposure of crops [ms]
+MIN_EXPOSURE_MS = 3.0  # shortest exposure of crops [ms]
 
 
 def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
     """Return a row for each network that is cut out of the shipped weights and trained further: our lead over it."""
     shipped = load_weights(shipped_weights())
     camera = LineCamera()
-    settings = TrainingSettings(steps=steps, minutes=600.0, learning_rate=CUT_RATE, seed=5, darkest_ms=DARKEST_MS)
+    settings = TrainingSettings(steps=steps, minutes=600.0, learning_rate=CUT_RATE, seed=5, darkest_ms=MIN_EXPOSURE_MS)
     laws = f"{FARM_LAW},{SCOUTING_LAW}"
     data = open_training_data(laws, 0, trained_on, camera)
     held_out = [farm_test_data(4, camera, law).train for law in (FARM_LAW, SCOUTING_LAW)]
@@ -141,7 +141,7 @@ def cut_rows(steps: int, trained_on: int = CUT_ON) -> list[Row]:
     scenes = observe_all(asked, data, lambda what, done, figure: None).normalised(shipped.normalisation)
     ours = read_twice(shipped, scenes.validation.examples)
     classes = shipped.config.classes
-    augmentation = training_capture(shipped.normalisation, DARKEST_MS)
+    augmentation = training_capture(shipped.normalisation, MIN_EXPOSURE_MS)
     found: list[Row] = []
     for overview_width, width, _ in CUT:
         config = replace(shipped.config, overview_width=overview_width, width=width)

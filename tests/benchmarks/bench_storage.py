@@ -102,9 +102,9 @@ def _warm(folder: Path) -> Row:
     """Repeat a finished survey, and compare the time of its stages with that of the first run."""
     from rich.console import Console
 
-    from flows.publish.survey_command import run_survey
     from flows.settings.load import load_settings
     from flows.survey import draw_class_map
+    from flows.survey_command import run_survey
     from flows.tasks.open_survey import OpenSurvey
     from flows.tasks.run import open_run
 

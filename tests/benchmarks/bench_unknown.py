@@ -18,8 +18,8 @@ from measure import Row, data_folder, not_run
 from numpy.typing import NDArray
 from rich.console import Console
 
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from flows.tasks.survey_model import shipped_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

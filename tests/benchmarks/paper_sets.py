@@ -18,7 +18,8 @@ from measure import ROOT
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name, scene_of_file
+from flows.tasks.scene import scene_of_file
+from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import LineSpec, SpectralBasis
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture

@@ -19,6 +19,7 @@ OTHERS = {  # other meanings of these words in these files
     "track": ("pipeline/simulator/scenes/farm", "pipeline/simulator/optics"),  # a class of the farm
     "strips": ("models/reading", "flows/publish", "storage/readers", "flows/tasks"),  # of rows of an image
     "panel": ("flows/publish",),  # of a figure
+    "dead": ("pipeline/signal", "pipeline/simulator"),  # elements of a detector
 }
 KEPT = {"LookupError", "ProcessLookupError", "shares_memory"}  # names of Python and numpy
 PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z][a-z0-9]*|[a-z0-9]+")  # the words of a name in snake or camel case

@@ -128,7 +128,7 @@ class Nursery:
 def serve(choices: Path) -> None:
     """Fork a child for each request on stdin, or wait for one; a folder keeps the children's choices of effects."""
     for name in (
-        *("flows.cli.main", "flows.publish.run_folder", "flows.publish.survey_command", "flows.survey"),
+        *("flows.cli.main", "flows.publish.run_folder", "flows.survey_command", "flows.survey"),
         *("flows.cli.survey_verbs", "flows.archive.commands", "matplotlib.backends.backend_agg"),
         *("models.network.segmenter", "rich.status", "safetensors.torch", "scipy.optimize", "tests.faults.injection"),
         *("pipeline.signal.compiled_loops", "pipeline.simulator.compiled_loops", "rasterio", "skimage.color"),

@@ -68,13 +68,13 @@ def test_2_values_of_a_dead_token_do_not_leak(bad: float):
     model = make_network(layers=2)
     image = _image(64, 96)
     said: list[Tensor] = []
-    living = torch.tensor([True, True, False, True, True, True])
+    valid = torch.tensor([True, True, False, True, True, True])
     spoiled = image.clone()
     spoiled[..., 15:17, 79:81] = bad  # convolutions spread it to the token's border
     model.from_token.register_forward_hook(lambda module, given, out: said.append(given[0].flatten(2)))
-    overviews = [model.read_overview(one, None, living) for one in (image, spoiled)]
+    overviews = [model.read_overview(one, None, valid) for one in (image, spoiled)]
     assert (said[0] - said[1]).abs().max() <= 1e-6
-    assert said[0][..., living].std() > 0.1
+    assert said[0][..., valid].std() > 0.1
     apart = (overviews[0].logits - overviews[1].logits)[..., :57].abs()  # 7 px and more from the dead token
     assert apart.max() <= 1e-6
 

@@ -21,8 +21,8 @@ from rasterio.enums import ColorInterp
 import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
 from flows.publish.run_folder import Published
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from pipeline.ground.georeference import pixel_rows_m2
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import open_archive, verify_archive

@@ -24,8 +24,8 @@ from scipy import ndimage
 from flows.archive.export_command import run_export
 from flows.archive.export_layers import ProductFlags, choose_products, open_exported
 from flows.archive.export_zones import ClassRaster, check_zones, dose_cells
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose

@@ -22,8 +22,8 @@ import storage.readers.recordings
 from flows.archive.commands import run_verify
 from flows.archive.reprocess_command import run_reprocess
 from flows.publish.run_folder import Published, load_receipt
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from flows.terminal.processes import DONE, FAILED
 from models.weights.files import save_weights
 from pipeline.errors import SceneError, SettingsError

@@ -27,7 +27,7 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
+from models.policies.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
 from pipeline.simulator.effects.pointing import PointingErrors

@@ -261,7 +261,7 @@ def raster_from_values(
         raise SceneError(f"scene {name} is {values.shape[:2]} px, its labels {labels.shape}; crop or pad one")
     if (found := find_beyond(values)) is not None:
         raise SceneError(
-            f"scene {name} has {found.words()}, beyond the {MOST_VALUE:g} that readings reach; put NaN where there is"
+            f"scene {name} has {found.text()}, beyond the {MOST_VALUE:g} that readings reach; put NaN where there is"
             " no data, or give the values in a larger unit"
         )
     planes = np.ascontiguousarray(values, dtype=np.float32)

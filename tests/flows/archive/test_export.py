@@ -21,8 +21,8 @@ from rich.console import Console
 
 from flows.archive.export_command import run_export
 from flows.archive.export_layers import ExportedRun
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
 from storage.archive.archive import Archive
 from storage.readers.envi_files import open_envi_cube

@@ -14,8 +14,8 @@ from PIL import Image
 
 import models.reading.prior_map as prior_map
 from flows.archive.export_command import run_export
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from models.weights.files import load_weights, save_weights, with_record
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.exported_run import POSE, Exported

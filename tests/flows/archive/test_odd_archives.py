@@ -9,8 +9,8 @@ from unittest.mock import Mock
 
 import pytest
 
+from flows import survey_command
 from flows.cli.main import main
-from flows.publish import survey_command
 from flows.tasks.local_server import ServerUnavailable
 from storage.archive.archive import Archive
 from storage.archive.staging import file_hash

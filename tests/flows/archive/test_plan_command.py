@@ -15,9 +15,9 @@ import pytest
 from rich.console import Console
 
 from flows.archive.plan_command import KEPT_FROM, estimated_bytes, plan_content, show_plan
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey
 from flows.tasks.run import open_run
 from flows.terminal.figures import format_seconds
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from flows.archive.export_command import run_export
 from flows.archive.export_layers import ProductFlags, choose_products
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from flows.tasks.patch_budget import ReadingCosts
 from flows.terminal.figures import format_area, format_count
 from models.weights.files import describe_weights

@@ -14,8 +14,8 @@ from rich.console import Console
 from flows.archive import stale_runs as generations
 from flows.archive.commands import run_verify
 from flows.archive.reprocess_command import run_reprocess
-from flows.publish.survey_command import run_survey
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import SettingsError, WeightsError
 from storage.archive.archive import Archive

@@ -175,7 +175,7 @@ def test_receipts_of_finished_surveys_are_printed_after_an_interrupt(
 ) -> None:
     """After Ctrl-C in the second survey the JSON object has the first one."""
     published = Mock(side_effect=[Mock(receipt={"survey": "a"}), KeyboardInterrupt])
-    monkeypatch.setattr("flows.publish.survey_command.run_survey", published)
+    monkeypatch.setattr("flows.survey_command.run_survey", published)
     ended = command_line("survey", field_file("a"), field_file("b"), "--json")
     assert (ended.code, json.loads(ended.out)) == (130, {"surveys": [{"survey": "a"}]})
 

@@ -13,7 +13,7 @@ import pytest
 
 from flows.cli import main as cli
 from flows.cli.app import GOES_ON, VERBS, build_app
-from flows.cli.survey_verbs import IN_TABLES
+from flows.settings.flags import IN_TABLES
 from flows.settings.load import SURVEY, TABLES
 from flows.terminal.progress import print_json
 from tests.flows.conftest import python

@@ -15,7 +15,8 @@ from flows.cli.main import main
 from flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
 from flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
 from flows.evaluate.judge import ORACLE, collect_row, difference, judge_frame, seeds_of, summarise
-from flows.training.data import farm_test_data, pack_mask
+from flows.tasks.scene import pack_mask
+from flows.training.data import farm_test_data
 from flows.training.train import train_weights
 from flows.training.train_scenes import TrainRequest
 from models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy

@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 
 from flows.cli.serve_command import load_fields
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey
 from flows.tasks.scene import scene_of_visit
 from pipeline.errors import NoSceneYet, NothingToMend, SettingsError, WeightsError
 from tests.conftest import QUIET

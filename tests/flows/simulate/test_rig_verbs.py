@@ -17,7 +17,7 @@ import pytest
 import serial
 
 from flows.cli.rig_commands import _write_survey, emulated_settings, run_emulate
-from flows.cli.survey_verbs import RenderingFlags
+from flows.settings.flags import RenderingFlags
 from flows.settings.load import SURVEY, TABLES, load_settings
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from tests.conftest import QUIET

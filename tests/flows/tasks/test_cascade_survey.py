@@ -12,7 +12,7 @@ import xarray as xr
 
 from flows.archive.plan_command import plan_content
 from flows.settings.load import load_settings
-from models.evaluation.placement import CascadeTable
+from models.policies.placement import CascadeTable
 from models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Flags, Survey, random_weights
 from tests.prior_work import without_effects

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from flows.publish.receipt_table import finding_rows
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
+from flows.survey_command import run_survey
 from flows.tasks.capture_plan import PassLayout
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid, patch_pixels

@@ -12,7 +12,7 @@ from flows.tasks.run import open_run
 from flows.tasks.survey_model import shipped_weights, weights_path
 from flows.tradeoff.store import coarse_of_sweeps
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import ReadTwice, placement_figures, run_controls
+from models.policies.placement import ReadTwice, placement_figures, run_controls
 from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera

@@ -85,9 +85,9 @@ def record() -> dict[str, dict[str, int | str]]:
 
 
 def test_an_edited_constant_changes_the_stages_that_reach_it() -> None:
-    """MOST_DEAD, for the filling of dead pixels, changes the stages that run the model and no others."""
+    """MOST_INVALID, for the filling of invalid pixels, changes the stages that run the model and no others."""
     assert set(ROOTS) == set(VERSIONS)
-    module, name = sources().named("MOST_DEAD")
+    module, name = sources().named("MOST_INVALID")
     texts = read_packages(ROOT)
     edited = re.sub(rf"^{name} = ", f"{name} = 0.5 * ", texts[module], flags=re.M)
     assert edited != texts[module]
@@ -115,8 +115,8 @@ def test_every_barrier_is_reached() -> None:
 @pytest.mark.parametrize(
     ("stage", "names"),
     {
-        "score": ("PixelScore", "Encoder", "fill_dead", "SceneGrid"),
-        "segment": ("Encoder", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
+        "score": ("PixelScore", "Encoder", "fill_invalid", "SceneGrid"),
+        "segment": ("Encoder", "fill_invalid", "MOST_INVALID", "Segmenter", "write_class_tile"),
         "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "lines_by_time", "EFFECTS"),
         "condense": ("find_components", "find_rare", "calibrate", "SignalCubeWriter"),
         "rectify": ("mosaic_tile", "LineCache", "MosaicWriter"),

@@ -14,10 +14,10 @@ import xarray as xr
 import zarr
 
 from flows.publish.publishing import clear_raw, publish
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
 from flows.survey import draw_class_map, survey
+from flows.survey_command import run_survey
 from flows.tasks.captures import plan_capture
 from flows.tasks.open_survey import OpenSurvey
 from flows.tasks.stage import Product, Stage, Wanted

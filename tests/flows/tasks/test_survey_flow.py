@@ -16,7 +16,7 @@ import pytest
 from pydantic import ValidationError
 
 from flows import survey as survey_flow
-from flows.publish import survey_command
+from flows import survey_command
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
 from flows.survey import capture, draw_class_map

@@ -19,8 +19,8 @@ from rich.console import Console
 from flows.publish.receipt import check_receipt
 from flows.publish.receipt_table import finding_rows
 from flows.publish.run_folder import Published
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from flows.tasks.scene import open_scene
 from models.network.spectral import LineSpec
 from models.reading.inference import segment

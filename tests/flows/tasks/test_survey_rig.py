@@ -18,9 +18,9 @@ import flows.tasks.prefect_tasks
 import flows.tasks.rig_field
 import flows.terminal.progress
 from flows.publish.run_folder import Published
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey_command import run_survey
 from flows.tasks.run import make_source, open_run
 from flows.tasks.scene import open_scene
 from flows.tasks.stages.effects import chosen_effects

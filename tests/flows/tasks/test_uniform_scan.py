@@ -14,8 +14,8 @@ from PIL import Image
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
 from flows.publish.receipt_table import finding_rows
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from flows.tasks.run import SurveyRun, open_run
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import QUIET, Flags, Survey, WeightsMaker

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.tasks.survey_model import beyond_training
-from models.reading.ood import Limits, OodDetector
+from models.network.ood import Limits, OodDetector
 from models.weights.files import TrainedOn, add_ood, describe_weights
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey_command import run_survey
 from flows.tradeoff import stages
 from flows.tradeoff.command import tradeoff
 from flows.tradeoff.entries import Tradeoff, measure_tradeoff

@@ -26,8 +26,8 @@ from flows.training.figures import judge_baselines
 from flows.training.train import run_train, train_weights
 from flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement import ReadTwice
 from models.network.spectral import SpectralBasis
+from models.policies.placement import ReadTwice
 from models.training.examples import Example
 from models.training.train import TrainingSettings
 from models.weights.files import TrainedOn, describe_weights, load_weights

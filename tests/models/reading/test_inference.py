@@ -163,7 +163,7 @@ def test_a_token_dead_in_most_of_its_pixels_is_left_out(more: int):
     whole = inference.read_coarse_pass(weights, [values], NM, grid).columns
     values[:16, :32], values[16, :more], values[41:43, 50:53] = np.nan, np.inf, -np.inf
     seen = inference.read_coarse_pass(weights, [values], NM, grid)
-    assert seen.living.tolist() == [not more, True, True, True]
+    assert seen.valid_tokens.tolist() == [not more, True, True, True]
     hole = np.zeros((64, 64), bool)
     hole[:16, :32], hole[16, :more], hole[41:43, 50:53] = True, True, True
     assert (seen.columns[~hole] == whole[~hole]).all()
@@ -203,6 +203,6 @@ def test_logits_that_are_not_finite_give_no_class(value: float):
 def test_a_pass_without_dead_pixels_has_no_mask():
     """No token is left out, and no pixel is filled."""
     seen = inference.read_coarse_pass(make_weights(), [_values(30, 31)], NM, SceneGrid(30, 31, 8))
-    assert (seen.living, seen.filled, seen.out_of_range) == (None, None, None)
+    assert (seen.valid_tokens, seen.filled, seen.out_of_range) == (None, None, None)
     assert seen.seen_columns is seen.columns
     assert inference.CoarsePass(seen.grid, seen.columns).capture == LineSpec()

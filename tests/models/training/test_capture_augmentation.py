@@ -55,9 +55,9 @@ def test_whitening_does_not_amplify_noise() -> None:
     np.testing.assert_allclose(sizes[1], [1, math.sqrt(0.5)], atol=0.02)
 
 
-def _augmentation(darkest_ms: float = 3.0) -> tuple[CaptureAugmentation, Normalisation]:
+def _augmentation(min_exposure_ms: float = 3.0) -> tuple[CaptureAugmentation, Normalisation]:
     normalisation = Normalisation.measured(0.3 + 0.05 * np.random.default_rng(5).normal(size=(4000, 12)))
-    return CaptureAugmentation(normalisation, darkest_ms=darkest_ms), normalisation
+    return CaptureAugmentation(normalisation, min_exposure_ms=min_exposure_ms), normalisation
 
 
 def _flat(normalisation: Normalisation, value: float, shape: tuple[int, int]) -> np.ndarray:

@@ -120,7 +120,7 @@ def test_crops_contain_labelled_pixels():
 def test_crops_are_augmented_if_their_noise_is_known():
     """Planes of these crops are those of shorter exposures; planes of a scene without noise stay 0."""
     plain = Normalisation(np.zeros(1, np.float32), np.ones(1, np.float32), np.eye(1, dtype=np.float32))
-    augmentation = CaptureAugmentation(plain, darkest_ms=10.0)
+    augmentation = CaptureAugmentation(plain, min_exposure_ms=10.0)
     for known in (ColumnNoise(np.full(1, 1e-4), np.full((1, 1), 1e-4)), None):
         sampler = CropSampler([replace(_example((64, 64)), noise=known)], 8, 32, augmentation=augmentation)
         batch = sampler.draw(4, np.random.default_rng(0), np.zeros(1, np.float32))

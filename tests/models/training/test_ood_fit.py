@@ -32,7 +32,7 @@ def scene(seed: int, side: int = 48) -> Example:
 def test_known_spectra_are_unknown_at_the_stated_rate() -> None:
     """The scenes were not used for the fit; spectra of no class, also of unlabelled pixels, are unknown."""
     fitted, validated = ([scene(i) for i in numbers] for numbers in (range(4), range(10, 13)))
-    ood_detector = fit_ood(fitted, validated, PLAIN, darkest_ms=3.0, bands=9, seed=0)
+    ood_detector = fit_ood(fitted, validated, PLAIN, min_exposure_ms=3.0, bands=9, seed=0)
     fresh = np.concatenate([scene(i).columns[4:].reshape(-1, COLUMNS) for i in range(20, 26)])
     assert 0.004 < ood_detector.unknown(fresh, rate=0.01, capture=LineSpec(), bands=9).mean() < 0.02
     out_of_range = np.array([[2.0, 0.0, 2.0], [3.0, 3.0, 3.0], [50.0, 50.0, 50.0], [1.0, 4.0, 3.0]])
@@ -42,19 +42,19 @@ def test_known_spectra_are_unknown_at_the_stated_rate() -> None:
 def test_every_capture_that_training_shows_has_limits() -> None:
     """Limits cover each spacing and light, down to the darkest; without known noise only one of each."""
     given = [scene(0)], [scene(1, 40)], PLAIN
-    limits = fit_ood(*given, darkest_ms=12.0, bands=9, seed=0).limits
+    limits = fit_ood(*given, min_exposure_ms=12.0, bands=9, seed=0).limits
     assert (limits.steps, limits.light.tolist()) == ((1, 2, 4, 8), [0.12, 0.25, 0.5, 1.0])
     assert limits.fine.shape == (4, 4, 7)
     assert (np.diff(limits.fine, axis=-1) <= 0).all()
     silent = [[replace(one, noise=None) for one in some] for some in given[:2]]
-    bare = fit_ood(silent[0], silent[1], PLAIN, darkest_ms=12.0, bands=9, seed=0).limits
+    bare = fit_ood(silent[0], silent[1], PLAIN, min_exposure_ms=12.0, bands=9, seed=0).limits
     assert (bare.steps, bare.light.tolist(), bare.fine.shape) == ((1,), [1.0], (1, 1, 7))
 
 
 def test_fit_needs_validation_scenes() -> None:
     """Without them the rate of known pixels that are called unknown cannot be measured."""
     with pytest.raises(SceneError, match="no scene was kept"):
-        fit_ood([scene(0)], [], PLAIN, darkest_ms=3.0, bands=9, seed=0)
+        fit_ood([scene(0)], [], PLAIN, min_exposure_ms=3.0, bands=9, seed=0)
 
 
 def test_repeated_columns_have_an_invertible_covariance() -> None:

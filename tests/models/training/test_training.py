@@ -201,7 +201,7 @@ def test_discriminants_do_not_rely_on_brightness() -> None:
 def test_discriminants_are_fitted_to_dark_pixels() -> None:
     """Weights for dark crops are less than half of those for bright ones; scenes without known noise stay bright."""
     plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
-    augmentation = CaptureAugmentation(plain, darkest_ms=3.0)
+    augmentation = CaptureAugmentation(plain, min_exposure_ms=3.0)
     silent = block_example(64, 16)
     noisy = replace(silent, noise=ColumnNoise(np.zeros(2), 0.01 * np.eye(2)))
     drawn = [

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
+from models.network.ood import OodDetector
 from models.network.sizes import TemporalSizes
 from models.network.temporal_reader import TemporalReader
-from models.reading.ood import OodDetector
 from models.weights import files
 from pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
-from tests.models.reading.test_ood import some_limits
+from tests.models.network.test_ood import some_limits
 
 SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
 

@@ -10,8 +10,8 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.network.ood import Limits, OodDetector
 from models.network.spectral import LineSpec
-from models.reading.ood import Limits, OodDetector
 
 COLUMNS = 5
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.evaluation import placement
 from models.evaluation.metrics import agreement, confusion, mean_iou
+from models.policies import placement
 from models.reading.inference import coarse_prediction_of_columns, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid

@@ -50,8 +50,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
     keep_freed_memory()
     with StageProgress(console, TITLES) as progress:
 
-        def note(words: str) -> None:
-            console.print(f"[dim]note: {escape(words)}[/]", soft_wrap=True)
+        def note(text: str) -> None:
+            console.print(f"[dim]note: {escape(text)}[/]", soft_wrap=True)
 
         with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
