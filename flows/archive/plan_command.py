@@ -307,8 +307,8 @@ def _of_camera(run: SurveyRun, fine: FinePlan | None) -> dict[str, Estimate]:
     if fine is None and (second := run.second_pass) is not None:
         record = None if run.recorded else run.scan_record
         left = raw_bytes(second.swaths, camera, bands) - second.interlaces * captured
-        shortest = camera if record is None else replace(camera, exposure_ms=record.offered_ms(camera)[0])
-        lines = int(run.plan.fine_s / (shortest.frame_ms * 1e-3))
+        offered_ms = second.recorded_ms or ((camera.exposure_ms,) if record is None else record.offered_ms(camera))
+        lines = int(run.plan.fine_s / (replace(camera, exposure_ms=offered_ms[0]).frame_ms * 1e-3))
         captured += min(lines * camera.samples * bands * BYTES_PER_SAMPLE, left)
     seconds = run.plan.coarse_s + (run.plan.fine_s if fine is None else fine.seconds)
     return {

@@ -103,25 +103,28 @@ class PassLayout:
     def plan(self, budget: float | None, seconds: float | None = None) -> CapturePlan:
         """Return the first pass and the full scan; with pointing errors, sweeps overlap and are longer.
 
-        Both passes together take ``seconds``, or ``budget``, a fraction of the full scan. Without either there is one
-        uniform scan. Raises as `sweeps`; BudgetError: the first pass takes longer.
+        Both passes together take ``seconds``, or ``budget``, a fraction of the full scan; that of a recording has the
+        recorded exposure. Without either there is one uniform scan. Raises as `sweeps`; BudgetError: the first pass
+        takes longer.
         """
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
         fine_s = 0.0
-        limit_s = seconds if budget is None else budget * full_s
+        usual_ms = None if self.recorded is None else self.recorded.fine_ms
+        whole_s = self.cost.seconds([replace(one, exposure_ms=usual_ms) for one in full], self.camera)
+        limit_s = seconds if budget is None else budget * whole_s
         if limit_s is not None:
             fine_s = limit_s - coarse_s
             if fine_s < 0:
                 limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.2f} s,"
                 fixed = self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)
-                ways = ["give more"] if budget is None or coarse_s <= full_s else []
+                ways = ["give more"] if budget is None or coarse_s <= whole_s else []
                 longer = budget is not None or self.coarse_exposure_ms is None  # than the shortest, for --seconds
                 ways += ["give a shorter --coarse-exposure-ms"] * (longer and self.recorded is None and fixed < limit_s)
                 left_out = "--zoom never" if budget is None else "without --budget, --policy and --coarse-exposure-ms"
                 raise BudgetError(
                     f"{limit} is below the time of the first pass of every {self.first_step}th line, "
-                    f"{coarse_s + 0.01:.2f} s of the full scan's {full_s:.2f} s; "
+                    f"{coarse_s + 0.01:.2f} s of the full scan's {whole_s:.2f} s; "
                     f"{', '.join([*ways, f'or take one uniform scan ({left_out})'])}"
                 )
         margin_px = 2 * self.pointing_px

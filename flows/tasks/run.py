@@ -273,7 +273,7 @@ class SurveyRun(CaptureRun):
         if plan.plain:
             return None
         field = (self.grid, self.camera, self.settings.cost)
-        of_recording = () if self.recorded is None else (self.recorded.fine_pass, self.recorded.exposures_ms)
+        of_recording = () if (one := self.recorded) is None else (one.fine_pass, one.exposures_ms, one.fine_ms)
         return SecondPass(*field, plan.coarse, plan.full, plan.fine_s, plan.margin_px, *of_recording)
 
     @property

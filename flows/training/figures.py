@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.ensemble import RandomForestClassifier
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 
 from flows.training.data import Report
@@ -196,21 +196,28 @@ def _miou(weights: Weights, examples: Sequence[Example]) -> float:
 def judge_baselines(
     train: Sequence[Example], validation: Sequence[Example], classes: int, seed: int, report: Report
 ) -> dict[str, float] | None:
-    """Return the mIoU of logistic regression and a random forest on pixels of validation scenes.
+    """Return the mIoU of LDA, logistic regression and a random forest on the same pixels of validation scenes.
 
-    Their features are those of `linear_discriminants`. None without a validation scene, or with a single class.
+    Without such scenes they learn from a random half of the training pixels, and the other half judges them. Features
+    are those of `linear_discriminants`. None with a single class, or if each has one pixel to learn from.
     """
     rng = np.random.default_rng([seed, 0xBA5])
-    if not validation or len(np.unique((learnt := LabelledPixels.drawn(train, rng)).labels)) < 2:
+    learnt = LabelledPixels.drawn(train, rng)
+    if validation:
+        judged = LabelledPixels.drawn(validation, rng)
+    else:
+        half = rng.permutation(len(learnt.labels)) % 2 == 0
+        learnt, judged = (LabelledPixels(learnt.features[part], learnt.labels[part]) for part in (half, ~half))
+    if not 1 < len(np.unique(learnt.labels)) < len(learnt.labels):
         return None
-    judged = LabelledPixels.drawn(validation, rng)
     found: dict[str, float] = {}
     for name, classifier in {
+        "LDA": LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"),
         "logistic regression": LogisticRegression(max_iter=200),
         "random forest": RandomForestClassifier(100, min_samples_leaf=2, random_state=seed),
     }.items():
-        report("fitting baseline classifiers", len(found) / 2, name)
-        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):  # nearly converged suffices
+        report("fitting baseline classifiers", len(found) / 3, name)
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a single pixel
             classifier.fit(learnt.features, learnt.labels)
         found[name] = mean_iou(confusion(judged.labels, classifier.predict(judged.features).astype(np.uint8), classes))
     return found

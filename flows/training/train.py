@@ -203,8 +203,8 @@ def _learned(
     weights, found["readings"] = better_reading(
         weights, start, frames, few=begun is None and labelled < FEW_PIXELS, begun=begun
     )
+    found["baselines"] = judge_baselines(examples, frames, config.classes, settings.seed, report)
     if frames:
-        found["baselines"] = judge_baselines(examples, frames, config.classes, settings.seed, report)
         report("validating", 0.0, f"{len(frames)} scenes")
         found[CALIBRATION] = judge_calibration(weights, frames, settings.seed)
     twice = read_twice(weights, frames)
@@ -258,12 +258,17 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     readings = record["readings"]
     of_readings, of_baselines = (
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
-        for scores in (readings["miou"], record.get("baselines") or {})
+        for scores in (readings["miou"], record["baselines"] or {})
     )
     text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
     console.print(f"{text}kept: {readings['kept']}", soft_wrap=True)
     if of_baselines:
-        console.print(f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}", soft_wrap=True)
+        console.print(
+            f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}"
+            if of_readings
+            else f"mIoU of classifiers of a random half of the training pixels, on the other half: {of_baselines}",
+            soft_wrap=True,
+        )
     figures = record["validation"]
     if figures is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None

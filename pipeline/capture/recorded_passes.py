@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.capture.recorded import RecordedSource
 from pipeline.errors import SceneError
 from pipeline.geometry.scan import Axis, Sweep, exposing
+from pipeline.planning.fine_pass import FIRST_STEP
 
 MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # largest excess of a plan over a recording, for the kernel and turned lines
 
@@ -33,6 +34,12 @@ class RecordedPasses:
     def exposures_ms(self) -> list[float]:
         """Return the exposures of the recorded sweeps, each once."""
         return sorted({exposing(self.source.camera, one.sweep).exposure_ms for one in self.source.sweeps})
+
+    @property
+    def fine_ms(self) -> float | None:
+        """Return the longest exposure of lines that are closer than those of a first pass [ms]; None: none are."""
+        close = [one.sweep for one in self.source.sweeps if one.sweep.step < FIRST_STEP]
+        return max((exposing(self.source.camera, sweep).exposure_ms for sweep in close), default=None)
 
     def uniform_scan(self) -> list[Sweep]:
         """Return all recorded sweeps as a uniform scan; SceneError where they differ in axis, step or binning."""

@@ -66,6 +66,7 @@ class SecondPass:
     margin_px: float = 0.0
     recorded: Callable[[list[Sweep]], list[Sweep]] | None = None  # cuts sweeps to the lines of a recording
     recorded_ms: Sequence[float] = ()  # exposures of that recording
+    usual_ms: float | None = None  # exposure of new lines; None: the camera's
 
     @property
     def key(self) -> dict[str, Any]:
@@ -81,9 +82,11 @@ class SecondPass:
     @cached_property
     def swaths(self) -> list[Sweep]:
         """Return the sweeps of every line that runs are parts of."""
-        found = self.full
-        if self.interlaces:
-            found = [replace(one, step=1, held=None, lines=(one.lines - 1) * one.step + 1) for one in self.first_pass]
+        found = (
+            [replace(one, step=1, held=None, lines=(one.lines - 1) * one.step + 1) for one in self.first_pass]
+            if self.interlaces
+            else self.full
+        )
         return [replace(one, name=f"fine-{number:03d}", kind="fine") for number, one in enumerate(found)]
 
     @cached_property
@@ -100,8 +103,9 @@ class SecondPass:
     def plan(self, gain: Floats, *, step: int = 1, exposure_ms: float | None = None) -> FinePlan:
         """Return the runs of lines ``step`` px apart that have the highest sum of (patch,) ``gain`` in the time.
 
-        NaN and negative gains count as 0.
+        NaN and negative gains count as 0. Lines have ``exposure_ms``, by default the usual exposure of new lines.
         """
+        exposure_ms = self.usual_ms if exposure_ms is None else exposure_ms
 
         def sweeps_of(runs: Sequence[LineRun]) -> list[Sweep]:
             found = [
@@ -117,15 +121,16 @@ class SecondPass:
             lambda runs: self.cost.seconds(sweeps_of(runs), self.camera),
         )
         chosen = choose_runs(self.rows, np.where(gain > 0, gain, 0.0), times, seconds=self.seconds, several=True)
-        if chosen is None:
-            return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
-        sweeps = sweeps_of(chosen.runs)
+        sweeps = [] if chosen is None else sweeps_of(chosen.runs)
         if self.recorded is not None:
             sweeps = self.recorded(sweeps)
+        if chosen is None or not sweeps:
+            return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
         patch_index = self.rows.patches(chosen.runs)
         whole = len(patch_index) == np.count_nonzero(self.rows.row >= 0)
         what = "the whole field" if whole else f"{len(patch_index)} patches"
-        reason = f"captured again: {what}, {format_scan(step, exposed.exposure_ms)}"
+        taken_ms = sorted({exposing(self.camera, sweep).exposure_ms for sweep in sweeps})
+        reason = f"captured again: {what}, {format_scan(step, *taken_ms)}"
         seconds = self.cost.seconds(sweeps, self.camera)
         return FinePlan(sweeps, patch_index, seconds, chosen.expected_gain, "full" if whole else "lines", reason)
 

@@ -48,10 +48,10 @@ class UniformScan:
         return self.seconds, self.bytes_raw, -self.expected[MIOU]
 
 
-def format_scan(step: int, exposure_ms: float) -> str:
-    """Return a summary of a uniform scan, such as "every 2nd line, 25 ms"."""
+def format_scan(step: int, *exposures_ms: float) -> str:
+    """Return a summary of a scan in one exposure or several, such as "every 2nd line, 25 ms"."""
     every = {1: "every line", 2: "every 2nd line", 3: "every 3rd line"}.get(step, f"every {step}th line")
-    return f"{every}, {exposure_ms:g} ms"
+    return f"{every}, {' or '.join(f'{one_ms:g} ms' for one_ms in exposures_ms)}"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import random
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,33 +21,28 @@ import pytest
 from flows.publish.receipt import is_pending
 from flows.terminal.processes import TERMINATED
 from tests.faults.nursery import Ended
-from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
+from tests.faults.small_survey import SETTINGS, Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
 from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
 SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
-CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGTERM),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
+SECOND_PASS = {"storage.archive.archive:Archive.spool_folder": 2, "storage.arrays.spool:Spool.append": 20}  # as PLACES
 KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`
-MOMENTS = (0.28, 0.98, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # as fractions of its time
-
-
-def told(ended: Ended) -> bool:
-    """Return whether a command ended by SIGTERM with its one sentence, and otherwise only progress."""
-    last = ended.text.strip().splitlines()[-1]
-    return ended.code == TERMINATED and last == GOING_ON and "error" not in ended.text and "defect" not in ended.text
+MOMENTS = (0.28, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # as fractions of its time
 
 
 def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tmp_path: Path) -> None:
-    """Its published stores verify, and the rerun completes with the stores of an undisturbed survey."""
+    """It prints progress and one sentence, its stores verify, and the rerun completes them as undisturbed."""
     out = tmp_path / "archive"
     ended = subject.nursery.run(words(out), "end_before", number=signal.SIGTERM, **SYNCED)
-    assert told(ended), (ended.code, ended.text)
+    assert (ended.code, ended.text.strip().splitlines()[-1]) == (TERMINATED, GOING_ON), ended.text
+    assert not any(word in ended.text for word in ("error", "defect"))
     assert problems(out) == []
     assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []
 
@@ -89,7 +85,7 @@ def test_a_rerun_adds_the_accuracy(subject: Subject, whole: Any, mapped: Path, t
     shutil.copytree(mapped, out)
     (first,) = receipts(out)
     ended = stopped(subject, out, name, call, number)
-    assert ended.code == CODES[number], ended.text
+    assert ended.code == (TERMINATED if number == signal.SIGTERM else -number), ended.text
     (before,) = receipts(out)
     assert problems(out) == []
     assert is_pending(before) == (place != ADDED) == ("accuracy" not in before)
@@ -105,7 +101,21 @@ def test_a_rerun_adds_the_accuracy(subject: Subject, whole: Any, mapped: Path, t
     assert not [*out.rglob("*.part"), *out.glob("spool/*")]
 
 
-# --- killed at random moments -----------------------------------------------------------------------------------------
+# --- killed around the second pass, or at random moments --------------------------------------------------------------
+
+
+def test_a_survey_killed_before_and_in_its_second_pass_is_resumed(subject: Subject, tmp_path: Path) -> None:
+    """After both kills the first pass and the scores stay, and the rerun ends in the stores of an undisturbed one."""
+    (subject.folder / "quick.toml").write_text(SETTINGS + "[cost]\nreload_s = 0\n")  # leaves time for a second pass
+    out, whole = tmp_path / "archive", tmp_path / "whole"
+    asked, once = ([word.replace("camera.", "quick.") for word in words(folder)] for folder in (out, whole))
+    assert subject.nursery.run(once).code == 0
+    for place, call in SECOND_PASS.items():
+        ended = subject.nursery.run(asked, "end_before", place=place, call=call, number=signal.SIGKILL)
+        stages = [uri.split("/")[1] for uri in stored(out)]
+        assert (ended.code, stages.count("capture"), stages.count("score")) == (-signal.SIGKILL, 1, 1), ended.text
+        assert any(file.stat().st_size > 4096 for file in out.glob("spool/*/*.lines")) == place.endswith("append")
+    assert wrong_after_rerun(replace(subject, truth=stored(whole)), out, subject.nursery.run(asked), runs=1) == []
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
@@ -115,7 +125,5 @@ def test_a_killed_survey_is_resumed(subject: Subject, tmp_path: Path, moment: fl
     time.sleep(moment * subject.whole_s)
     child.kill()
     assert child.wait().code in (-signal.SIGKILL, 0)  # a run that is faster than the first may have ended
-    before = stored(tmp_path)
     assert wrong_after_fault(subject, tmp_path) == []
     assert wrong_after_rerun(subject, tmp_path, subject.nursery.run(words(tmp_path))) == []
-    assert set(before) <= set(stored(tmp_path))

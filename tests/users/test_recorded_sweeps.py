@@ -186,6 +186,17 @@ def test_plans_use_the_recorded_exposure(tmp_path: Path, full_scan: FullScan, ma
     assert "100 ms" in receipt["plan"]["reason"]
 
 
+def test_a_budget_is_a_fraction_of_the_recorded_seconds(tmp_path: Path, survey_png: Survey, weights: Path) -> None:
+    """The camera of the run has 100 ms, its lines have 10 ms: both passes use most of the time that these give."""
+    quick = {"cost.reload_s": 0, "cost.capture_start_s": 0, "cost.slew_s": 0}
+    asked = {"keep": "raw", "labels": None, "scan_step": "1", "scan_exposure_ms": "10", **NARROW, **quick}
+    run = survey_png(tmp_path / "sim", budget=None, **asked)
+    receipt = survey_sweeps(tmp_path / "a", run.folder, weights=str(weights), budget=0.9).receipt
+    given_s = 0.9 * run.receipt["savings"]["capture_s"]["done"]
+    assert 0.8 * given_s < receipt["recording"]["passes_s"] <= given_s
+    assert receipt["plan"]["reason"].endswith("every line, 10 ms")
+
+
 def test_a_recorded_scan_is_compared_with_all_of_its_lines(tmp_path: Path, full_scan: FullScan, weights: Path) -> None:
     """An area of interest limits only the map: all lines are read and count in the reference, so savings are 1."""
     corner = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [30, 30], [0, 30], [0, 0]]]}

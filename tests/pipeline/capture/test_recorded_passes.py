@@ -44,14 +44,12 @@ def test_a_recorded_line_serves_the_end_of_a_plan_once() -> None:
 
 
 def test_a_plan_without_recorded_lines_moves_to_the_recorded_swath() -> None:
-    """The plan's kind, line spacing and binning stay; its lines cover the recorded swath from end to end."""
+    """The plan's kind, line spacing and binning stay; the last recorded line serves its last one."""
     passes = passes_over(ASIDE)
     assert passes.served([COARSE]) is None
     (found,) = passes.first_pass([COARSE])
     assert (found.name, found.swath_px, found.step, found.binning) == ("coarse-0", 7.0, 4, 1)
-    np.testing.assert_allclose(
-        found.line_px(), -39.5 + 4 * np.arange(21), atol=1e-5
-    )  # the last recorded line serves the last
+    assert found.line_px() == pytest.approx(-39.5 + 4 * np.arange(21), abs=1e-5)
     assert passes.full_scan([FULL]) == [ASIDE]
     blank = replace(record(simulated(), replace(ASIDE, name="blank", swath_px=30.0)), valid_line=np.zeros(80, bool))
     source = recorded_source(simulated(), [*passes.source.sweeps, blank])
@@ -84,7 +82,9 @@ def test_a_recording_of_two_kinds_of_lines_is_no_uniform_scan() -> None:
 
 
 def test_a_planned_pass_takes_the_recorded_exposure() -> None:
-    """The recorded exposure replaces the exposure of the plan; the camera's own stays unchanged."""
+    """It replaces that of the plan, the camera's stays unchanged. A second pass takes that of close lines, if any."""
     (found,) = passes_over(replace(FULL, exposure_ms=20.0)).first_pass([replace(COARSE, exposure_ms=50.0)])
     assert found.exposure_ms == 20.0
     assert CAMERA.exposure_ms == 100.0
+    first = replace(COARSE, exposure_ms=200.0)
+    assert [passes_over(first, replace(FULL, exposure_ms=20.0)).fine_ms, passes_over(first).fine_ms] == [20.0, None]

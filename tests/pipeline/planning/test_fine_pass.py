@@ -116,10 +116,12 @@ def test_a_pointing_margin_extends_a_run_at_both_ends() -> None:
 
 
 def test_a_recording_limits_the_sweeps_of_a_plan() -> None:
-    """The plan's seconds are those of the recorded lines."""
-    plan = replace(second_pass(FULL_S), recorded=lambda sweeps: sweeps[:1]).plan(drawn(1))
-    assert len(plan.sweeps) == 1
+    """The plan's seconds and exposures are those of the recorded lines; without any there is no plan."""
+    plan = replace(second_pass(FULL_S), recorded=lambda a: [replace(a[0], exposure_ms=5.0), a[1]]).plan(drawn(1))
+    assert len(plan.sweeps) == 2
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA)
+    assert plan.reason.endswith("every line, 5 ms or 100 ms")
+    assert not replace(second_pass(FULL_S), recorded=lambda made: []).plan(drawn(1)).patch_index.size
 
 
 @pytest.mark.parametrize("step", FIRST_STEPS)
