@@ -45,7 +45,7 @@ from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRaster
 SEEDS = (61, 62, 63)
 SIZE = "640x512"
 LIGHTS = (1.0, 0.25)
-SHARES = (1.0, 0.25, 0.0625)
+SHARES = (1.0, 0.25, 0.125, 0.0625)
 SWATHS = 8
 EXPOSURES_MS = (1.25, 2.5, 5.0)  # exposure of every line in full light; seconds are stated by it
 LINES = 515  # of one swath of the full scan
@@ -61,9 +61,13 @@ OTHER = (  # light, fraction of interest, swaths, seconds, farms
     *((1.0, 1 / 4, 8, seconds, (64, 65, 66)) for seconds in (21.0, 27.3)),
     *((1.0, share, 8, 58.0, SEEDS) for share in (1 / 16, 1.0)),
     *((light, share, 4, seconds, SEEDS) for light, seconds in ((1.0, 14.2), (1 / 16, 91.4)) for share in (1 / 16, 1.0)),
-    *((light, share, 1, seconds, SEEDS) for light, seconds in ((1.0, 4.3), (1 / 16, 23.6)) for share in SHARES),
+    *(
+        (light, share, 1, seconds, SEEDS)
+        for light, seconds in ((1.0, 4.3), (1 / 16, 23.6))
+        for share in (1, 1 / 4, 1 / 16)
+    ),
 )
-GOALS = {1.0: -0.3, 0.25: -0.3, 0.0625: 3.0}  # points over the uniform scan, mean over a fraction's cells
+GOALS = {1.0: -0.3, 0.25: -0.3, 0.125: 1.5, 0.0625: 3.0}  # points over the uniform scan, mean over a fraction's cells
 
 
 @dataclass(frozen=True)
