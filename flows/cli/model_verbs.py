@@ -191,7 +191,7 @@ class EvaluateFlags(SceneFlags):
     draws
         Bootstrap samples for the intervals.
     controls
-        For a run: also judge the overview, a full reading and other placements. Default: as in its survey.
+        For a run: also judge the small network, the full one and other placements. Default: as in its survey.
     """
 
     weights: Annotated[tuple[Path, ...], Parameter(negative="")] = ()

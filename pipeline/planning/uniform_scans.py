@@ -51,7 +51,7 @@ class UniformScan:
 def format_scan(step: int, *exposures_ms: float) -> str:
     """Return a summary of a scan in one exposure or several, such as "every 2nd line, 25 ms"."""
     every = {1: "every line", 2: "every 2nd line", 3: "every 3rd line"}.get(step, f"every {step}th line")
-    return f"{every}, {' or '.join(f'{one_ms:g} ms' for one_ms in exposures_ms)}"
+    return f"{every}, {' and '.join(f'{one_ms:g} ms' for one_ms in exposures_ms)}"
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,7 @@ def test_a_recording_limits_the_sweeps_of_a_plan() -> None:
     plan = replace(second_pass(FULL_S), recorded=lambda a: [replace(a[0], exposure_ms=5.0), a[1]]).plan(drawn(1))
     assert len(plan.sweeps) == 2
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA)
-    assert plan.reason.endswith("every line, 5 ms or 100 ms")
+    assert plan.reason.endswith("every line, 5 ms and 100 ms")
     assert not replace(second_pass(FULL_S), recorded=lambda made: []).plan(drawn(1)).patch_index.size
 
 
