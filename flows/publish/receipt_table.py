@@ -48,6 +48,7 @@ LEAST_REFERENCE = 100_000  # bytes; with a smaller reference, rows are not in MB
 SMALL_RUN = 2_000_000  # bytes kept, most of which do not depend on the field
 MOST_NAMED = 4  # changes of class in a row
 LEADING_CLASSES = 3  # of a plot
+LEAST_LOSS = 0.0005  # of expected mIoU, below which it rounds to 0.0 points
 LEAST_TURN_DEG = 0.05  # of a prior map; less is not shown
 FOREIGN = 0.2  # fraction of unknown pixels above which the weights do not fit the field
 FOREIGN_WORDS = (
@@ -95,11 +96,12 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
     if capture.get("uniform") is None:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
+    words += f" A uniform scan with nearly the best score takes {scan}."
     taken = receipt.get("scans", {}).get("taken")
     if taken and not is_foreign(receipt) and format_prediction(taken["expected_miou"], taken.get("expected_spread")):
         lost = receipt["scans"]["reference"]["expected_miou"] - taken["expected_miou"]
-        scan += f"; expected loss of this scan: {format_points(max(lost, 0.0))} points of mIoU"
-    return f"{words} A uniform scan with nearly the best score takes {scan}."
+        words += f" This survey is expected to score {format_points(lost)} points less." if lost >= LEAST_LOSS else ""
+    return words
 
 
 def format_score(receipt: Mapping[str, Any]) -> str:

@@ -154,7 +154,7 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     found = find_recorded_run(str(table["sweeps"]))
     if found is not None:
         run, shape, _ = found
-        uniform = any(run.settings.get(name) is not None for name in UNIFORM)
+        uniform = run.settings.get("zoom") != ALWAYS and any(run.settings.get(name) is not None for name in UNIFORM)
         another_plan = requested - {*LIMITS} if uniform else requested & {*UNIFORM, *LIMITS}
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
@@ -268,7 +268,8 @@ def _check_table(
             every = f"known keys: {', '.join(prefix + name for name in declared)}"
             hint = f"did you mean '{near[0]}'?" if near else every
             raise SettingsError(
-                f"unknown setting {place}; " + (f"it is called '{RENAMED[full]}' now" if full in RENAMED else hint)
+                f"unknown setting {place}; "
+                + (f"it is called '{RENAMED[full]}' now" if RENAMED.get(full) in everywhere else hint)
             )
         if not prefix and key in TABLES:
             checked[key] = _parse_table(key, value, place, origin)

@@ -37,8 +37,8 @@ class RecordedPasses:
 
     @property
     def fine_ms(self) -> float | None:
-        """Return the longest exposure of lines that are closer than those of a first pass [ms]; None: none are."""
-        close = [one.sweep for one in self.source.sweeps if one.sweep.step < FIRST_STEP]
+        """Return the longest exposure of lines of a second pass, or as close as such [ms]; None: there are none."""
+        close = [one.sweep for one in self.source.sweeps if one.sweep.kind == "fine" or one.sweep.step < FIRST_STEP]
         return max((exposing(self.source.camera, sweep).exposure_ms for sweep in close), default=None)
 
     def uniform_scan(self) -> list[Sweep]:

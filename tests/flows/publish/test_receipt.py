@@ -257,7 +257,7 @@ def test_the_cheapest_good_scan_is_named():
     told = " ".join(printed(receipt).split())
     assert "uniform scan with nearly the best score takes 40 s (every line, 17 ms)." in told
     receipt["scans"] = {name: {"expected_miou": miou} for name, miou in (("taken", 0.92), ("reference", 0.928))}
-    assert format_reference(receipt).endswith("17 ms); expected loss of this scan: 0.8 points of mIoU.")
+    assert format_reference(receipt).endswith("17 ms). This survey is expected to score 0.8 points less.")
 
 
 def test_a_report_begins_with_map_savings_and_score():
