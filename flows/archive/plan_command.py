@@ -237,8 +237,9 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
     if (zoomed := scans["two_passes"]) is not None:
         first = format_scan(zoomed["step"], zoomed["exposure_ms"])
         mark = "this survey, two passes" if zoomed["taken"] else "two passes"
-        words = [format_estimate(name, zoomed[name]) for name in LABELS if name != "bytes_kept"]
-        cells.append((zoomed["capture_s"]["value"], [first, mark, *words]))
+        words = [format_estimate(name, zoomed[name]) for name in LABELS if name not in ("bytes_kept", "miou")]
+        score = DASH if zoomed["miou"]["at_most"] else format_estimate("miou", zoomed["miou"])  # no score by the record
+        cells.append((zoomed["capture_s"]["value"], [first, mark, *words, score]))
     columns = ("scan or first pass", "", "capture time", "bytes captured", "multiply-adds", "mIoU, about")
     return table(columns, [row for _, row in sorted(cells)], left=2, whole=columns[2:])
 

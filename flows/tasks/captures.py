@@ -80,9 +80,7 @@ def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
             run = open_run(requested)
         except NothingToMend as known:
             observer.log(str(known))
-            return RunRef(
-                f"runs/{known.run}", open_archive(requested.out).root / "runs" / known.run, unchanged=str(known)
-            )
+            return RunRef(f"runs/{known.run}", open_archive(requested.out).root / "runs" / known.run)
     run.archive.reclaim()  # remove incomplete stores of killed runs
     for note in run.notes:
         observer.note(note)

@@ -54,7 +54,6 @@ class RunRef:
     folder: Path
     captured_again: float | None = None  # fraction of the patches; None after a uniform scan
     pending: bool = False  # whether its accuracy is computed next
-    unchanged: str | None = None  # reason for no capture; the run is an earlier one
 
     @property
     def name(self) -> str:

@@ -159,7 +159,10 @@ def _usable(
     if days < 0:
         return f"it was captured {-days:.3g} days after this visit"
     earlier = (EarlierRun(mosaic), *_earlier_runs(archive, run))
-    return Prior(run.folder.name, probabilities, earlier, days, _day_of_year(settings), classes)
+    day = None if settings.moment is None else float(settings.moment[0])
+    if (called := moment_of(settings.visit)) is not None:
+        day = float(called.timetuple().tm_yday)
+    return Prior(run.folder.name, probabilities, earlier, days, day, classes)
 
 
 def _earlier_runs(archive: Archive, run: Run) -> Iterator[EarlierRun]:
@@ -207,14 +210,6 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
         return moment[0] - day + (moment[1] - hour) / 24
     created = moment_of(run.created)
     return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
-
-
-def _day_of_year(settings: Settings) -> float | None:
-    """Return the day of the year of a visit: by the date it is called by, else by the built-in scene's day."""
-    called = moment_of(settings.visit)
-    if called is not None:
-        return float(called.timetuple().tm_yday)
-    return None if settings.moment is None else float(settings.moment[0])
 
 
 def prior_map_figures(store: Path) -> dict[str, Any] | None:

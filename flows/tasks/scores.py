@@ -40,7 +40,7 @@ def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> s
     if not known:
         return ""
     worst = min(known, key=lambda name: known[name])
-    words = f"Its worst class is {spaced(worst)} with {format_points(known[worst])}"
+    words = f"The map's worst class is {spaced(worst)} with {format_points(known[worst])}"
     if alone:
         return f"{words}."
     full = "" if every.get(worst) is None else f", the full network on every patch {format_points(every[worst])}"

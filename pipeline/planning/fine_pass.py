@@ -82,11 +82,9 @@ class SecondPass:
     @cached_property
     def swaths(self) -> list[Sweep]:
         """Return the sweeps of every line that runs are parts of."""
-        found = (
-            [replace(one, step=1, held=None, lines=(one.lines - 1) * one.step + 1) for one in self.first_pass]
-            if self.interlaces
-            else self.full
-        )
+        found = self.full
+        if self.interlaces:
+            found = [replace(one, step=1, held=None, lines=(one.lines - 1) * one.step + 1) for one in self.first_pass]
         return [replace(one, name=f"fine-{number:03d}", kind="fine") for number, one in enumerate(found)]
 
     @cached_property

@@ -196,8 +196,8 @@ def test_headline_is_one_paragraph_with_the_figures():
     """It has score, worst class, capture time and fraction captured again; without labels it has no score."""
     assert headline(make_receipt(), 0.23) == (
         "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct); the full network on every patch gives 87.5."
-        " Its worst class is bare weed with 60.0: the small network alone gives 20.0, the full network on every patch"
-        " 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured again: 23 % of the field."
+        " The map's worst class is bare weed with 60.0: the small network alone gives 20.0, the full network on every"
+        " patch 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured again: 23 % of the field."
     )
     assert "labels (" not in headline(make_receipt(labels=False))
 
