@@ -160,6 +160,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
     whole = replace(run.settings, extent=EXTENT_WHOLE)
     uniform = replace(run, settings=whole, plan=replace(run.plan, plain=True), extent=None)
     work = uniform.work_done(uniform.likely_patches).total  # of each uniform scan
+    seconds = run.plan.coarse_s + run.plan.fine_s
     content = {
         "archive": settings.out,
         "stages": [asdict(row) for row in planner.rows],
@@ -169,6 +170,8 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "scans": {
             "taken": as_figures(run.scans.chosen, multiply_adds=work),
             "reference": as_figures(run.scans.reference, multiply_adds=work),
+            "best_in_time": None if run.plan.plain else as_figures(run.scans.best_in_time(seconds), multiply_adds=work),
+            "at_most": run.budget is not None,  # the scores are of maps with everything read
             "candidates": [as_figures(one, multiply_adds=work) for one in frontier(run.scans.offered)],
             "two_passes": None
             if zoomed is None
@@ -219,7 +222,12 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
 
 def scan_table(scans: Mapping[str, Any]) -> Table:
     """Return two passes and the best uniform scans of other time budgets: seconds, bytes, multiply-adds and score."""
-    named = {"this survey": scans["taken"], "cheapest near the best": scans["reference"]}
+    named = {
+        "this survey": scans["taken"],
+        "best uniform scan in this time": scans["best_in_time"],
+        "cheapest near the best": scans["reference"],
+    }
+    expected = "at most {}" if scans["at_most"] else "{}"
     every = scans["candidates"][:: math.ceil(len(scans["candidates"]) / MOST_SCANS)]
     rows = {
         one["seconds"]: [
@@ -228,7 +236,7 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
             format_seconds(one["seconds"]),
             format_bytes(one["bytes_raw"]),
             format_count(one["multiply_adds"]),
-            format_prediction(one["expected_miou"], one["expected_spread"]) or DASH,
+            expected.format(format_prediction(one["expected_miou"], one["expected_spread"]) or DASH),
         ]
         for one in (*every, *named.values())
         if one is not None

@@ -40,7 +40,7 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.uniform_scans import MIOU, format_scan
+from pipeline.planning.uniform_scans import format_scan
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
@@ -153,10 +153,9 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
-    in_time = [one for one in run.scans.offered if one.seconds <= run.plan.coarse_s + plan.seconds + 1e-6]
     scans = {
         "taken": run.scans.chosen,
-        "best_in_time": max(in_time, key=lambda one: one.expected[MIOU], default=None),
+        "best_in_time": run.scans.best_in_time(run.plan.coarse_s + plan.seconds),
         "reference": run.scans.reference,
     }  # where there is a table
     return build_receipt(

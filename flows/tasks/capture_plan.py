@@ -194,6 +194,11 @@ class ScanChoice:
         """Return the reference: the cheapest scan that is nearly as good as the best; None without a table."""
         return reference_scan(self.offered) if self.offered else None
 
+    def best_in_time(self, seconds: float) -> UniformScan | None:
+        """Return the scan with the highest expected mIoU that ends in time; None where none does."""
+        in_time = [one for one in self.offered if one.seconds <= seconds + 1e-6]
+        return max(in_time, key=lambda one: one.expected[MIOU], default=None)
+
 
 def choose_uniform_scan(
     layout: PassLayout, weights: Description, path: Path, bands: int, settings: Settings

@@ -220,21 +220,11 @@ class Segmenter(nn.Module):
         """Return the device of the parameters."""
         return self.full_classes.weight.device
 
-    def forward(self, image: Tensor, detail: Tensor, patch_index: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """Return logits of the overview (B, classes, H, W) and of the patches (B, K, classes, p, p).
-
-        ``image`` is the input of the overview, ``detail`` that of the full network. ``patch_index`` (B, K) are int64
-        patch numbers, ``origin`` (B, 2) the tokens above and left of a crop.
-        """
-        overview = self.read_overview(image, origin)
-        cells = cut(detail, self.config.patch)
-        index = patch_index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
-        return overview.logits, self.read_patches(overview, cells.gather(1, index), patch_index)
-
     def read_overview(self, image: Tensor, origin: Tensor | None = None, valid: Tensor | None = None) -> Overview:
         """Compute the overview of an image (B, J + PLANES, H, W).
 
-        Tokens that are not ``valid``, (tokens,) bool of a single scene, take no part in the attention.
+        ``origin`` (B, 2) are the tokens above and left of a crop. Tokens that are not ``valid``, (tokens,) bool of a
+        single scene, take no part in the attention.
         """
         height, width = image.shape[2:]
         gap = -width % TOKEN_PX, -height % TOKEN_PX

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.network.segmenter import Segmenter
+from models.network.segmenter import Segmenter, cut
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Capture, LineSpec, Normalisation, SpectralBasis
 from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
@@ -80,6 +80,13 @@ def make_network(seed: int = 0, **sizes: Any) -> Segmenter:
             idle = parameter == 0
             parameter[idle] = torch.normal(0.0, 0.3, parameter.shape)[idle]
     return model
+
+
+def read_both(model: Segmenter, image: Tensor, detail: Tensor, index: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
+    """Return logits of the overview of ``image``, and of the patches ``index`` (B, K) of ``detail``."""
+    overview = model.read_overview(image, origin)
+    chosen = torch.stack([cells[own] for cells, own in zip(cut(detail, model.config.patch), index, strict=True)])
+    return overview.logits, model.read_patches(overview, chosen, index)
 
 
 def plain_weights(**sizes: Any) -> Weights:

@@ -72,7 +72,6 @@ class PairShift:
     status: Status
     shift: Floats  # (2,) rows and columns to add to places in ``moving``; NaN unless found [px]
     error_px: Floats  # (2,) standard error that the noise leaves
-    peak: float = np.nan  # correlation at the shift
     pixels: int = 0
 
 
@@ -133,7 +132,6 @@ def _judge(fits: list[_Fit], prior_px: float) -> PairShift:
         status="found" if sure else "undecidable",
         shift=best.shift if sure else np.full(2, np.nan),
         error_px=best.error,
-        peak=float(np.sqrt(1 - best.misfit)),
         pixels=best.pixels,
     )
 

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import pytest
 from rich.console import Console
 
-from flows.archive.plan_command import KEPT_FROM, estimated_bytes, plan_content, show_plan
+from flows.archive.plan_command import KEPT_FROM, estimated_bytes, plan_content, scan_table, show_plan
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey_command import run_survey
@@ -230,7 +230,10 @@ def test_a_plan_shows_two_passes_beside_uniform_scans(tmp_path: Path, seconds: s
     assert zoomed["miou"]["at_least"]
     assert zoomed["multiply_adds"]["value"] > found["scans"]["candidates"][0]["multiply_adds"] > 0
     show_plan(found, Console(file=(shown := io.StringIO()), width=160))
-    assert ("this survey, two passes" in shown.getvalue()) == taken
+    for mark in ("this survey, two passes", "best uniform scan in this time"):
+        assert (mark in shown.getvalue()) == taken
+    Console(file=shown, width=160).print(scan_table(found["scans"] | {"at_most": True}))
+    assert ["at most 9" in one for one in shown.getvalue().split("mIoU, about")[1:]] == [False, True]
 
 
 def test_a_partial_scan_has_no_expected_miou_and_reads_captured_patches(settings: Settings, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from models.network.sizes import CELL_PX, PLANES, SegmenterConfig, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import make_network, noise
+from tests.models.conftest import make_network, noise, read_both
 
 IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches
 
@@ -81,7 +81,7 @@ def test_every_parameter_has_a_gradient():
     """The loss is that of a map with some patches."""
     model = make_network(layers=2)
     numbers = torch.tensor([[3, 0, 9]])
-    logits, patches = model(IMAGE, IMAGE, numbers, torch.zeros(1, 2))
+    logits, patches = read_both(model, IMAGE, IMAGE, numbers, torch.zeros(1, 2))
     model.composite(logits, patches, numbers).square().mean().backward()
     idle = [name for name, value in model.named_parameters() if value.grad is None or not value.grad.any()]
     assert not idle
@@ -125,7 +125,7 @@ def test_multiply_adds_equal_the_counter(sizes: dict[str, int], patch_index: int
     flops = {attention: lambda q, k, v, *args, out_shape=None, **kwargs: sdpa_flop_count(q, k, v)}
     counter = FlopCounterMode(display=False, custom_mapping=flops)
     with torch.inference_mode(), counter:
-        model(image, image, torch.arange(patch_index)[None], torch.zeros(1, 2))
+        read_both(model, image, image, torch.arange(patch_index)[None], torch.zeros(1, 2))
     assert multiply_adds(config, grid, patch_index, 0).total == counter.get_total_flops() / 2
 
 

@@ -14,7 +14,7 @@ from models.reading import inference
 from models.weights.files import Weights, with_record
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import make_weights, noise, plain_weights, scene_columns
+from tests.models.conftest import make_weights, noise, plain_weights, read_both, scene_columns
 
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
@@ -97,7 +97,7 @@ def test_a_region_is_segmented_like_a_training_crop(patch: int, origin: tuple[in
     numbers = torch.from_numpy(patch_index)[None]
     with torch.inference_mode():
         places = torch.tensor([origin]).double() * patch / TOKEN_PX
-        logits = model.composite(*model(*images, numbers, places), numbers)
+        logits = model.composite(*read_both(model, *images, numbers, places), numbers)
     assert np.abs(drawn.confidence - logits[0].softmax(dim=0).amax(dim=0).numpy()).max() <= 1e-5
     here = inference.segment(weights, replace(moved, origin=(0, 0)), fine[patch_index], patch_index, capture=other)
     assert (drawn.confidence == here.confidence).all() == (origin == (0, 0))
