@@ -57,14 +57,12 @@ class _Taken(SimulatedSweep):
 def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
-    """Image a labelled scene on the basis, with noise by ``rng``. Raises SceneError: no labels, or a gap."""
+    """Image a labelled scene on the basis, with noise by ``rng``. Raises SceneError: a gap."""
     if scene.key.partition("/")[0] not in LAWS:
         return observe(scene, camera, grid, basis, rng)
-    if scene.labels is None:
-        raise SceneError(f"scene {scene.name} has no labels; training needs them")
     columns, noise = observe_finely(scene, camera, grid, basis, int(rng.integers(2**31)))
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
-    labels[: grid.height, : grid.width] = scene.labels
+    labels[: grid.height, : grid.width] = np.asarray(scene.labels, np.uint8)
     padded = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
     return Example(scene.name, padded, labels, (grid.height, grid.width), noise)
 

@@ -52,15 +52,11 @@ def observe(
     """Image a labelled scene by the footprint and noise of the camera, and project it onto the basis.
 
     Strips of rows have random streams of their own.
-
-    Raises SceneError where the scene has no labels.
     """
-    if scene.labels is None:
-        raise SceneError(f"scene {scene.name} has no labels; training needs them")
     matrix, _ = basis.matrix(scene.wavelength_nm)
     planes = np.asarray(pad_by_reflection(scene.planes, grid.padded_shape), np.float32)
     labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
-    labels[: grid.height, : grid.width] = scene.labels
+    labels[: grid.height, : grid.width] = np.asarray(scene.labels, np.uint8)
     rows, width = grid.padded_shape
     strip = math.gcd(rows, STRIP_ROWS)
     columns = np.empty((rows, width, basis.columns), np.float32)
