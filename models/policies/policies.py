@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import patches_of
 from models.reading.inference import CoarsePrediction
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
@@ -34,20 +34,24 @@ def score_patches(
     - ``random``: Random numbers by ``seed``.
     - ``mask``: A (y, x) image of the scene's size (the paper's fixed attention policy); NaN counts as 0.
 
-    Raises SettingsError for an unknown policy, or ``mask`` without a mask; ShapeError for a mask of another size.
+    Raises SettingsError for an unknown policy.
     """
+    grid = seen.grid
     if policy == "random":
-        return random_scores(seen.grid, seed)
+        return random_scores(grid, seed)
     if policy == "gain":
         found = class_errors(seen)
         return gain_of(found[:, 0], found[:, 1].sum(axis=0))
     if policy == "mask":
-        scores = _mask_scores(seen, mask)
+        image = np.zeros(grid.padded_shape)
+        values = np.asarray(mask, np.float64).reshape(grid.height, grid.width, -1).mean(axis=-1)
+        image[: grid.height, : grid.width] = np.nan_to_num(values)
+        scores = _patch_means(image, seen)
     elif policy in PIXEL_SCORES and (of := PIXEL_SCORES[policy].of) is not None:
         scores = _patch_means(of(seen), seen)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
-    return (scores * seen.grid.valid_fraction()).ravel()
+    return (scores * grid.valid_fraction()).ravel()
 
 
 def random_scores(grid: SceneGrid, seed: int) -> Scores:
@@ -132,17 +136,3 @@ def _patch_means(pixels: NDArray[np.float64], seen: CoarsePrediction) -> Scores:
         for image in (pixels * on_scene, on_scene)
     )
     return np.asarray(np.divide(total, count, out=np.zeros(grid.patch_shape), where=count > 0))
-
-
-def _mask_scores(seen: CoarsePrediction, mask: NDArray[np.generic] | None) -> Scores:
-    grid = seen.grid
-    if mask is None:
-        raise SettingsError("the policy 'mask' needs --mask FILE, an image of the scene's size")
-    if mask.shape[:2] != (grid.height, grid.width):
-        raise ShapeError(
-            f"the mask has {mask.shape[:2]} px (y, x), the scene {(grid.height, grid.width)}; give one of its size"
-        )
-    flat = mask.reshape(grid.height, grid.width, -1).astype(np.float64).mean(axis=-1)
-    image = np.zeros(grid.padded_shape)
-    image[: grid.height, : grid.width] = np.nan_to_num(flat)
-    return _patch_means(image, seen)
