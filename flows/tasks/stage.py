@@ -156,7 +156,7 @@ def stage(
 
     def record(function: Callable[..., Wanted]) -> Stage:
         """Return the stage of a function."""
-        needs = needs_of(function)
+        needs = inspect.getfullargspec(function).kwonlyargs
 
         @wraps(function)
         def wants(run: Any, *stores: StageRef) -> Wanted:
@@ -167,11 +167,6 @@ def stage(
         return Stage(name, title, product, wants, inputs, retries, named)
 
     return record
-
-
-def needs_of(function: Callable[..., Any]) -> list[str]:
-    """Return the names of the keyword arguments of a stage function."""
-    return [one.name for one in inspect.signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
 
 
 def needed(run: Any, name: str) -> Any:

@@ -9,6 +9,7 @@ If the change has no effect on the output of the stage, keep the version. Then r
 from __future__ import annotations
 
 import gc
+import inspect
 import json
 import re
 import sys
@@ -25,7 +26,6 @@ from flows.archive import ingest_command  # noqa: E402
 from flows.settings.survey_settings import Settings  # noqa: E402
 from flows.tasks.open_survey import STAGES, versions  # noqa: E402
 from flows.tasks.run import SurveyRun  # noqa: E402
-from flows.tasks.stage import needs_of  # noqa: E402
 from storage.archive.keys import StageRef  # noqa: E402
 from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # noqa: E402
 
@@ -148,7 +148,7 @@ def test_store_names_in_receipts_are_unique(absent: tuple[str, ...]) -> None:
 def test_a_survey_has_the_arguments_of_its_stages(name: str) -> None:
     """Each keyword argument of a stage is an attribute of a run or a setting."""
     run, settings = ({*dir(kind), *kind.__dataclass_fields__} for kind in (SurveyRun, Settings))
-    assert set(needs_of(STAGES[name].wants)) <= run | settings
+    assert {*inspect.getfullargspec(inspect.unwrap(STAGES[name].wants)).kwonlyargs} <= run | settings
 
 
 if __name__ == "__main__":
