@@ -25,7 +25,7 @@ from models.evaluation.metrics import (
     paired_interval,
 )
 from models.network.sizes import multiply_adds
-from models.policies.placement import RANDOM_DRAWS, ReadTwice, gain_sums, oracle_gain
+from models.policies.placement import RANDOM_DRAWS, ReadTwice, oracle_gain
 from models.policies.policies import score_multiply_adds, score_patches
 from models.reading.inference import segment
 from models.weights.files import Weights
@@ -46,15 +46,14 @@ def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights
     rows: list[Record] = []
     for policy, draw, fraction, patch_index in _rows(request, frame, gain):
         scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
-        bought, best = gain_sums(gain, patch_index)
         chosen = np.isin(np.arange(gain.size), patch_index).reshape(grid.patch_shape)
         row = {
             "policy": policy,
             "draw": draw,
             "fraction": fraction,
             "patches": len(patch_index),
-            "gain": bought,
-            "best_gain": best,
+            "gain": float(gain[patch_index].sum()),
+            "best_gain": float(np.sort(gain)[::-1][: len(patch_index)].sum()),  # of as many of the best
             "counts": scene.counts(chosen, weights.config.classes).tolist(),
             "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), frame.bands, score=scored).total,
         }

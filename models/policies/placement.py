@@ -65,11 +65,6 @@ def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np
     return np.where(labelled, loss, 0.0)
 
 
-def gain_sums(gain: NDArray[np.floating], chosen: NDArray[np.integer]) -> tuple[float, float]:
-    """Return the gain of the chosen patches, and of as many of the best ones; sum over frames, then divide."""
-    return float(gain[chosen].sum()), float(np.sort(gain)[::-1][: len(chosen)].sum())
-
-
 Placements = dict[str, list[Counts]]  # row -> confusion counts of its map; of ``random`` several
 
 
