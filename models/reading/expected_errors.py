@@ -85,10 +85,6 @@ class PatchExpectedErrors:
         counts = self.pixels.sum(axis=0, dtype=np.float64)
         return np.asarray(np.divide(self.wrong, counts, out=np.zeros_like(counts), where=counts > 0))
 
-    def wrong_pixels(self) -> Floats:
-        """Return the expected number of wrong pixels of each patch, (patch,)."""
-        return np.tensordot(self.pixels, self.expected_error, 2)
-
     def expected_wrong(self) -> float:
         """Return the expected fraction of wrong pixels of the field; 0 without pixels."""
         return float(self.wrong.sum() / max(self.pixels.sum(dtype=np.float64), 1.0))

@@ -146,7 +146,7 @@ def gain_by_record(
     def gain_of(step: int, exposure_ms: float) -> Scores:
         return gains.within_zones(errors.expected_gain(record.error_rates(step, exposure_ms, class_names)))
 
-    return errors.wrong_pixels(), second_pass.best(record, gain_of)
+    return np.tensordot(errors.pixels, errors.expected_error, 2), second_pass.best(record, gain_of)
 
 
 def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, part: bool) -> FinePlan:
