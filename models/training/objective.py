@@ -37,11 +37,6 @@ class Phase:
 PHASES = (Phase(0.5, 0.5), Phase(0.7, 0.3), Phase(1.0, 0.2, larger=2))
 
 
-def phase_at(done: float) -> Phase:
-    """Return the phase at the fraction ``done`` of a run."""
-    return next((phase for phase in PHASES if done < phase.until), PHASES[-1])
-
-
 def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
     """Return weights 1 / sqrt(frequency), with mean 1 over the labelled pixels, capped; 0 for an absent class."""
     counts = np.zeros(classes)

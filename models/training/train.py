@@ -24,7 +24,7 @@ from models.network.segmenter import Segmenter
 from models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
 from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from models.training.examples import BRIGHTNESS, CropSampler, Example
-from models.training.objective import batch_loss, class_weights, phase_at
+from models.training.objective import PHASES, batch_loss, class_weights
 from models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError, SceneError
 from pipeline.geometry.grid import UNLABELLED
@@ -130,7 +130,7 @@ class Trainer:
         course = self.course
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * rate_at(done)
-        phase = phase_at(done)
+        phase = next((one for one in PHASES if done < one.until), PHASES[-1])
         fewer = phase.larger if self.sampler.size(phase.larger) > self.sampler.size() else 1  # in large scenes
         batch = self.sampler.draw(max(1, self.settings.batch // fewer), self.rng, self.gain_shift, larger=phase.larger)
         course.step += 1

@@ -15,7 +15,7 @@ from models.reading.inference import map_of_columns
 from models.training import train as training
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import CropSampler
-from models.training.objective import batch_loss, class_weights, draw_patches, map_loss, phase_at, pixel_losses
+from models.training.objective import PHASES, Phase, batch_loss, class_weights, draw_patches, map_loss, pixel_losses
 from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
@@ -38,7 +38,7 @@ def test_training_reduces_the_loss(monkeypatch: pytest.MonkeyPatch):
     batch = CropSampler([scene], 8, 32).draw(8, np.random.default_rng(0), SHIFT)
     weight = class_weights([scene.labels], 3, 5.0)
     with torch.no_grad():
-        last = batch_loss(model, batch, weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
+        last = batch_loss(model, batch, weight, np.random.default_rng(0), PHASES[0], soft_dice=False)
     assert last < losses[0] / 3
     assert (summary["steps"], summary["skipped_steps"], len(freed)) == (40, 0, 2)
     assert not model.training
@@ -127,12 +127,12 @@ def test_most_patches_of_a_late_phase_are_drawn_by_entropy():
     overview[:, 0] = 30.0
     overview[:, :, :8, :8] = 0.0  # unsure in patch 0 alone
 
-    def first(done: float) -> float:
+    def first(phase: Phase) -> float:
         streams = (np.random.default_rng(seed) for seed in range(60))
-        return float(np.mean([draw_patches(overview, CONFIG, rng, phase_at(done))[0, 0] == 0 for rng in streams]))
+        return float(np.mean([draw_patches(overview, CONFIG, rng, phase)[0, 0] == 0 for rng in streams]))
 
-    assert 0.35 < first(0.0) < 0.65
-    assert 0.7 < first(0.9) < 0.95
+    assert 0.35 < first(PHASES[0]) < 0.65
+    assert 0.7 < first(PHASES[-1]) < 0.95
 
 
 @pytest.mark.parametrize(("deep", "least", "most"), [(False, 1.0, 1.0), (True, 0.04, 0.2)])
@@ -142,7 +142,7 @@ def test_deep_networks_read_patches_in_few_steps(deep: bool, least: float, most:
     rng = np.random.default_rng(0)
     weight = torch.ones(3)
     batch = CropSampler([block_example()], 8, 32).draw(1, rng, SHIFT)
-    losses = [batch_loss(model, batch, weight, rng, phase_at(0.0), soft_dice=False) for _ in range(100 if deep else 10)]
+    losses = [batch_loss(model, batch, weight, rng, PHASES[0], soft_dice=False) for _ in range(100 if deep else 10)]
     read = [torch.autograd.grad(loss, model.full_classes.bias, allow_unused=True)[0] is not None for loss in losses]
     assert least <= np.mean(read) <= most
 
