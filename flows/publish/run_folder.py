@@ -190,27 +190,19 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
 
 
 def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], prior: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the costs against the full scan; for a raster those of the model alone."""
+    """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
+    did = run.work_done(read, prior)
+    of_model = {
+        "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
+        "multiply_adds": {**SavingEntry(did.total, run.costs.of_map(run.kept_patches).total).as_dict(), **asdict(did)},
+    }
     if run.raster is not None:
-        return _model_savings(run, read, prior)
+        return of_model
     entries = capture_savings([*run.plan.coarse, *plan.sweeps], run.plan.full, run.camera, run.grid)
     capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
     if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.summary}
-    return {
-        **{name: entry.as_dict() for name, entry in entries.items()},
-        "capture_s": capture,
-        **_model_savings(run, read, prior),
-    }
-
-
-def _model_savings(run: SurveyRun, read: NDArray[np.intp], prior: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the patches segmented at full resolution and the multiply-adds, against those of every patch."""
-    did = run.work_done(read, prior)
-    return {
-        "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
-        "multiply_adds": {**SavingEntry(did.total, run.costs.of_map(run.kept_patches).total).as_dict(), **asdict(did)},
-    }
+    return {**{name: entry.as_dict() for name, entry in entries.items()}, "capture_s": capture, **of_model}
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> QuicklookData:
