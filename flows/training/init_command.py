@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from flows.settings.documents import as_toml
 from flows.settings.flags import AsJson, Switch
 from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
@@ -139,9 +139,9 @@ def _label_lines(draft: SceneDraft, known: SceneSettings) -> list[str]:
     labels = draft.files.labels
     if not labels:
         return ['# labels = "labels/{name}.png"   # no label files were found: {name} is an image\'s name']
-    kept = [] if known.class_attribute is None else [f"class_attribute = {_quoted(known.class_attribute)}"]
+    kept = [] if known.class_attribute is None else [f"class_attribute = {as_toml(known.class_attribute)}"]
     if known.unlabelled is not None:
-        kept.append(f"unlabelled = {_value(known.unlabelled)}")
+        kept.append(f"unlabelled = {as_toml(known.unlabelled)}")
     if draft.only_label is None:
         pair = next(iter(labels.items()))
         return [
@@ -149,7 +149,7 @@ def _label_lines(draft: SceneDraft, known: SceneSettings) -> list[str]:
             f"# labels of {len(labels)} of {len(draft.files.images)} images were found by their names: "
             f"{_printable(pair[0].name)} has {_printable(pair[1].name)}",
         ]
-    return [*kept, f"labels = {_quoted(draft.only_label)}   # of all images"]
+    return [*kept, f"labels = {as_toml(draft.only_label)}   # of all images"]
 
 
 def _wavelength_lines(draft: SceneDraft) -> list[str]:
@@ -187,7 +187,7 @@ def _class_lines(draft: SceneDraft) -> list[str]:
         return []
     guess = [one.value for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
     lines = [
-        f"# unlabelled = {_value(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
+        f"# unlabelled = {as_toml(one)}   # if it means no class: remove the #, and its line below" for one in guess[:1]
     ]
     polygons = all(is_polygon_file(label) for label in draft.files.labels.values())
     parts = (
@@ -196,19 +196,11 @@ def _class_lines(draft: SceneDraft) -> list[str]:
         else "value in the label files; rename them as you like"
     )
     lines += ["", f"[classes]   # with its fraction of the labelled pixels: name = {parts}"]
-    return lines + [f"{_key(one.name)} = {_value(one.value)}   # {one.fraction:.1%}" for one in classes]
-
-
-def _value(value: ClassValue) -> str:
-    return str(value) if isinstance(value, int) else str(list(value))
+    return lines + [f"{_key(one.name)} = {as_toml(one.value)}   # {one.fraction:.1%}" for one in classes]
 
 
 def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else as_toml(name)
 
 
 def _unseen(draft: SceneDraft) -> list[str]:
