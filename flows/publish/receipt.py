@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
@@ -169,25 +168,6 @@ def build_receipt(**fields: object) -> Receipt:
         name: fields[name] for name in ReceiptFields.model_fields if fields.get(name) or name in needed & {*fields}
     }
     return check_receipt(json.loads(to_json(known)))
-
-
-def with_accuracy(
-    receipt: Receipt, accuracy: Mapping[str, Any], stage: StageRecord, address: str, *, settings: Facts, judged: str
-) -> Receipt:
-    """Return a receipt with an accuracy added; the costs of the survey do not change.
-
-    ``stage`` is the record of the evaluation, ``address`` that of the product ``accuracy``. ``settings`` are those of
-    the evaluation, ``judged`` is its time. Raises ShapeError: a field is missing or not valid.
-    """
-    files = {name: place for name, place in receipt["products"].items() if place.startswith("runs/")}
-    stores = {name: place for name, place in receipt["products"].items() if name not in (*files, "accuracy")}
-    added = {
-        **{"accuracy_is": "judged", "judged": judged, "accuracy": accuracy},
-        "settings": {**receipt["settings"], **settings},
-        "stages": [row for row in receipt["stages"] if row["name"] != stage.name] + [asdict(stage)],
-        "products": {**stores, "accuracy": address, **files},
-    }
-    return build_receipt(**(receipt | added))
 
 
 def check_receipt(receipt: Mapping[str, Any]) -> Receipt:

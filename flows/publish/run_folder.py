@@ -22,7 +22,7 @@ from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground, draw_spectra, thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
-from flows.publish.receipt import AccuracyIs, Facts, Receipt, build_receipt, check_receipt, with_accuracy
+from flows.publish.receipt import AccuracyIs, Facts, Receipt, build_receipt, check_receipt
 from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
@@ -68,20 +68,23 @@ class Published:
 def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
     """Replace a published run by one with its accuracy.
 
-    ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the evaluation. All else of the receipt stays.
+    ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the evaluation. All else of the receipt stays: the
+    costs of the survey do not change. Raises ShapeError: a field of the receipt is missing or not valid.
     """
     before = load_receipt(draft.published)
     asked = asked_settings(survey.run)
     other_labels = asked["labels"] != before["settings"].get("labels")
     names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
-    receipt = with_accuracy(
-        before,
-        load_accuracy(accuracy),
-        survey.records[STAGES["evaluate"].name],
-        STAGES["evaluate"].addresses(accuracy)["accuracy"],
-        settings={name: asked[name] for name in names},
-        judged=now(),
-    )
+    files = {name: place for name, place in before["products"].items() if place.startswith("runs/")}
+    stores = {name: place for name, place in before["products"].items() if name not in (*files, "accuracy")}
+    stage = STAGES["evaluate"]
+    added = {
+        **{"accuracy_is": "judged", "judged": now(), "accuracy": load_accuracy(accuracy)},
+        "settings": {**before["settings"], **{name: asked[name] for name in names}},
+        "stages": [row for row in before["stages"] if row["name"] != stage.name] + [asdict(survey.records[stage.name])],
+        "products": {**stores, **stage.addresses(accuracy), **files},
+    }
+    receipt = build_receipt(**(before | added))
     return publish_draft(survey, draft, load_plan(survey.products["score"]), receipt)
 
 
