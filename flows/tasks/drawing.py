@@ -264,7 +264,7 @@ def draw_field(
         if least_gain is not None:
             begun = 0.3
             overviews = Path(folder) if pool.shares_memory else None
-            overview = Scoring(work.weights, work.mosaic, GAIN, work.capture, overviews)
+            overview = Scoring(work.weights, work.mosaic, work.capture, GAIN, overviews)
             some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
             found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), inputs=work.inputs)
             class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)

@@ -100,13 +100,19 @@ def _weights_there(seal: str, device: str, content: bytes) -> WeightsFile:
 
 
 @dataclass(frozen=True)
-class Scoring:
-    """Worker that scores the patches of a region by the coarse prediction."""
+class MosaicReader:
+    """Base of the workers that read a mosaic by the network."""
 
     weights: WeightsFile
     mosaic: StageRef
+    capture: LineSpec  # of pixels for which the mosaic has none
+
+
+@dataclass(frozen=True)
+class Scoring(MosaicReader):
+    """Worker that scores the patches of a region by the coarse prediction."""
+
     policy: str
-    capture: LineSpec
     overviews: Path | None = None  # folder that keeps the overview; None: it is not kept
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
@@ -132,13 +138,8 @@ def overview_file(folder: Path, region: Region) -> Path:
     return folder / f"{region.kept.top}-{region.kept.left}.npy"
 
 
-@dataclass(frozen=True)
-class ExpectedErrors:
+class ExpectedErrors(MosaicReader):
     """Worker that computes the expected errors of the overview at a region."""
-
-    weights: WeightsFile
-    mosaic: StageRef
-    capture: LineSpec
 
     def __call__(self, region: Region) -> PatchExpectedErrors:
         """Return the expected errors of the region's own patches."""
@@ -151,13 +152,8 @@ class ExpectedErrors:
         return PatchExpectedErrors.of([(sure, np.zeros(sure.shape[:2]))], grid, len(weights.class_names))
 
 
-@dataclass(frozen=True)
-class Readings:
+class Readings(MosaicReader):
     """Worker that segments a region by the overview alone, and by the full network everywhere."""
-
-    weights: WeightsFile
-    mosaic: StageRef
-    capture: LineSpec
 
     def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
         """Return (reading, y, x) classes of the kept part, and scores and errors of its patches.
@@ -228,7 +224,7 @@ class FieldWork:
         Raises SettingsError: one region does not fit the memory.
         """
         found = self._joined(
-            self._of_regions(Scoring(self.weights, mosaic, policy, capture), mosaic, NO_PATCHES, report)
+            self._of_regions(Scoring(self.weights, mosaic, capture, policy), mosaic, NO_PATCHES, report)
         )
         return _field_gain(found) if policy == GAIN else found
 

@@ -128,7 +128,7 @@ def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -
     run, stages = surveyed
     copy = tmp_path / "w.safetensors"
     copy.write_bytes(run.work.weights.path.read_bytes())
-    scoring = Scoring(replace(run.work.weights, path=copy), _mosaics(stages)[0], "entropy", run.capture)
+    scoring = Scoring(replace(run.work.weights, path=copy), _mosaics(stages)[0], run.capture, "entropy")
     sent = pickle.dumps((scoring, run.work.regions[0]))
     assert len(sent) < copy.stat().st_size + 2000
     expected = scoring(run.work.regions[0])
