@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from storage.arrays.layout import open_group, score_layout
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
 
-Restore = Callable[[slice, slice, Sequence[int]], NDArray[np.float32]]  # rows, columns, bands: (row, column, band)
+OpenStore = Callable[[Path], Mosaic | SignalCube]
 OF_WAVELENGTHS = ("band", "wavelength")
 OF_BANDS = (*OF_WAVELENGTHS, "fwhm")
 OF_LINES = ("line", "sample", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line")
@@ -29,12 +28,17 @@ VALUE = {"long_name": "scene value", "units": "1"}
 
 
 class RestoredArray(BackendArray):
-    """Spectra (row, column, band) float32; indexing restores only the selected ones."""
+    """Spectra (row, column, band) float32 of a store, which is opened when some are first selected and restored."""
 
-    def __init__(self, shape: tuple[int, ...], restore: Restore) -> None:
+    def __init__(self, shape: tuple[int, ...], path: Path, open_store: OpenStore) -> None:
         self.shape = shape
         self.dtype = np.dtype(np.float32)
-        self._restore = restore
+        self._path = path
+        self._open_store = open_store
+
+    @cached_property
+    def _store(self) -> Mosaic | SignalCube:
+        return self._open_store(self._path)
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._outer)
@@ -46,7 +50,12 @@ class RestoredArray(BackendArray):
         if 0 in kept:
             return np.empty(kept, np.float32)
         (rows, row), (columns, column) = (_span(np.atleast_1d(one)) for one in chosen[:2])
-        return self._restore(rows, columns, np.atleast_1d(chosen[2]).tolist())[row][:, column].reshape(kept)
+        bands = np.atleast_1d(chosen[2]).tolist()
+        if isinstance(self._store, Mosaic):
+            values = self._store.values(rows, columns, bands)
+        else:
+            values = self._store.spectra(rows.start, rows.stop, columns, bands)
+        return values[row][:, column].reshape(kept)
 
 
 def _span(places: NDArray[np.intp]) -> tuple[slice, slice | NDArray[np.intp]]:
@@ -56,37 +65,20 @@ def _span(places: NDArray[np.intp]) -> tuple[slice, slice | NDArray[np.intp]]:
     return slice(first, last + 1), slice(None) if whole else places - first
 
 
-@dataclass(frozen=True)
-class _StoredSpectra:
-    """Restore spectra of a mosaic or a condensed sweep, which is opened at the first call."""
-
-    path: Path
-    open: Callable[[Path], Mosaic | SignalCube]
-
-    @cached_property
-    def store(self) -> Mosaic | SignalCube:
-        return self.open(self.path)
-
-    def __call__(self, rows: slice, columns: slice, bands: Sequence[int]) -> NDArray[np.float32]:
-        if isinstance(self.store, Mosaic):
-            return self.store.values(rows, columns, bands)
-        return self.store.spectra(rows.start, rows.stop, columns, bands)
-
-
 def open_lazy_mosaic(path: Path) -> xarray.DataArray:
     """Open a mosaic as (y, x, band) scene values, with a coordinate on every axis.
 
     Raises IncompleteStoreError: it is missing or damaged.
     """
-    return _open(path, ("y", "x", "band"), OF_PLACES, _StoredSpectra(path, open_mosaic))
+    return _open(path, ("y", "x", "band"), OF_PLACES, open_mosaic)
 
 
 def open_lazy_lines(path: Path) -> xarray.DataArray:
     """Open a condensed sweep as (line, sample, band) scene values, rare spectra too; otherwise `open_lazy_mosaic`."""
-    return _open(path, ("line", "sample", "band"), OF_LINES, _StoredSpectra(path, open_signal_cube))
+    return _open(path, ("line", "sample", "band"), OF_LINES, open_signal_cube)
 
 
-def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore: Restore) -> xarray.DataArray:
+def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], open_store: OpenStore) -> xarray.DataArray:
     """Return spectra with the coordinates of their store, in dask's blocks of whole shards of scores."""
     group = open_group(path)
     size, block = score_layout(group)
@@ -94,7 +86,7 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], restore
     shape = (*size, coords["wavelength"].sizes["band"])
     bare = {name: np.arange(length) for name, length in zip(dims, shape, strict=True) if name not in coords}
     mapped = {"grid_mapping": GRID_MAPPING} if GRID_MAPPING in coords else {}
-    spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, restore)), VALUE | mapped)
+    spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, path, open_store)), VALUE | mapped)
     found = xarray.Dataset({"spectra": spectra.chunk(dict(zip(dims, (*block, -1), strict=True)))}, coords | bare)
     return by_wavelength(with_plain_attributes(xarray.decode_cf(found, mask_and_scale=False)))["spectra"]
 
