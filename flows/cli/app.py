@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
-import importlib.util
-from pathlib import Path
+import importlib.resources
 
 from cyclopts import App
 
@@ -53,9 +52,7 @@ def build_app(*, listed: bool) -> App:
 
 def _summary(module: str, function: str) -> str:
     """Return the first paragraph of a function's docstring, from the source."""
-    found = importlib.util.find_spec(module)
-    assert found is not None
-    assert found.origin is not None
-    parts = ast.parse(Path(found.origin).read_bytes()).body
+    package, _, name = module.rpartition(".")
+    parts = ast.parse(importlib.resources.files(package).joinpath(f"{name}.py").read_bytes()).body
     own = next(part for part in parts if isinstance(part, ast.FunctionDef) and part.name == function)
     return (ast.get_docstring(own) or "").partition("\n\n")[0]
