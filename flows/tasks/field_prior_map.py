@@ -65,16 +65,13 @@ class FieldPriorMap:
 
 def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:
     """Return one image (y, x, ...) from several of one size: the first that is not NaN, by pixel."""
-    whole: NDArray[np.float32] | None = None
-    for image in images:
-        if whole is None:
-            whole = image
-            continue
+    others = iter(images)
+    whole = next(others)
+    for image in others:
         finite = np.isfinite(whole)
         if finite.all():
             return whole
         whole = np.where(finite, whole, image)
-    assert whole is not None
     return whole
 
 
