@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,8 +47,6 @@ from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
 from storage.parallel.pool import THREADS, WorkerPool
 from storage.remote.opening import open_archive
-
-Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
 
 
 def reprocess(
@@ -92,7 +90,6 @@ def reprocess_fields(
     weights: Path | None = None,
     dry_run: bool = False,
     pool: WorkerPool = THREADS,
-    survey: Survey | None = None,
 ) -> dict[str, Any]:
     """Survey fields of an archive again, and return a row a field.
 
@@ -125,7 +122,7 @@ def reprocess_fields(
                 elif dry_run:
                     row |= {"state": "would run"}
                 else:
-                    folder = survey(settings, console) if survey else run_survey(settings, console).folder
+                    folder = run_survey(settings, console).folder
                     row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
                     renewed.pop(folder.name, None)  # a run that was stopped may be older than the one that it renews
                     renewed[old] = folder.name  # the same where a run got the accuracy that it lacked

@@ -6,11 +6,13 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rich.console import Console
 
+from flows.archive import reprocess_command
 from flows.archive import stale_runs as generations
 from flows.archive.commands import run_verify
 from flows.archive.reprocess_command import run_reprocess
@@ -59,7 +61,10 @@ class Reprocess:
 
     def __call__(self, archive: Path, code: int = DONE, survey: Any = None, **wishes: Any) -> list[dict[str, Any]]:
         self.capsys.readouterr()
-        assert run_reprocess(archive, QUIET, survey=survey, as_json=True, **wishes) == code
+        with pytest.MonkeyPatch.context() as patch:
+            if survey is not None:
+                patch.setattr(reprocess_command, "run_survey", lambda *given: SimpleNamespace(folder=survey(*given)))
+            assert run_reprocess(archive, QUIET, as_json=True, **wishes) == code
         fields: list[dict[str, Any]] = json.loads(self.capsys.readouterr().out)["fields"]
         return fields
 
