@@ -77,10 +77,9 @@ def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMa
     figures = receipt.get("prior_map")
     if figures is None or prior is None or figures["put_aside"]:
         return None
+    earlier = np.array(prior.classes)
     names = np.full(256, UNLABELLED, np.uint8)
-    for number, earlier in enumerate(prior.classes):
-        if earlier >= 0:
-            names[earlier] = number
+    names[earlier[earlier >= 0]] = np.flatnonzero(earlier >= 0)
     before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
     return PriorMapField(prior.days, names[before], ProbabilityStore(drawn.path / "class_probabilities.zarr").age())
 

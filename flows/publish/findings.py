@@ -96,13 +96,13 @@ def find_ground(
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
+    age_days = np.where(found.classes != UNLABELLED, probabilities.age(), np.nan)
     figures: dict[str, Any] = {
         "crs": crs_name(geobox),
         "resolution_m": pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x)),
         "shape": [int(size) for size in geobox.shape],
+        "older_ha": older_hectares(run.zones.place, age_days),
     }
-    age_days = np.where(found.classes != UNLABELLED, probabilities.age(), np.nan)
-    figures |= {"older_ha": older_hectares(run.zones.place, age_days)}
     if (old_class := probabilities.old_class()) is not None:
         changes = [] if prior is None else prior["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
