@@ -15,7 +15,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from storage.arrays.georeference import GRID_MAPPING
-from storage.arrays.layout import open_group, score_layout
+from storage.arrays.layout import array_of, open_group
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
 
@@ -81,9 +81,10 @@ def open_lazy_lines(path: Path) -> xarray.DataArray:
 def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], open_store: OpenStore) -> xarray.DataArray:
     """Return spectra with the coordinates of their store, in dask's blocks of whole shards of scores."""
     group = open_group(path)
-    size, block = score_layout(group)
+    scores = array_of(group, "scores")
+    block = (scores.shards or scores.chunks)[1:]
     coords = {name: xarray.Variable(*one) for name, one in read_coordinates(group, (*places, *OF_BANDS)).items()}
-    shape = (*size, coords["wavelength"].sizes["band"])
+    shape = (*scores.shape[1:], coords["wavelength"].sizes["band"])
     bare = {name: np.arange(length) for name, length in zip(dims, shape, strict=True) if name not in coords}
     mapped = {"grid_mapping": GRID_MAPPING} if GRID_MAPPING in coords else {}
     spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, path, open_store)), VALUE | mapped)

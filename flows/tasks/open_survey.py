@@ -22,6 +22,7 @@ from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
+from storage.archive.manifests import manifest_sha256
 from storage.archive.records import StageRecord
 from storage.archive.staging import bytes_below
 
@@ -206,7 +207,7 @@ class OpenSurvey:
         peak: int | None = None,
     ) -> None:
         size = self.run.archive.stored_bytes
-        known = self.run.archive.manifest_hash(ref)
+        known = manifest_sha256(self.run.archive.root / ref.uri)
         bytes_in = sum(size(one) for one in inputs)
         self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
         self.products[stage] = ref

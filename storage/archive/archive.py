@@ -204,12 +204,8 @@ class Archive:
         size = as_table(manifest.get(CLEARED)).get("bytes_before")
         return size if isinstance(size, int) else listed_bytes(manifest)
 
-    def manifest_hash(self, ref: StageRef) -> str:
-        """Return the SHA-256 of a store's manifest.json, and so of every byte of the store."""
-        return manifest_sha256(self.root / ref.uri)
-
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """Return the `manifest_hash` of stores and of all their inputs, by address."""
+        """Return the SHA-256 of the manifests of stores and all their inputs, and so of every byte, by address."""
         plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
         return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
 

@@ -120,16 +120,6 @@ def as_table(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
-    """Return the facts for the manifest of an extended run; its time of publication stays.
-
-    ``before`` and ``sha256`` are its present manifest and the SHA-256 of that file.
-    """
-    at = datetime.now(UTC).isoformat(timespec="milliseconds")
-    created = {} if "created" not in before else {"created": before["created"]}
-    return created | {EXTENDED: {"at": at, "manifests": [*manifests_before(before), sha256]}}
-
-
 def check_files(folder: Path, *, hashes: bool) -> None:
     """Compare a published folder with its manifest: names and sizes, and every byte where ``hashes``.
 

@@ -10,11 +10,12 @@ import ctypes
 import errno
 import os
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from storage.archive.keys import plain
-from storage.archive.manifests import extended_facts, manifest_sha256, read_manifest, write_manifest
+from storage.archive.manifests import EXTENDED, manifest_sha256, manifests_before, read_manifest, write_manifest
 from storage.archive.staging import (
     MANIFEST_NAME,
     bytes_below,
@@ -99,7 +100,10 @@ class RunDraft:
         """Write the manifest; its size depends on files and facts alone."""
         content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
         if self.extends:
-            content |= extended_facts(read_manifest(self.published), manifest_sha256(self.published))
+            before = read_manifest(self.published)
+            manifests = [*manifests_before(before), manifest_sha256(self.published)]
+            content |= {"created": before["created"]} if "created" in before else {}
+            content[EXTENDED] = {"at": datetime.now(UTC).isoformat(timespec="milliseconds"), "manifests": manifests}
         write_manifest(self.folder, content)
 
     def abandon(self) -> None:

@@ -227,14 +227,6 @@ def step_of(group: zarr.Group, attribute: str = "scale_factor") -> float:
         return float(array_of(group, "scores").attrs[attribute])  # type: ignore[arg-type]
 
 
-def score_layout(group: zarr.Group) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the rows and columns of scores, and of a shard of them (IncompleteStoreError: damaged)."""
-    scores = array_of(group, "scores")
-    _, rows, columns = scores.shape
-    _, deep, wide = scores.shards or scores.chunks
-    return (rows, columns), (deep, wide)
-
-
 _FILTERING = Lock()
 
 

@@ -98,7 +98,7 @@ class ObjectArchive(Archive):
         return super().is_known(ref) or self._find(ref.uri)
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
-        """Upload stores and all their inputs, and return their `manifest_hash` by address."""
+        """Upload stores and all their inputs, and return the SHA-256 of their manifests by address."""
         given = list(refs)
         self._ensure(super().manifest_hashes(given))
         return super().manifest_hashes(given)
