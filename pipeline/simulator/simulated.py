@@ -110,7 +110,41 @@ class SimulatedSource:
         return None
 
     def references(self, sweep: Sweep) -> References:
-        return take_references(self.scene, self.rig, self.choice, sweep)
+        """Return means of dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
+
+        The white frame is scaled from a shorter exposure, so that it does not saturate. It is taken with the mirror at
+        rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are
+        in the rig's bands.
+        """
+        rig = self.rig.taking(sweep)
+        block = sweep_block(self.scene, rig, AT_REST, range(1))
+        dark = dark_frame(block, self.choice)
+        assert block.white_e is not None
+        light = np.repeat(block.white_e.astype(np.float32)[None, None], block.rig.camera.samples, axis=1)
+        for effect, variant in self.choice.effects:
+            if effect.name not in SEEN:
+                continue
+            if hasattr(effect, "gain"):
+                light = light * effect.gain(block, variant)
+            elif hasattr(effect, "change"):
+                light = effect.change(light, block, variant)
+        seen: Frame = light[0]
+        bad = None
+        if self.choice.variant(DEFECTS.name) != OFF:
+            dead = dead_elements(rig, seen.shape[1])
+            seen[dead] = 0
+            elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
+            bad = _binned(elements.astype(np.float32), sweep.binning) > 0 if elements.any() else None
+        white_reference = self.scene.white_reference.astype(np.float32)
+        if (response := self.choice.variant(RESPONSE.name)) != OFF:
+            white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
+        return References(
+            dark=_binned(dark, sweep.binning),
+            white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
+            white_reference=white_reference,
+            bad=bad,
+            by_mirror=self.choice.variant(VIGNETTING.name) != OFF,
+        )
 
 
 @dataclass(frozen=True)
@@ -212,44 +246,6 @@ def check_binning(sweep: Sweep, camera: LineCamera) -> None:
             f"sweep {sweep.name}: sums of {sweep.binning} samples of {camera.bits} bits do not fit uint16; "
             f"bin at most {camera.most_binning}"
         )
-
-
-def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
-    """Return means of dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
-
-    The white frame is scaled from a shorter exposure, so that it does not saturate. It is taken with the mirror at
-    rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are in
-    the rig's bands.
-    """
-    rig = rig.taking(sweep)
-    block = sweep_block(scene, rig, AT_REST, range(1))
-    dark = dark_frame(block, choice)
-    assert block.white_e is not None
-    light = np.repeat(block.white_e.astype(np.float32)[None, None], block.rig.camera.samples, axis=1)
-    for effect, variant in choice.effects:
-        if effect.name not in SEEN:
-            continue
-        if hasattr(effect, "gain"):
-            light = light * effect.gain(block, variant)
-        elif hasattr(effect, "change"):
-            light = effect.change(light, block, variant)
-    seen: Frame = light[0]
-    bad = None
-    if choice.variant(DEFECTS.name) != OFF:
-        dead = dead_elements(rig, seen.shape[1])
-        seen[dead] = 0
-        elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
-        bad = _binned(elements.astype(np.float32), sweep.binning) > 0 if elements.any() else None
-    white_reference = scene.white_reference.astype(np.float32)
-    if (response := choice.variant(RESPONSE.name)) != OFF:
-        white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
-    return References(
-        dark=_binned(dark, sweep.binning),
-        white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
-        white_reference=white_reference,
-        bad=bad,
-        by_mirror=choice.variant(VIGNETTING.name) != OFF,
-    )
 
 
 def _binned(frame: Frame, binning: int) -> Frame:
