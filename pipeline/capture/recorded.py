@@ -103,8 +103,6 @@ class RecordedSource:
         The camera of the recording, with the samples of a line that is not binned.
     wavelength_nm, field_shape
         (band,) centres [nm] and (y, x) size of the field [px].
-    name
-        Name for the receipt.
     notes
         Assumptions on the recording.
 
@@ -114,6 +112,8 @@ class RecordedSource:
         There is no sweep, or a sweep's lines have other samples or bands than the camera and the wavelengths.
     """
 
+    name = "recorded"
+
     def __init__(
         self,
         sweeps: Sequence[RecordedSweep],
@@ -121,7 +121,6 @@ class RecordedSource:
         wavelength_nm: NDArray[np.float64],
         field_shape: tuple[int, int],
         *,
-        name: str = "recorded",
         notes: Sequence[str] = (),
     ) -> None:
         if not sweeps:
@@ -130,7 +129,6 @@ class RecordedSource:
         self.camera = camera
         self.wavelength_nm = wavelength_nm
         self.field_shape = field_shape
-        self.name = name
         self.notes = tuple(notes)
         for one in self.sweeps:
             wanted = (camera.samples // one.sweep.binning, len(wavelength_nm))

@@ -157,10 +157,6 @@ def _crc32(text: bytes) -> bytes:
     return b"%08x" % zlib.crc32(text)
 
 
-def say_nothing(step: str) -> None:
-    """Report no progress of the rig."""
-
-
 @dataclass(eq=False)
 class CaptureRunner:
     """Runs captures on connected devices, and records what they acknowledge."""
@@ -169,7 +165,7 @@ class CaptureRunner:
     journal: CaptureJournal
     camera: LineCamera
     rig: SurveyRig
-    say: Say = field(default=say_nothing, kw_only=True)
+    say: Say
     _times_ms: tuple[float, float] | None = field(default=None, init=False)  # exposure and period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:

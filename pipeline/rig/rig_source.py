@@ -30,7 +30,7 @@ from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.capture_paths import REFERENCES, CaptureRecord, UnusableCaptureError, locate_lines, next_path, path_of
-from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say, say_nothing
+from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.transports import DeviceRefused, StateUnknown
@@ -55,8 +55,6 @@ class RigSource:
         Store of the camera's files and the journal. The store of an earlier process continues its captures.
     vector_pairs
         Positions that the mirror's memory holds.
-    say
-        Called with the present step in a few words while no line comes: upload, capture or transfer.
     """
 
     name = "rig"
@@ -71,7 +69,6 @@ class RigSource:
         *,
         rig: SurveyRig | None = None,
         vector_pairs: int = 1500,
-        say: Say = say_nothing,
     ) -> None:
         self.camera = camera
         self.wavelength_nm = wavelength_nm
@@ -80,7 +77,7 @@ class RigSource:
         self.vector_pairs = vector_pairs
         self._open = open_devices
         self._kept = kept
-        self._say = say
+        self._say: Say = lambda step: None
         self._journal = CaptureJournal(kept)
         self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
         self._runner: CaptureRunner | None = None
@@ -106,7 +103,7 @@ class RigSource:
         return other
 
     def saying(self, say: Say) -> RigSource:
-        """Return the same source with another report of the present step."""
+        """Return the same source that calls ``say`` while no line comes, with its step: upload, capture or transfer."""
         other = copy(self)
         other._say = say
         other._runner = None
