@@ -143,13 +143,11 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
             line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
             reached = np.isfinite(line) & np.isfinite(sample)
             found.append(_patches(sweeps[number], camera, line[reached], sample[reached]))
-    return SampleViews(
-        np.concatenate([one.swath_px for one in found]),
-        np.concatenate([one.scan_px for one in found]),
-        np.concatenate([one.slope for one in found]),
-        np.concatenate([one.along_y for one in found]),
-        found[0].binning,
-    )
+    values: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in found])
+        for name in ("swath_px", "scan_px", "slope", "along_y")
+    }
+    return replace(found[0], **values)
 
 
 def _first_seeing(
