@@ -311,7 +311,18 @@ class MirrorDevice:
         with self._lock:
             out: list[Chunk] = []
             while data:
-                data = self._take_line(data, out) if self.mode is Mode.SIMPLE else self._take_frame(data, out)
+                simple = self.mode is Mode.SIMPLE  # a line or a frame may change the mode
+                taken, end, data = data.partition(b"\n" if simple else b"\x7e")
+                if not simple:
+                    for found in self._reader.feed(taken + end):
+                        whole, damaged = (found, None) if isinstance(found, pro.Frame) else (None, found)
+                        self._answer(Request(self.mode, frame=whole, damaged=damaged), out)
+                    continue
+                self._line = (self._line + taken)[: 2 * MOST_LINE]  # enough to see at its end that it is too long
+                if end:
+                    line, self._line = self._line.rstrip(b"\r"), b""
+                    if line:
+                        self._answer(Request(Mode.SIMPLE, line=line.decode("ascii", "replace").strip().upper()), out)
             return out
 
     def take_pulses(self) -> None:
@@ -343,24 +354,6 @@ class MirrorDevice:
         self.mode = mode
         self._line = b""
         self._reader = pro.FrameReader()
-
-    def _take_line(self, data: bytes, out: list[Chunk]) -> bytes:
-        """Take bytes up to the end of a line, and return those behind it: a line may change the mode."""
-        taken, end, rest = data.partition(b"\n")
-        self._line = (self._line + taken)[: 2 * MOST_LINE]  # enough to see at its end that it is too long
-        if end:
-            line, self._line = self._line.rstrip(b"\r"), b""
-            if line:
-                self._answer(Request(Mode.SIMPLE, line=line.decode("ascii", "replace").strip().upper()), out)
-        return rest
-
-    def _take_frame(self, data: bytes, out: list[Chunk]) -> bytes:
-        """Take bytes up to a boundary, and return those behind it: a frame may change the mode."""
-        taken, end, rest = data.partition(b"\x7e")
-        for found in self._reader.feed(taken + end):
-            whole, damaged = (found, None) if isinstance(found, pro.Frame) else (None, found)
-            self._answer(Request(self.mode, frame=whole, damaged=damaged), out)
-        return rest
 
     def _answer(self, request: Request, out: list[Chunk]) -> None:
         """Carry a request out and add the reply."""

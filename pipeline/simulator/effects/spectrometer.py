@@ -161,9 +161,7 @@ class Smile(LightChange):
 def wavelength_shift(samples: int, smile_nm: float) -> Floats:
     """Return the excess of each sample's wavelength over its band's, (sample,) [nm]."""
     half = (samples - 1) / 2
-    if half == 0:
-        return np.zeros(samples)
-    return np.asarray(smile_nm * ((np.arange(samples) - half) / half) ** 2, np.float64)
+    return np.asarray(smile_nm * ((np.arange(samples) - half) / max(half, 0.5)) ** 2, np.float64)  # 0 of one sample
 
 
 @lru_cache(maxsize=4)
