@@ -1,47 +1,58 @@
 """Indian Pines, trained and tested on halves of the same fields: the segmenter against LDA, SVM and random forest.
 
 All methods read the spectra of the file, and those of the simulated camera with blur and noise, as in surveys and
-`spectralzoom train`. The peers read every band, as single pixels and as means of 5 x 5 px. Their
-settings are chosen on the training pixels alone, one half of each field against the other, like the test halves.
+`spectralzoom train`. The peers read every band, as single pixels and as means of 5 x 5 px. Their settings are chosen
+on the training pixels alone, one half of each field against the other, like the test halves.
 `bench_pines.py --weights FILE` evaluates given weights instead of training some. `--halves` trains on one half of the
-training fields and evaluates on the other, to choose settings.
+training fields and evaluates on the other, to choose settings. Set OMP_NUM_THREADS=1.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE.parents[1])]
+import numpy as np
+from measure import Row, data_folder, not_run
+from numpy.typing import NDArray
+from scipy.ndimage import label, uniform_filter
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
 
-import numpy as np  # noqa: E402 - after the number of threads is set
-from measure import Row, data_folder, not_run  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-
-from models.evaluation.metrics import average_accuracy, confusion, kappa, overall_accuracy  # noqa: E402
-from pipeline.geometry.grid import UNLABELLED  # noqa: E402
-
-if TYPE_CHECKING:
-    from models.reading.inference import CoarsePrediction
-    from models.training.train import TrainingSettings
-    from models.weights.files import Weights
-    from pipeline.simulator.scenes.scene import RasterScene
+from flows.evaluate.frames import observe_frame
+from flows.tasks.scene import scene_of_file
+from flows.training.data import load_data_set
+from flows.training.figures import READINGS
+from flows.training.train import train_weights
+from flows.training.train_scenes import COLUMNS, TrainRequest
+from models.evaluation.metrics import average_accuracy, confusion, kappa, overall_accuracy
+from models.network.machine import one_thread
+from models.network.sizes import SegmenterConfig
+from models.network.spectral import SpectralBasis, patches_of
+from models.policies.policies import score_patches
+from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
+from models.training.examples import Example, electrons_of, measured_normalisation, normalised
+from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train, with_discriminants
+from models.weights.files import Weights, load_weights
+from pipeline.geometry.camera import LineCamera, expose, footprint
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.planning.coverage import frame_patches
+from pipeline.simulator.scenes.scene import RasterScene
 
 SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers
 WINDOW = 5  # px a side of the means in the second round of the peers
 FRACTIONS = (0.0, 0.1, 0.2, 0.35, 1.0)  # of the patches, by entropy
-STEPS = 300
+SETTINGS = TrainingSettings(steps=300, minutes=120)
 
 Values = NDArray[np.float32]
 Labels = NDArray[np.uint8]
@@ -99,8 +110,6 @@ def rows_of_halves() -> list[Row]:
 
 
 def _compared(ours: Sequence[Result], peers: Sequence[Result]) -> list[Row]:
-    if not peers:
-        return [*map(_row, ours), Row("peers", "not run: needs scikit-learn")]
     bars = [max(peer.figures[number] for peer in peers) for number in range(3)]
     goal = f"> {bars[0]:.1%} {bars[1]:.1%} {bars[2]:.3f}"
     shown = [
@@ -121,7 +130,6 @@ def _choices(folder: Path) -> dict[str, Any]:
 
 
 def _open(folder: Path) -> Split:
-    from flows.training.data import load_data_set
 
     files = load_data_set(folder / SCENE, **_choices(folder))
     train, test = files.load(Path(SCENE).stem, "train"), files.load(Path(SCENE).stem, "test")
@@ -132,7 +140,6 @@ def _open(folder: Path) -> Split:
 
 def halves(labels: Labels) -> NDArray[np.int64]:
     """Cut each connected field of one class in two across its longer side: 0 and 1, -1 for unlabelled pixels."""
-    from scipy.ndimage import label
 
     half = np.full(labels.shape, -1)
     for number in np.unique(labels[labels != UNLABELLED]):
@@ -145,11 +152,6 @@ def halves(labels: Labels) -> NDArray[np.int64]:
 
 
 def _peers(split: Split, source: str) -> list[Result]:
-    try:
-        import sklearn  # noqa: F401 - an extra of the benchmarks
-    except ImportError:
-        return []
-    from scipy.ndimage import uniform_filter
 
     smooth = np.asarray(uniform_filter(split.values, (WINDOW, WINDOW, 1), mode="reflect"), np.float32)
     scan_passes = {"single spectra": split.values, f"{WINDOW} x {WINDOW} px": smooth}
@@ -161,11 +163,6 @@ def _peers(split: Split, source: str) -> list[Result]:
 
 
 def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
-    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-    from sklearn.ensemble import RandomForestClassifier
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import SVC
 
     forest: dict[str, list[Any]] = {"max_features": ["sqrt", 40]}
     svm: dict[str, list[Any]] = {"svc__C": [10, 100, 1000], "svc__gamma": [3e-4, 1e-3, 3e-3, 1e-2]}
@@ -177,7 +174,6 @@ def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
 
 
 def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[str, list[Any]]) -> Result:
-    from sklearn.model_selection import GridSearchCV
 
     began = time.process_time()
     taught = split.train != UNLABELLED
@@ -191,32 +187,19 @@ def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[s
 
 
 def _trained(folder: Path, out: Path) -> Path:
-    from flows.training.train import train_weights
-    from flows.training.train_scenes import TrainRequest
 
     path = out / "pines.safetensors"
-    train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=_settings()))
+    train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=SETTINGS))
     return path
 
 
-def _settings() -> TrainingSettings:
-    from models.training.train import TrainingSettings
-
-    return TrainingSettings(steps=STEPS, minutes=120)
-
-
 def _scene(folder: Path) -> RasterScene:
-    from flows.tasks.scene import scene_of_file
-    from flows.training.data import load_data_set
-    from pipeline.geometry.camera import LineCamera
 
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
 
 
 def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
     """Return a fine exposure of a scene, (y, x, band), as the fine pass of the training before its columns."""
-    from models.training.examples import electrons_of
-    from pipeline.geometry.camera import LineCamera, expose, footprint
 
     camera = LineCamera()
     electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
@@ -225,9 +208,6 @@ def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-    from flows.evaluate.frames import observe_frame
-    from models.weights.files import load_weights
-    from pipeline.geometry.camera import LineCamera
 
     weights = load_weights(path)
     scene = _scene(folder)
@@ -239,15 +219,6 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
     """Train the segmenter on the spectra of the file, and return its results."""
-    from flows.training.figures import READINGS
-    from flows.training.train_scenes import COLUMNS
-    from models.network.sizes import SegmenterConfig
-    from models.network.spectral import SpectralBasis, patches_of
-    from models.reading.inference import coarse_prediction_of_columns
-    from models.training.examples import Example, measured_normalisation, normalised
-    from models.training.train import LabelledPixels, linear_discriminants, train, with_discriminants
-    from models.weights.files import Weights
-    from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
     scene = _scene(folder)
     height, width = split.train.shape
@@ -263,7 +234,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     config = SegmenterConfig(split.classes, basis.columns, grid.patch)
     pixels = LabelledPixels.drawn([example], np.random.default_rng(0))
     start = linear_discriminants(pixels.brightened(normalisation.gain_shift, np.random.default_rng(1)), split.classes)
-    network, record = train(config, [example], normalisation.gain_shift, _settings(), start=start)
+    network, record = train(config, [example], normalisation.gain_shift, SETTINGS, start=start)
     network = with_discriminants(network, start, READINGS["mean of both"])
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
     patches = np.asarray(patches_of(example.columns, grid.patch), np.float32)
@@ -272,10 +243,6 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
 
 def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:
     """Return the results with several fractions of the patches, chosen by entropy."""
-    from models.network.machine import one_thread
-    from models.policies.policies import score_patches
-    from models.reading.inference import coarse_prediction_of_columns, segment
-    from pipeline.planning.coverage import frame_patches
 
     training = weights.record["training"]
     found = []
@@ -293,11 +260,11 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
     return found
 
 
-def main(arguments: Sequence[str]) -> int:
+def main() -> int:
     parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
     parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
     parser.add_argument("--halves", action="store_true", help="train and judge on halves of the training fields")
-    flags = parser.parse_args(arguments)
+    flags = parser.parse_args()
     for row in rows_of_halves() if flags.halves else rows(flags.weights):
         met = {True: "met", False: "NOT met", None: ""}[row.met]
         print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
@@ -305,4 +272,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(main())

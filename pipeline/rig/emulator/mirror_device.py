@@ -298,6 +298,9 @@ class MirrorDevice:
     port, and that of an emulated camera, which asks for positions.
     """
 
+    _line: bytes  # of simple mode, without its end
+    _reader: pro.FrameReader
+
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self.pulses: Pulses | None = None

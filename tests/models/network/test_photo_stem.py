@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -11,8 +9,6 @@ from models.network.photo_stem import PaddedConv, PhotoStem
 from models.network.segmenter import Segmenter
 from models.network.sizes import PLANES, SegmenterConfig
 from models.weights.files import load_encoder
-
-DEEP = SegmenterConfig(classes=3, columns=2, patch=32, layers=1, deep=True)
 
 
 @pytest.mark.parametrize(("kernel", "stride", "seen"), [(3, 1, (3, 5)), (3, 2, (4, 6)), (5, 1, (2, 6)), (5, 2, (3, 7))])
@@ -35,7 +31,7 @@ def test_features_have_the_sizes_of_the_levels() -> None:
 
 def test_the_shipped_encoder_has_every_convolution() -> None:
     """Only layers that depend on the columns, the widths or the classes start at random."""
-    model = Segmenter(DEEP)
+    model = Segmenter(SegmenterConfig(classes=3, columns=2, patch=32, layers=1, deep=True))
     left = model.load_state_dict(load_encoder(), strict=False)
     assert not left.unexpected_keys
     own = {name.split(".")[1] for name in left.missing_keys if name.startswith("overview_stem.")}
@@ -45,7 +41,7 @@ def test_the_shipped_encoder_has_every_convolution() -> None:
 @pytest.mark.parametrize("columns", [1, 2, 3, 48])
 def test_colours_are_the_last_middle_and_first_column(columns: int) -> None:
     """Columns ascend with the wavelength; each colour has half of a column's spread."""
-    weight = Segmenter(replace(DEEP, columns=columns)).overview_stem.colours.weight[:, :, 0, 0]
+    weight = PhotoStem(columns + PLANES, [8, 16, 32, 64]).colours.weight[:, :, 0, 0]
     assert torch.equal(weight.sum(dim=1), torch.full((3,), 0.5))
     places = (weight[:, :columns] * torch.arange(columns)).sum(dim=1) / 0.5
     torch.testing.assert_close(places, torch.tensor([columns - 1, (columns - 1) / 2, 0.0]))
