@@ -17,7 +17,7 @@ from models.training.examples import Example
 from models.training.objective import map_loss, pixel_losses
 from models.training.train import Trainer, TrainingSettings
 from pipeline.geometry.grid import UNLABELLED
-from tests.models.conftest import SMALL
+from tests.models.conftest import SMALL, read_both
 
 SIZES: dict[str, Any] = SMALL | {"classes": 2}
 SETTINGS = TrainingSettings(steps=4, batch=1, crop=16)
@@ -65,7 +65,7 @@ def test_14_segmenter_with_two_classes_has_gradients():
         image = torch.randn(1, 4 + PLANES, 32, 32)
     labels = (image[:, 0] > 0).long()
     none = torch.zeros(1, 0, dtype=torch.int64)
-    logits = model.composite(*model(image, image, none, torch.zeros(1, 2)), none)
+    logits = model.composite(*read_both(model, image, image, none, torch.zeros(1, 2)), none)
     loss = map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(2), soft_dice=True)
     loss.backward()  # type: ignore[no-untyped-call]
     for learned in (model.overview_classes.weight.grad, model.spectral.weight.grad):

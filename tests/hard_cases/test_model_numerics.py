@@ -27,7 +27,7 @@ from models.training.train import TrainingSettings, train
 from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import frame_patches, select_patches
-from tests.models.conftest import SMALL, coarse_prediction, make_network, noise, plain_weights
+from tests.models.conftest import SMALL, coarse_prediction, make_network, noise, plain_weights, read_both
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)
 PLACE = torch.zeros(1, 2)
@@ -86,7 +86,7 @@ def test_3_empty_batch_gives_empty_maps(count: int):
     model = make_network(layers=2)
     numbers = torch.zeros(0, count, dtype=torch.int64)
     image = torch.zeros(0, 4 + PLANES, 32, 48)
-    logits, patches = model(image, image, numbers, torch.zeros(0, 2))
+    logits, patches = read_both(model, image, image, numbers, torch.zeros(0, 2))
     assert logits.shape == (0, 3, 32, 48)
     assert patches.shape == (0, count, 3, 8, 8)
     assert model.composite(logits, patches, numbers).shape == (0, 3, 32, 48)
@@ -112,7 +112,7 @@ def test_5_map_without_patches_is_the_overview():
     seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), SceneGrid(48, 64, 8))
     image = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None]
     model = weights.segmenter
-    logits, patches = model(image, image, NONE, PLACE)
+    logits, patches = read_both(model, image, image, NONE, PLACE)
     whole = model.composite(logits, patches, NONE)
     assert torch.equal(whole, logits)
     assert (logits[0].softmax(dim=0).permute(1, 2, 0).numpy() == seen.probability).all()
@@ -130,7 +130,7 @@ def test_6_map_of_all_patches_ignores_their_order():
     maps = []
     for seed in range(3):
         order = torch.randperm(24, generator=torch.Generator().manual_seed(seed))[None]
-        logits, patches = model(image, image, order, PLACE)
+        logits, patches = read_both(model, image, image, order, PLACE)
         maps.append(model.composite(logits, patches, order))
     assert max((other - maps[0]).abs().max().item() for other in maps[1:]) <= 1e-5
     assert ((maps[0] - logits).abs().amax(dim=1) > 1e-5).all()
@@ -175,10 +175,10 @@ def test_11_bfloat16_agrees_with_float32(size: tuple[int, int]):
     model = make_network(layers=2)
     image = _image(*size)
     numbers = torch.arange(0, size[0] * size[1] // 64, 3)[None]
-    exact = model.composite(*model(image, image, numbers, PLACE), numbers)
+    exact = model.composite(*read_both(model, image, image, numbers, PLACE), numbers)
     with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
         warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
-        rough = model.composite(*model(image, image, numbers, PLACE), numbers)
+        rough = model.composite(*read_both(model, image, image, numbers, PLACE), numbers)
     depth = sum(isinstance(part, torch.nn.Conv2d | torch.nn.Linear) for part in model.modules())
     assert (exact - rough).square().mean().sqrt() <= 2.0**-8 * math.sqrt(depth) * exact.square().mean().sqrt()
     best = exact.softmax(dim=1).topk(2, dim=1).values
@@ -287,13 +287,13 @@ def test_23_map_does_not_depend_on_the_batch():
     detail = _image(32, 64, 8, 1)
     places = torch.arange(16).view(8, 2)
     numbers = torch.stack([torch.randperm(32, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
-    together = model.composite(*model(image, detail, numbers, places), numbers)
+    together = model.composite(*read_both(model, image, detail, numbers, places), numbers)
     for i in (0, 3, 7):
         one = slice(i, i + 1)
-        alone = model.composite(*model(image[one], detail[one], numbers[one], places[one]), numbers[one])
+        alone = model.composite(*read_both(model, image[one], detail[one], numbers[one], places[one]), numbers[one])
         assert (alone - together[one]).abs().max() <= 4e-6
     turned = numbers.flip(1)
-    assert (model.composite(*model(image, detail, turned, places), turned) - together).abs().max() <= 4e-6
+    assert (model.composite(*read_both(model, image, detail, turned, places), turned) - together).abs().max() <= 4e-6
 
 
 @torch.inference_mode()
@@ -330,7 +330,7 @@ def test_27_zero_and_huge_corrections_keep_gradients_finite(size: float):
         for parameter in model.full_classes.parameters():
             parameter.zero_()
         model.full_classes.bias[1] = size
-    logits, patches = model(image, image, numbers, PLACE)
+    logits, patches = read_both(model, image, image, numbers, PLACE)
     under = cut(logits, 8)[:, numbers[0]]
     assert torch.equal(patches, under) if size == 0 else (patches.argmax(dim=2) == 1).all()
     labels = torch.full((1, 32, 32), 2)

@@ -85,7 +85,8 @@ def make_network(seed: int = 0, **sizes: Any) -> Segmenter:
 def read_both(model: Segmenter, image: Tensor, detail: Tensor, index: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
     """Return logits of the overview of ``image``, and of the patches ``index`` (B, K) of ``detail``."""
     overview = model.read_overview(image, origin)
-    chosen = torch.stack([cells[own] for cells, own in zip(cut(detail, model.config.patch), index, strict=True)])
+    cells = cut(detail, model.config.patch)
+    chosen = cells.gather(1, index[:, :, None, None, None].expand(-1, -1, *cells.shape[2:]))
     return overview.logits, model.read_patches(overview, chosen, index)
 
 

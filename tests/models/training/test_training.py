@@ -19,7 +19,7 @@ from models.training.objective import PHASES, Phase, batch_loss, class_weights, 
 from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
-from tests.models.conftest import block_example, make_weights
+from tests.models.conftest import block_example, make_weights, read_both
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
@@ -225,7 +225,7 @@ def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
     flat = torch.randn(1, 4 + PLANES, 1, 1)
     given = flat.expand(-1, -1, 32, 32), torch.randn(1, 4 + PLANES, 32, 32), torch.arange(16)[None]
     nets = [training.with_discriminants(own, start, share) for share in (fraction, 0.0)]
-    mixed, alone, whole = (net(*given, torch.zeros(1, 2)) for net in (*nets, own))
+    mixed, alone, whole = (read_both(net, *given, torch.zeros(1, 2)) for net in (*nets, own))
     for found, plain, full in zip(mixed, alone, whole, strict=True):
         torch.testing.assert_close(found, fraction * full + (1 - fraction) * plain, rtol=1e-4, atol=1e-3)
     told = start["spectral.weight"][:, :, 0, 0] @ flat[0, :4, 0, 0] + start["spectral.bias"]
