@@ -56,7 +56,7 @@ def test_observed_scenes_are_padded_by_mirroring():
 
 
 def test_examples_without_a_labelled_pixel_are_refused():
-    """The error says of how many scenes none has one."""
+    """Training on them would change nothing; the error has the number of scenes."""
     blank = Example("e", np.zeros((32, 32, 1), np.float16), np.full((32, 32), 255, np.uint8), (32, 32))
     with pytest.raises(SceneError, match="none of 2 scenes has a labelled pixel"):
         CropSampler([blank, blank], 8, 32)
