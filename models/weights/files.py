@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +33,6 @@ else:
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/5"
-ENCODER = "spectralzoom-encoder/1"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine")
 COLOURS = "class_colours"
@@ -294,13 +292,6 @@ def load_weights(path: Path) -> Weights:
         if not (normalisation.spread > 0).all():
             raise ValueError("normalisation.spread has a value that is not above 0")
     return Weights(network.eval(), described.basis, normalisation, described.class_names, colours, described.record)
-
-
-def load_encoder() -> dict[str, Tensor]:
-    """Read the encoder for large frames, trained on ImageNet, as tensors of the segmenter; a copy is shipped."""
-    path = Path(str(resources.files("models") / "shipped" / "imagenet.safetensors"))
-    tensors = read_tensors(path, read_about(path, ENCODER))
-    return {f"overview_stem.{name}": tensor.float() for name, tensor in tensors.items()}
 
 
 def describe_weights(path: Path) -> Description:
