@@ -227,7 +227,7 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
         "best uniform scan in this time": scans["best_in_time"],
         "cheapest near the best": scans["reference"],
     }
-    expected = "at most {}" if scans["at_most"] else "{}"
+    bound = "at most " if scans["at_most"] else ""
     every = scans["candidates"][:: math.ceil(len(scans["candidates"]) / MOST_SCANS)]
     rows = {
         one["seconds"]: [
@@ -236,7 +236,7 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
             format_seconds(one["seconds"]),
             format_bytes(one["bytes_raw"]),
             format_count(one["multiply_adds"]),
-            expected.format(format_prediction(one["expected_miou"], one["expected_spread"]) or DASH),
+            f"{bound}{score}" if (score := format_prediction(one["expected_miou"], one["expected_spread"])) else DASH,
         ]
         for one in (*every, *named.values())
         if one is not None

@@ -130,7 +130,6 @@ def _choices(folder: Path) -> dict[str, Any]:
 
 
 def _open(folder: Path) -> Split:
-
     files = load_data_set(folder / SCENE, **_choices(folder))
     train, test = files.load(Path(SCENE).stem, "train"), files.load(Path(SCENE).stem, "test")
     assert train.labels is not None
@@ -140,7 +139,6 @@ def _open(folder: Path) -> Split:
 
 def halves(labels: Labels) -> NDArray[np.int64]:
     """Cut each connected field of one class in two across its longer side: 0 and 1, -1 for unlabelled pixels."""
-
     half = np.full(labels.shape, -1)
     for number in np.unique(labels[labels != UNLABELLED]):
         fields, count = label(labels == number)
@@ -152,7 +150,6 @@ def halves(labels: Labels) -> NDArray[np.int64]:
 
 
 def _peers(split: Split, source: str) -> list[Result]:
-
     smooth = np.asarray(uniform_filter(split.values, (WINDOW, WINDOW, 1), mode="reflect"), np.float32)
     scan_passes = {"single spectra": split.values, f"{WINDOW} x {WINDOW} px": smooth}
     return [
@@ -163,7 +160,6 @@ def _peers(split: Split, source: str) -> list[Result]:
 
 
 def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
-
     forest: dict[str, list[Any]] = {"max_features": ["sqrt", 40]}
     svm: dict[str, list[Any]] = {"svc__C": [10, 100, 1000], "svc__gamma": [3e-4, 1e-3, 3e-3, 1e-2]}
     return {
@@ -174,7 +170,6 @@ def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
 
 
 def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[str, list[Any]]) -> Result:
-
     began = time.process_time()
     taught = split.train != UNLABELLED
     half = halves(split.train)[taught]
@@ -187,20 +182,17 @@ def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[s
 
 
 def _trained(folder: Path, out: Path) -> Path:
-
     path = out / "pines.safetensors"
     train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=SETTINGS))
     return path
 
 
 def _scene(folder: Path) -> RasterScene:
-
     return scene_of_file(load_data_set(folder / SCENE).load(Path(SCENE).stem), LineCamera())
 
 
 def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
     """Return a fine exposure of a scene, (y, x, band), as the fine pass of the training before its columns."""
-
     camera = LineCamera()
     electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
     values = expose(electrons, camera, step=1, rng=np.random.default_rng(seed))
@@ -208,7 +200,6 @@ def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-
     weights = load_weights(path)
     scene = _scene(folder)
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
@@ -219,7 +210,6 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
     """Train the segmenter on the spectra of the file, and return its results."""
-
     scene = _scene(folder)
     height, width = split.train.shape
     basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[False])
@@ -243,7 +233,6 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
 
 def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:
     """Return the results with several fractions of the patches, chosen by entropy."""
-
     training = weights.record["training"]
     found = []
     words = f"a map; training {training.get('processor_seconds', 0)} s CPU, {training['steps']} steps"
