@@ -1,4 +1,4 @@
-"""What a second pass could gain by swaths of its own, or by a spacing and exposure for each row of patches.
+"""Compare the second pass with free swaths, and with a spacing and exposure for each row of patches.
 
 Each survey of `bench_regimes` stops after its first pass, with the plan of the second one. Free swaths are moved by
 whole patches, and take every line of a run. Rows with a spacing and exposure of their own are compared with the best
