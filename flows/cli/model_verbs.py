@@ -16,7 +16,7 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
 from flows.terminal.progress import print_json, stderr
-from flows.training.train import CROPS_PX, asked_command, check_counts, run_train
+from flows.training.train import asked_command, check_counts, run_train
 from flows.training.train_scenes import TrainRequest
 from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
 from models.evaluation.metrics import DRAWS
@@ -24,7 +24,6 @@ from models.network.machine import PROCESSOR, Device
 from models.training.temporal import TemporalTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
-from pipeline.simulator.scenes.built_in import built_in_laws
 
 
 @Parameter(name="*")
@@ -104,7 +103,7 @@ class TrainFlags(SceneFlags):
     heads
         Number of attention heads; a divisor of --dim.
     crop
-        Size of the crops [px]. Default: 256 for the farm, 384 for files.
+        Size of the crops [px].
     batch
         Crops per step; half as many, of twice the area, in the last 30 % of the steps.
     min_exposure_ms
@@ -130,7 +129,7 @@ class TrainFlags(SceneFlags):
     dim: int = 64
     layers: int | None = None
     heads: int = 4
-    crop: int | None = None
+    crop: int = TrainingSettings.crop
     batch: int = TrainingSettings.batch
     min_exposure_ms: float = TrainingSettings.darkest_ms
     train_mask: str | None = None
@@ -160,7 +159,7 @@ class TrainFlags(SceneFlags):
                 steps=self.steps,
                 minutes=self.minutes,
                 seed=self.seed,
-                crop=CROPS_PX[bool(built_in_laws(dataset))] if self.crop is None else self.crop,
+                crop=self.crop,
                 batch=self.batch,
                 darkest_ms=self.min_exposure_ms,
                 learning_rate=usual if self.learning_rate is None else self.learning_rate,

@@ -42,6 +42,7 @@ from models.weights.files import (
     TrainedOn,
     Weights,
     add_ood,
+    load_encoder,
     load_weights,
     save_weights,
     with_record,
@@ -51,8 +52,6 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.land import sun_over_farm
-
-CROPS_PX = {True: 256, False: 384}  # by default: of built-in scenes, and of frames
 
 
 def train_weights(
@@ -184,7 +183,7 @@ def _learned(
     rng = np.random.default_rng([0x1DA])
     augmentation = training_capture(normalisation, settings.darkest_ms)
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
-    start = linear_discriminants(pixels, config.classes)
+    start = linear_discriminants(pixels, config.classes) | (load_encoder() if config.deep else {})
     model, summary = train(
         config,
         examples,

@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
+from models.network.photo_stem import PhotoStem
 from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
 from pipeline.errors import ShapeError
 
@@ -141,13 +142,10 @@ class Residual(nn.Module):
 class Stem(nn.Module):
     """Encoder of a U-Net: an image to features at every level, each half as large as the last."""
 
-    def __init__(self, inputs: int, widths: list[int], deep: bool = False) -> None:
+    def __init__(self, inputs: int, widths: list[int]) -> None:
         super().__init__()
         self.enter = nn.Conv2d(inputs, widths[0], 1)
-        self.blocks = nn.ModuleList(
-            nn.Sequential(*(Residual(width) for _ in range(level))) if deep else Residual(width)
-            for level, width in enumerate(widths)
-        )
+        self.blocks = nn.ModuleList(map(Residual, widths))
         self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
 
     def forward(self, image: Tensor) -> list[Tensor]:
@@ -197,7 +195,7 @@ class Segmenter(nn.Module):
         self.config = config
         inputs = config.columns + PLANES
         widths = level_widths(config.overview_width, TOKEN_PX, config.deep)
-        self.overview_stem = Stem(inputs, widths, config.deep)
+        self.overview_stem = PhotoStem(inputs, widths) if config.deep else Stem(inputs, widths)
         self.to_token = nn.Conv2d(widths[-1], config.dim, BOTTOM, stride=BOTTOM)
         self.encoder = Encoder(config.dim, config.layers, config.heads, config.mlp_ratio)
         self.from_token = nn.Conv2d(config.dim, widths[-1] * BOTTOM**2, 1)

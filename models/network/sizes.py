@@ -32,6 +32,9 @@ AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
 OTHERS = 7  # inputs of the temporal reader beside probabilities: seen, age, both lights, line spacing, season (2)
+PHOTO_FIRST = 32  # channels of the first convolution of the encoder for large frames
+# Its stages: channels, pixels a side of a filter, stride, ratio of inner channels, blocks.
+PHOTO_STAGES = ((16, 3, 1, 1, 1), (24, 3, 2, 6, 2), (40, 5, 2, 6, 2), (80, 3, 2, 6, 3), (112, 5, 1, 6, 1))
 GATES = 3  # of the temporal reader: weight of prior map, weight of visit, weight of both against the prior map
 
 
@@ -56,7 +59,7 @@ class SegmenterConfig:
     layers: int = 3
     heads: int = 4
     mlp_ratio: int = 3
-    deep: bool = False  # an overview for large frames: channels and blocks where pixels are few, none at the finest
+    deep: bool = False  # an overview for large frames, with an encoder that was trained on ImageNet
 
     def __post_init__(self) -> None:
         for name in ("classes", *MOST):
@@ -116,20 +119,43 @@ def multiply_adds(
     inputs = config.columns + PLANES
     lowest = level_widths(config.overview_width, TOKEN_PX, config.deep)[-1] * BOTTOM**2
     overview = TOKEN_PX**2 * config.columns * config.classes  # spectral classifier
-    overview += _pyramid(inputs, config.overview_width, TOKEN_PX, config.deep)
+    overview += (_photo_pyramid if config.deep else _pyramid)(inputs, config.overview_width, TOKEN_PX)
     overview += 2 * lowest * config.dim  # to a token and back
     drawn = math.prod(grid.padded_shape) * (basis + config.overview_width * config.classes)
     patch = config.patch**2 * (apart * basis + config.width * config.classes)
-    patch += _pyramid(inputs + config.overview_width, config.width, config.patch, deep=False)
+    patch += _pyramid(inputs + config.overview_width, config.width, config.patch)
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
     return MultiplyAdds(tokens * overview + drawn + read, score, patches * patch)
 
 
-def _pyramid(inputs: int, width: int, size: int, deep: bool) -> int:
+def _levels(width: int, size: int, deep: bool) -> list[tuple[int, int]]:
+    """Channels and pixels of each level of a cell of ``size`` px."""
+    return [(channels, (size >> i) ** 2) for i, channels in enumerate(level_widths(width, size, deep))]
+
+
+def _pyramid(inputs: int, width: int, size: int) -> int:
     """Stem and head of a cell of ``size`` px: the way in, residual blocks, and the ways between levels."""
-    levels = [(channels, (size >> i) ** 2) for i, channels in enumerate(level_widths(width, size, deep))]
-    blocks = sum((i + min(i, 1) if deep else 2) * 9 * c**2 * pixels for i, (c, pixels) in enumerate(levels))
+    levels = _levels(width, size, deep=False)
+    blocks = sum(2 * 9 * c**2 * pixels for c, pixels in levels)
     blocks -= 9 * levels[-1][0] ** 2 * levels[-1][1]  # the lowest level has none on the way up
     between = sum(8 * upper * lower * pixels for (upper, _), (lower, pixels) in pairwise(levels))
     return inputs * width * size**2 + blocks + between
+
+
+def _photo_pyramid(inputs: int, width: int, size: int) -> int:
+    """Return the count of the encoder for large frames and the head, in a cell of ``size`` px."""
+    levels = _levels(width, size, deep=True)
+    pixels = size**2 // 4
+    found = inputs * (width + 3) * size**2 + 3 * 9 * PHOTO_FIRST * pixels
+    before = PHOTO_FIRST
+    for channels, kernel, stride, ratio, blocks in PHOTO_STAGES:
+        for block in range(blocks):
+            found += (ratio > 1) * ratio * before**2 * pixels
+            pixels = pixels if block else pixels // stride**2
+            found += ratio * before * (kernel**2 + channels) * pixels
+            before = channels
+    found += before * levels[-1][0] * pixels
+    found += sum(stage[0] * c * side for stage, (c, side) in zip(PHOTO_STAGES, levels[1:], strict=False))
+    found += sum(4 * upper * lower * side for (upper, _), (lower, side) in pairwise(levels))
+    return found + sum(9 * c**2 * side for c, side in levels[1:-1])

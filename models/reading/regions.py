@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.sizes import PATCHES_AT_ONCE, PLANES, TOKEN_PX, SegmenterConfig, level_widths
+from models.network.sizes import PATCHES_AT_ONCE, PHOTO_STAGES, PLANES, TOKEN_PX, SegmenterConfig, level_widths
 from pipeline.geometry.grid import SceneGrid
 
 REGION_PX = 640  # a side, at most
@@ -161,6 +161,8 @@ def region_bytes(config: SegmenterConfig, region: Region, patch_index: int, band
         FEATURE_COPIES * sum(channels / 4**level for level, channels in enumerate(level_widths(width, size, deep)))
         for width, size, deep in ((config.overview_width, TOKEN_PX, config.deep), (config.width, config.patch, False))
     )
+    if config.deep:  # the widest layer of its encoder has a quarter of the pixels
+        overview += FEATURE_COPIES * PHOTO_STAGES[1][3] * PHOTO_STAGES[0][0] / 4
     drawn = MAP_COPIES * config.classes
     chunk = min(PATCHES_AT_ONCE, patch_index) * config.patch**2 * (full + inputs + config.overview_width)
     strip = STRIP_COPIES * bands * min(STRIP_ROWS, y) * x

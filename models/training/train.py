@@ -34,6 +34,9 @@ FREED_EVERY = 50  # steps: crops of several sizes leave gaps of 9 MB a step in k
 PIXELS = 60_000  # to fit classifiers to, of all scenes together
 CAPTURES = 16  # simulated for discriminants, of all scenes together or more
 ABSENT = -20.0  # logit of a class without a pixel
+KNOWN = ("overview_stem.first.", "overview_stem.stages.")  # parameters of large frames that ImageNet trained
+KNOWN_RATE = 0.3  # of the learning rate, for these
+NORM_BATCHES = 60  # over which the batch norms of the averaged weights are measured
 
 
 @dataclass(frozen=True)
@@ -103,11 +106,10 @@ class Trainer:
             self.model.load_state_dict(start, strict=False)
         self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
-        parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
-        groups: list[dict[str, object]] = [
-            {"params": [p for p in parameters if p.ndim > 1], "weight_decay": settings.weight_decay},
-            {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
-        ]
+        groups: list[dict[str, object]] = []  # matrices and kernels decay, gains and shifts do not
+        for name, one in sorted(self.model.named_parameters(), key=lambda named: named[1].ndim <= 1):
+            rate = KNOWN_RATE if name.startswith(KNOWN) else 1.0
+            groups.append({"params": [one], "rate": rate, "weight_decay": settings.weight_decay * (one.ndim > 1)})
         self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
         self.sampler = CropSampler(
             examples, config.patch, settings.crop, settings.noise, config.deep, augmentation, device
@@ -129,7 +131,7 @@ class Trainer:
         """
         course = self.course
         for group in self.optimiser.param_groups:
-            group["lr"] = self.settings.learning_rate * rate_at(done)
+            group["lr"] = self.settings.learning_rate * rate_at(done) * group["rate"]
         phase = next((one for one in PHASES if done < one.until), PHASES[-1])
         fewer = phase.larger if self.sampler.size(phase.larger) > self.sampler.size() else 1  # in large scenes
         batch = self.sampler.draw(max(1, self.settings.batch // fewer), self.rng, self.gain_shift, larger=phase.larger)
@@ -313,6 +315,9 @@ def train(
         if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
             trainer.keep(checkpoint, identity)
             kept = time.monotonic()
+    if config.deep:
+        drawn = (trainer.sampler.draw(settings.batch, trainer.rng, gain_shift).image for _ in range(NORM_BATCHES))
+        torch.optim.swa_utils.update_bn(drawn, trainer.averaged.overview_stem)
     return trainer.averaged.to(PROCESSOR), trainer.summary()
 
 
@@ -320,8 +325,9 @@ def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:
     """Return a network with the mean weights of both: good where either was (Wortsman et al. 2022, WiSE-FT)."""
     mean = copy.deepcopy(trained)
     with torch.no_grad():
-        for own, before in zip(mean.parameters(), start.parameters(), strict=True):
-            own.lerp_(before.to(own.device), 0.5)
+        for own, before in zip(mean.state_dict().values(), start.state_dict().values(), strict=True):
+            if own.is_floating_point():
+                own.lerp_(before.to(own.device), 0.5)
     return mean
 
 

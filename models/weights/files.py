@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ else:
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/5"
+ENCODER = "spectralzoom-encoder/1"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine")
 COLOURS = "class_colours"
@@ -189,7 +191,7 @@ class Weights:
 
 def save_weights(weights: Weights, path: Path) -> None:
     """Write a checksummed file by a temporary name and a rename. Raises WeightsError for an error of the disk."""
-    tensors = dict(weights.segmenter.state_dict())
+    tensors = {name: one for name, one in weights.segmenter.state_dict().items() if one.is_floating_point()}
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
     tensors[COLOURS] = torch.from_numpy(weights.class_colours.copy())
@@ -292,6 +294,13 @@ def load_weights(path: Path) -> Weights:
         if not (normalisation.spread > 0).all():
             raise ValueError("normalisation.spread has a value that is not above 0")
     return Weights(network.eval(), described.basis, normalisation, described.class_names, colours, described.record)
+
+
+def load_encoder() -> dict[str, Tensor]:
+    """Read the encoder for large frames, trained on ImageNet, as tensors of the segmenter; a copy is shipped."""
+    path = Path(str(resources.files("models") / "shipped" / "imagenet.safetensors"))
+    tensors = read_tensors(path, read_about(path, ENCODER))
+    return {f"overview_stem.{name}": tensor for name, tensor in tensors.items()}
 
 
 def describe_weights(path: Path) -> Description:

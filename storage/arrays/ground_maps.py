@@ -78,17 +78,13 @@ def open_image(path: Path, name: str) -> StoredImage:
 
 @dataclass(frozen=True)
 class GroundMap:
-    """A stored map, in memory."""
+    """A stored map in memory, without its ages, confidence and changes."""
 
     classes: NDArray[np.uint8]  # (y, x) index into the legend's names, 255 = none or not seen
-    confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where not seen
     picture: NDArray[np.uint8]  # (y, x, 3) red green blue, 0 where not seen
     legend: ClassNames
     geobox: GeoBox
     areas: dict[str, dict[str, float]]  # of each class: m2, ha, fraction of the classified area
-    age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where not seen
-    changed: NDArray[np.float32] | None  # (y, x) fraction of its patch that changed, NaN where not seen; None at first
-    old_class: NDArray[np.uint8] | None  # (y, x) previous class where it changed, else 255; None at first
 
 
 class GroundMapWriter:
@@ -145,14 +141,4 @@ def load_ground_map(path: Path) -> GroundMap:
     geobox = load_geobox(path)
     if geobox is None:
         raise IncompleteStoreError(f"{path} has no grid mapping; it is no map of the ground")
-    return GroundMap(
-        classes=read_array(group, "classes"),
-        confidence=read_array(group, "confidence"),
-        picture=read_array(group, "picture"),
-        legend=legend_of(group),
-        geobox=geobox,
-        areas=areas,
-        age_days=read_array(group, "age"),
-        changed=read_array(group, "changed") if "changed" in group else None,
-        old_class=read_array(group, OLD_CLASS) if OLD_CLASS in group else None,
-    )
+    return GroundMap(read_array(group, "classes"), read_array(group, PICTURE), legend_of(group), geobox, areas)

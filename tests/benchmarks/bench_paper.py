@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from measure import Row, aligned, data_folder, not_run
 from numpy.typing import NDArray
-from paper_sets import CAMERA, INPUTS, PATCH, DataSet, Image, Say, coarse_image, farm_all, farm_four, folder
+from paper_sets import CAMERA, INPUTS, DataSet, Image, Say, coarse_image, farm_all, farm_four, folder
 
+from flows.training.train_scenes import DEEP_PATCH_PX
 from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
 from models.network.machine import keep_freed_memory, one_thread
 from models.network.sizes import multiply_adds
@@ -223,7 +224,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--weights", type=Path, metavar="FILE", help="weights of the folder, or of CWFID; else trained")
     made.add_argument("--hold-out", default="", metavar="NAMES", help="frames of the folder to judge; every third")
     made.add_argument("--steps", type=int, default=STEPS, help=f"of each training ({STEPS})")
-    made.add_argument("--patch", type=int, default=PATCH, help=f"patch of a folder's network [px] ({PATCH})")
+    made.add_argument("--patch", type=int, default=DEEP_PATCH_PX, help=f"of a folder's network [px] ({DEEP_PATCH_PX})")
     made.add_argument("--patches", type=lambda text: tuple(map(int, text.split(","))), default=COUNTS, metavar="K,K")
     return made
 

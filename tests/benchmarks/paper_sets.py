@@ -20,12 +20,12 @@ from torch import Tensor
 
 from flows.tasks.scene import scene_of_file
 from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
-from models.network.sizes import SegmenterConfig
+from flows.training.train_scenes import Common, TrainRequest, network_config
 from models.network.spectral import LineSpec, SpectralBasis
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
 from models.training.examples import measured_normalisation, normalised, observe
 from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, train
-from models.weights.files import Weights, load_weights, save_weights
+from models.weights.files import ENCODER, Weights, load_encoder, load_weights, save_weights
 from pipeline.errors import SceneError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, block_means
@@ -70,7 +70,7 @@ class PaperCaptures(CaptureAugmentation):
 
 def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: int, steps: int, say: Say) -> Weights:
     """Train a network, or load it from the temporary folder if it is there."""
-    key = hashlib.sha256(repr((name, sorted(scenes), patch, steps)).encode()).hexdigest()[:12]
+    key = hashlib.sha256(repr((name, sorted(scenes), patch, steps, ENCODER)).encode()).hexdigest()[:12]
     path = Path(tempfile.gettempdir()) / "spectralzoom-paper" / f"{key}.safetensors"
     try:
         return load_weights(path)
@@ -83,8 +83,11 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     seen = [observe(scene, CAMERA, SceneGrid(*scene.shape, patch), basis, rng) for scene in made]
     normalisation = measured_normalisation(seen)
     examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
-    config = SegmenterConfig(len(first.class_names), basis.columns, patch)
+    common = Common(basis, first.class_names, first.class_colours, patch, first.wavelength_nm)
+    config = network_config(TrainRequest(name, path, patch=patch), common)
     start = linear_discriminants(LabelledPixels.drawn(examples, rng), config.classes)
+    if config.deep:
+        start |= load_encoder()
 
     def progress(now: Progress) -> None:
         if now.step % 50 == 0:

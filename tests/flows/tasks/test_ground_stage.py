@@ -23,7 +23,8 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.arrays import class_maps
 from storage.arrays.georeference import AngularGrid
-from storage.arrays.ground_maps import GroundMap, load_ground_map
+from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.layout import open_group, read_array
 from tests.exported_run import POSE
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
@@ -103,6 +104,11 @@ def draw(run: Run, stores: Stores) -> StageRef:
     return ground.produce(run.archive, ground.wants(run, *stores))[0]
 
 
+def image(ref: StageRef, name: str) -> np.ndarray:
+    """Read an image of a map on the ground."""
+    return read_array(open_group(ref.path / STORE), name)
+
+
 def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: Stores, tmp_path: Path) -> None:
     """Single unknown pixels get no confidence or age from their neighbours."""
     classes = np.zeros(SHAPE, np.uint8)
@@ -111,15 +117,17 @@ def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: S
     legend = (("crop", "unknown"), np.array([[0, 255, 0], [255, 0, 255]], np.uint8))
     write_class_map(tmp_path / "out_of_range" / "class_map.zarr", class_maps.ClassMap(classes, confidence, *legend))
     believe(tmp_path / "out_of_range", np.where(classes == 1, np.nan, 0).astype(np.float32))
-    found = load_ground_map(draw(run, (StageRef("segment", "s", tmp_path / "out_of_range"), stores[1])).path / STORE)
-    assert (found.classes == 1).sum() > 50
-    np.testing.assert_array_equal(np.isnan(found.confidence), found.classes != 0)
-    np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
+    ref = draw(run, (StageRef("segment", "s", tmp_path / "out_of_range"), stores[1]))
+    found = image(ref, "classes")
+    assert (found == 1).sum() > 50
+    for name in ("confidence", "age"):
+        np.testing.assert_array_equal(np.isnan(image(ref, name)), found != 0)
 
 
 def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores) -> None:
     """Each scene pixel's class is at the end of its ray; the picture brightens towards the rig, as the mosaic does."""
-    found = load_ground_map(draw(run, stores).path / STORE)
+    ref = draw(run, stores)
+    found = load_ground_map(ref.path / STORE)
     grid = run.ground_grid
     y, x = pixel_places(SHAPE)
     points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
@@ -127,7 +135,7 @@ def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores)
     column, row = (np.floor(part).astype(int) for part in ~found.geobox.affine * places.T)
     wanted = np.where(points[:, 1] < 0, 0, np.where(points[:, 0] < y[30], UNLABELLED, 1))
     assert found.classes[row, column].tolist() == wanted.tolist()
-    sure = found.confidence[row, column]
+    sure = image(ref, "confidence")[row, column]
     np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
     assert sure[wanted == 1] == pytest.approx(0.75)
     tones = colours_of(stores[1])
@@ -141,9 +149,9 @@ def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores)
     assert np.corrcoef(along, found.picture[row, column, 0])[0, 1] > 0.95
 
 
-def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
+def field_pixels(run: Run, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the mask of map pixels within the field, and row and column of the field's pixel that each shows."""
-    places = run.ground_grid.scene_pixels(*(slice(0, size) for size in found.classes.shape))
+    places = run.ground_grid.scene_pixels(*(slice(0, size) for size in shape))
     seen = np.isfinite(places[..., 0])
     return seen, np.floor(places[seen] + 0.5).astype(int).T
 
@@ -156,23 +164,24 @@ def test_age_and_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, t
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
     write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
     believe(tmp_path / "later", age, old.astype(np.uint8))
-    found = load_ground_map(draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1])).path / STORE)
-    seen, (row, column) = field_pixels(run, found)
-    np.testing.assert_array_equal(found.age_days[seen], age[row, column])
-    np.testing.assert_array_equal(found.old_class[seen], old[row, column])
-    np.testing.assert_array_equal(found.changed[seen], patch_fractions(old)[row // 8, column // 8])
-    for image in (found.age_days, found.changed):
-        assert np.isnan(image[~seen]).all()
-    assert (found.old_class[~seen] == UNLABELLED).all()
+    ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
+    age_days, changed, old_class = (image(ref, name) for name in ("age", "changed", "changed_from"))
+    seen, (row, column) = field_pixels(run, age_days.shape)
+    np.testing.assert_array_equal(age_days[seen], age[row, column])
+    np.testing.assert_array_equal(old_class[seen], old[row, column])
+    np.testing.assert_array_equal(changed[seen], patch_fractions(old)[row // 8, column // 8])
+    assert np.isnan(age_days[~seen]).all()
+    assert np.isnan(changed[~seen]).all()
+    assert (old_class[~seen] == UNLABELLED).all()
 
 
 def test_a_first_visit_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
     """Every pixel of the field has age 0; the store has no variable for changes."""
     ref = draw(run, stores)
-    found = load_ground_map(ref.path / STORE)
-    seen, _ = field_pixels(run, found)
-    assert (found.age_days[seen] == 0).all()
-    assert np.isnan(found.age_days[~seen]).all()
+    age_days = image(ref, "age")
+    seen, _ = field_pixels(run, age_days.shape)
+    assert (age_days[seen] == 0).all()
+    assert np.isnan(age_days[~seen]).all()
     with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
         assert not {"changed", "changed_from"} & set(content)
         assert content["age"].attrs["units"] == "days"

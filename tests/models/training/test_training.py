@@ -147,6 +147,34 @@ def test_deep_networks_read_patches_in_few_steps(deep: bool, least: float, most:
     assert least <= np.mean(read) <= most
 
 
+DEEP = SegmenterConfig(classes=3, columns=2, patch=32, width=4, overview_width=4, dim=16, layers=1, heads=2, deep=True)
+
+
+def test_an_encoder_that_is_known_learns_slowly() -> None:
+    """Convolutions and norms of ImageNet learn by 0.3 of the rate; only matrices and kernels decay."""
+    trainer = training.Trainer(DEEP, [block_example(64, 32)], SHIFT, SETTINGS)
+    trainer.step(0.05)  # the highest rate
+    groups = {id(group["params"][0]): (group["lr"], group["weight_decay"]) for group in trainer.optimiser.param_groups}
+    stem = trainer.model.overview_stem
+    assert groups[id(stem.first.norm.weight)] == (pytest.approx(0.3 * 3e-3), 0)
+    assert groups[id(stem.stages[1][0].project.conv.weight)] == (pytest.approx(0.3 * 3e-3), 0.02)
+    assert groups[id(stem.colours.weight)] == (pytest.approx(3e-3), 0.02)
+
+
+def test_the_norms_of_averaged_weights_are_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last crops set their means: what the averaged weights give for many crops has mean 0 and variance 1."""
+    monkeypatch.setattr(training, "NORM_BATCHES", 200)
+    scene = block_example(64, 32)
+    model, _ = train(DEEP, [scene], SHIFT, replace(SETTINGS, steps=3, crop=32))
+    stem, drawn = model.overview_stem, CropSampler([scene], 32, 32, zoomed=True)
+    image = drawn.draw(400, np.random.default_rng(1), SHIFT).image
+    with torch.no_grad():
+        found = stem.first.conv(torch.nn.functional.pad(stem.colours(image), (0, 1, 0, 1)))
+    norm = stem.first.norm
+    torch.testing.assert_close(norm.running_var, found.var(dim=(0, 2, 3)), rtol=0.1, atol=1e-6)
+    assert ((norm.running_mean - found.mean(dim=(0, 2, 3))).abs() < 0.1 * norm.running_var.sqrt()).all()
+
+
 def test_unlabelled_pixels_do_not_change_the_loss():
     """Logits of unlabelled pixels have no gradient, and other logits there give the same loss."""
     labels = torch.randint(0, 3, (1, 8, 8), generator=torch.Generator().manual_seed(0))
