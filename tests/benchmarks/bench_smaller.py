@@ -5,8 +5,8 @@ A step takes 1 s of one core; all patches score 82.6 with 400 steps, 89.9 with 1
 `python tests/benchmarks/bench_smaller.py 20` trains for 20 steps instead of `STEPS`.
 
 `python tests/benchmarks/bench_smaller.py cut 2300` instead cuts smaller networks out of the shipped weights and trains
-them further, with the token width of ours; ours is as shipped. Test fields are not in the training data. A network takes
-15 to 40 minutes of a core.
+them further, with the token width of ours; ours is as shipped. Test fields are not in the training data. A network
+takes 15 to 40 minutes of a core.
 """
 
 from __future__ import annotations
