@@ -26,11 +26,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
-from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera, flat_positions
+from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
 from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
 from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Axis, Floats, Sweep
+from pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
 from pipeline.ground.georeference import geobox_of_record
 from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
@@ -258,7 +258,7 @@ def _without_mirror(
         scan_px = scan_px / line_m
     scan_px = scan_px - (scan_px.min() + scan_px.max()) / 2
     camera = flat_camera(camera, float(np.abs(scan_px).max()))
-    return camera, [replace(pointing, position=flat_positions(scan_px, camera))]
+    return camera, [replace(pointing, position=scan_positions(0.0, scan_px, camera))]
 
 
 def _timed(
