@@ -46,7 +46,6 @@ from storage.archive.manifests import (
     try_manifest,
     write_manifest,
 )
-from storage.archive.records import Run
 from storage.archive.run_folders import RunDraft, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
@@ -308,10 +307,6 @@ class Archive:
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
         """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
-
-    def kept_bytes(self, run: Run) -> int:
-        """Return the bytes kept for a run: its folder, the stores that it names, and their inputs, with manifests."""
-        return sum(self.sizes([run.uri, *run.names]).values())
 
     def take_moved(self) -> int:
         """Return the bytes transferred to and from a bucket since the last call."""
