@@ -108,8 +108,7 @@ class Archive:
 
         Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing or cut short.
         """
-        uri = in_text(address)
-        if uri is not None:
+        if (uri := in_text(address)) is not None:
             check_files(self.root / uri, hashes=False)
             if is_cleared(read_manifest(self.root / uri)):
                 raise IncompleteStoreError(
@@ -185,8 +184,7 @@ class Archive:
     ) -> tuple[StageRef, bool]:
         """Return the store with this key, and whether ``build`` wrote it now or it existed."""
         key = stage_key(stage, version, params, inputs)
-        found = self.find(stage, key)
-        if found is not None:
+        if (found := self.find(stage, key)) is not None:
             return found, False
         with self.publish(stage, key, version=version, params=params, inputs=inputs) as staged:
             if not staged.done:

@@ -364,8 +364,7 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
     Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
-    named = _named_run(address)
-    if named is not None:
+    if (named := _named_run(address)) is not None:
         return _run_with_cubes(*named)[2]
     path = Path(_fetched(address))
     if not path.exists():
@@ -435,8 +434,7 @@ def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[
     for folder in reversed(archive.runs()) if name is None else [archive.run_folder(name)]:
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
-        cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
-        if cubes:
+        if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
     which = "no run" if name is None else f"the run {name}"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")
