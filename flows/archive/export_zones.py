@@ -63,8 +63,7 @@ class ClassRaster:
 def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
     """Refuse a prescription for other classes, or without a place (SettingsError)."""
     names: Sequence[str] = open_image(run.path(run.map_product), "classes").about["class_names"]
-    unknown = sorted(set(choice.doses) - set(names))
-    if unknown:
+    if unknown := sorted(set(choice.doses) - set(names)):
         raise SettingsError(f"--prescription: the run has no class {unknown[0]!r}; its classes are {', '.join(names)}")
     if run.geobox is None and choice.doses:
         raise SettingsError(
