@@ -21,6 +21,7 @@ from pipeline.errors import SceneError, WavelengthError
 from storage.readers.cube_sources import read_by_chunks
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
+from tests.storage.readers.test_raster_tags import write as write_bands
 
 RNG = np.random.default_rng(5)
 NM = np.array([450.0, 550.0, 660.0, 800.0, 900.0])
@@ -231,9 +232,7 @@ def test_rows_from_south_to_north_have_gdals_position(tmp_path: Path) -> None:
     """GDAL writes the southern row first, under the GeoTransform of the upright image."""
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     upright = rasterio.transform.from_origin(500_000, 5_000_030, 10, 10)
-    size = {"height": 3, "width": 4, "count": 1, "dtype": "float32"}
-    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", crs="EPSG:32632", transform=upright, **size) as file:
-        file.write(values, 1)
+    write_bands(tmp_path / "a.tif", values[None], crs="EPSG:32632", transform=upright).close()
     rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT="NC4")
     cube = open_cube(f"{tmp_path / 'a.nc'}:Band1")
     assert cube.geobox.affine.to_gdal() == (500_000, 10, 0, 5_000_000, 0, 10)
