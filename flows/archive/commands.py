@@ -223,7 +223,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     found = find_product(catalogue, product)
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
-        row = _run_row(catalogue, found, archive.kept_bytes(found))
+        row = _run_row(catalogue, found, sum(archive.sizes([found.uri, *found.names]).values()))
         row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]

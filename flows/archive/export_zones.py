@@ -21,7 +21,7 @@ from pipeline.geometry.grid import UNLABELLED, cuts
 from pipeline.ground.field_places import M2_PER_HECTARE
 from pipeline.ground.georeference import is_in_metres, pixel_side_m
 from pipeline.lazy import pyproj, rasterio_features, rasterio_warp, shapely
-from storage.arrays.class_maps import ClassNames
+from storage.arrays.class_maps import ClassNames, legend_of
 from storage.arrays.ground_maps import open_image
 from storage.export.map_files import (
     DEGREE_DIGITS,
@@ -56,17 +56,14 @@ class ClassRaster:
     def of(cls, run: ExportedRun) -> ClassRaster:
         """Read the classes of the map's store."""
         stored = open_image(run.path(run.map_product), "classes")
-        colours = np.array(stored.about["class_colours"], np.uint8).reshape(-1, 3)
         classes = np.concatenate([rows for _, rows in stored.rows()])
-        legend = ClassNames(tuple(stored.about["class_names"]), colours)
-        return cls(classes, legend, Affine(*stored.about["spatial:transform"]), run.geobox)
+        return cls(classes, legend_of(stored.group), Affine(*stored.about["spatial:transform"]), run.geobox)
 
 
 def check_zones(run: ExportedRun, choice: ProductChoice) -> None:
     """Refuse a prescription for other classes, or without a place (SettingsError)."""
     names: Sequence[str] = open_image(run.path(run.map_product), "classes").about["class_names"]
-    unknown = sorted(set(choice.doses) - set(names))
-    if unknown:
+    if unknown := sorted(set(choice.doses) - set(names)):
         raise SettingsError(f"--prescription: the run has no class {unknown[0]!r}; its classes are {', '.join(names)}")
     if run.geobox is None and choice.doses:
         raise SettingsError(

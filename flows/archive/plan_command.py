@@ -108,9 +108,8 @@ class Planner(OpenSurvey):
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why)
         else:
-            folder = store_at(self.run.archive.root, product, key).folder
             row = StageForecast(stage, "to run" if found is None else "cached", key)
-            ref = _Awaited(product, key, folder, made_by=stage) if found is None else found
+            ref = found or _Awaited(product, key, store_at(self.run.archive.root, product, key).folder, made_by=stage)
         if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref

@@ -95,8 +95,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     """Open scene and archive; return the run, its sweeps, and assumptions on the scene. Simulates nothing."""
     if settings.source != "sim":
         raise SettingsError(f"source = {settings.source!r} cannot be simulated; leave it out")
-    refused = farm_refusal(settings)
-    if refused is not None:
+    if (refused := farm_refusal(settings)) is not None:
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
     if scene.filled_px:  # a survey skips them; a simulation would have to invent radiance

@@ -153,8 +153,7 @@ def open_frames(
         if count < 1:
             raise SettingsError(f"--scenes must be at least 1, got {count}")
         data = farm_test_data(count, camera, dataset)
-    unknown = [name for name in frames if name not in data.train]
-    if unknown:
+    if unknown := [name for name in frames if name not in data.train]:
         raise SettingsError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)
     return replace(data, train=names, validation=(), held_out=())

@@ -40,8 +40,7 @@ def publish(survey: OpenSurvey) -> RunRef:
 
 
 def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
-    stopped = _stopped_run(survey)
-    if stopped is not None:
+    if (stopped := _stopped_run(survey)) is not None:
         survey.observer.note(f"published before: {stopped.folder}; its accuracy is added to it")
         return stopped
     judged = survey.run.scene.labelled and survey.run.settings.accuracy
@@ -125,8 +124,7 @@ def _stopped_run(survey: OpenSurvey) -> RunRef | None:
     for folder in reversed(survey.run.archive.runs()):
         if not _is_stopped(survey, read_run(folder)):
             continue
-        draft = survey.run.archive.extend_run(folder.name, wait=False)
-        if draft is not None:
+        if (draft := survey.run.archive.extend_run(folder.name, wait=False)) is not None:
             draft.abandon()  # it was free
             if _is_stopped(survey, read_run(folder)):  # and not judged since
                 return RunRef(f"runs/{folder.name}", folder, pending=True)

@@ -297,8 +297,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if saturated:
         found["signal"] = {"saturated": saturated}
     lines = read_table(products.mosaic.path / "lines.json")
-    troubled = {name: facts for name, facts in lines.items() if any(facts.values())}
-    if troubled:
+    if troubled := {name: facts for name, facts in lines.items() if any(facts.values())}:
         found["lines"] = troubled
     return found
 

@@ -40,23 +40,20 @@ def _flags(names: Iterable[str]) -> Any:
 
 
 _RENDERING = ("effects", "seed", "day", "hour", "interest", "sky", "light_fraction", "bands", "wavelengths")
-_Every: Any = _flags(name for name in _DECLARED if name not in TABLES or name in IN_TABLES)
-_OfRendering: Any = _flags(_RENDERING)
-_OfSimulation: Any = _flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))
 
 
 @Parameter(name="*")
-class SurveyFlags(_Every):  # type: ignore[misc]
+class SurveyFlags(_flags(name for name in _DECLARED if name not in TABLES or name in IN_TABLES)):  # type: ignore[misc]
     """Flags of all settings of a survey."""
 
 
 @Parameter(name="*")
-class RenderingFlags(_OfRendering):  # type: ignore[misc]
+class RenderingFlags(_flags(_RENDERING)):  # type: ignore[misc]
     """Flags of the simulated rig and its light."""
 
 
 @Parameter(name="*")
-class SimulationFlags(_OfSimulation):  # type: ignore[misc]
+class SimulationFlags(_flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))):  # type: ignore[misc]
     """Flags of a simulated scan."""
 
 

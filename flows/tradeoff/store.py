@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -185,8 +185,7 @@ def scan_raster(path: str, weights_path: Path | None) -> ScanLines:
         time_s=np.arange(len(values), dtype=np.float64),
         data=values.astype(np.uint16),
     )
-    statistics = SignalStatistics(values.shape[2], values[..., 0].size)
-    statistics.add(values, np.ones(values.shape[:2], np.bool_))
+    statistics = _statistics([(0, values, np.ones(values.shape[:2], np.bool_))], values.shape)
     noise = find_components(statistics, false_alarm=USUAL.false_alarm, least=USUAL.least).noise
     known = np.where(np.isfinite(noise) & (noise > 0), noise, 1.0)
     scene = scene_of_file(file, LineCamera())
@@ -252,7 +251,7 @@ def keep_raw(scan: ScanLines) -> KeptLines:
 
 def condense(scan: ScanLines, step: float) -> KeptLines:
     """Condense the lines as a survey does."""
-    statistics = _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    statistics = _statistics(calibrated_blocks(scan.lines, scan.camera), scan.values.shape)
     components = find_components(statistics, false_alarm=USUAL.false_alarm, least=USUAL.least)
     law = ResidualLaw.learned(statistics.spectra, components)
     condenser = Condenser(components, law, scan.camera, USUAL.rare_spectra, step)
@@ -264,8 +263,8 @@ def condense(scan: ScanLines, step: float) -> KeptLines:
 Block = tuple[int, Values, NDArray[np.bool_]]  # first line, values (line, sample, band), valid (line, sample)
 
 
-def _statistics(blocks: Iterator[Block], scan: ScanLines) -> SignalStatistics:
-    lines, samples, bands = scan.values.shape
+def _statistics(blocks: Iterable[Block], shape: tuple[int, ...]) -> SignalStatistics:
+    lines, samples, bands = shape
     statistics = SignalStatistics(bands, lines * samples)
     for _, values, valid in blocks:
         statistics.add(values, valid)
@@ -340,10 +339,10 @@ def _scored(scan: ScanLines, *, raw: bool) -> tuple[Components, Values]:
 
     The unit of principal scores is the mean noise of all bands.
     """
-    statistics = _statistics(calibrated_blocks(scan.lines, scan.camera), scan)
+    statistics = _statistics(calibrated_blocks(scan.lines, scan.camera), scan.values.shape)
     components = find_components(statistics, false_alarm=USUAL.false_alarm, least=USUAL.least)
     if raw:
-        statistics = _statistics(_raw_blocks(scan), scan)
+        statistics = _statistics(_raw_blocks(scan), scan.values.shape)
         assert statistics.origin is not None
         mean = statistics.total / statistics.count
         axes = np.linalg.eigh(statistics.single / statistics.count - np.outer(mean, mean))[1][:, ::-1]

@@ -192,8 +192,7 @@ class RecordedSource:
 
         Raises NotRecordedError: a planned line was never captured.
         """
-        own = self._own(sweep)
-        if own is not None:
+        if (own := self._own(sweep)) is not None:
             return PickedLines(np.full(sweep.lines, own), np.arange(sweep.lines), np.zeros(sweep.lines, np.bool_))
         found = [self._nearest(sweep, group) for group in self._groups]
         whole = [one for one in found if (one[0] >= 0).all()]

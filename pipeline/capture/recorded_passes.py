@@ -90,8 +90,7 @@ class RecordedPasses:
         """
         found = []
         for sweep in planned:
-            cut = self.source.cut_to_recorded(sweep)
-            if cut is not None:
+            if (cut := self.source.cut_to_recorded(sweep)) is not None:
                 self.source.pick(cut)
                 found.append(replace(cut, exposure_ms=self._exposure_ms(cut)))
         return found

@@ -216,12 +216,3 @@ def flat_camera(camera: LineCamera, extent_px: float) -> LineCamera:
     tangent = np.sqrt(2 * FLAT_PX / half)  # a line at the tangent e is sqrt(1 + e^2) times as long
     ifov_rad = min(camera.ifov_rad, float(tangent) / max(extent_px, half))
     return replace(camera, focal_length_mm=camera.pitch_um * 1e-3 / ifov_rad)
-
-
-def flat_positions(scan_px: Floats, camera: LineCamera) -> Floats:
-    """Return mirror positions (line, 2) for the lines of a scan without a mirror, at ``scan_px`` (line,).
-
-    ``camera`` is that of :func:`flat_camera`.
-    """
-    tangents = np.stack([np.zeros_like(scan_px), scan_px], axis=-1) * camera.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))

@@ -108,7 +108,7 @@ def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 
     Raises PoseError: a position is beyond the mirror's disk.
     """
-    return _aim(sweep, camera, sweep.held_px())
+    return scan_positions(sweep.swath_px, sweep.held_px(), camera)
 
 
 def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
@@ -116,11 +116,15 @@ def line_positions(sweep: Sweep, camera: LineCamera) -> Floats:
 
     Raises PoseError: a position is beyond the mirror's disk.
     """
-    return _aim(sweep, camera, sweep.line_px())
+    return scan_positions(sweep.swath_px, sweep.line_px(), camera)
 
 
-def _aim(sweep: Sweep, camera: LineCamera, scan_px: Floats) -> Floats:
-    tangents = np.stack([np.full_like(scan_px, sweep.swath_px), scan_px], axis=-1) * camera.ifov_rad
+def scan_positions(swath_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
+    """Return the mirror positions (..., 2) of lines centred on ``swath_px``, at ``scan_px`` on the scan axis.
+
+    Raises PoseError: a position is beyond the mirror's disk.
+    """
+    tangents = np.stack([np.full_like(scan_px, swath_px), scan_px], axis=-1) * camera.ifov_rad
     return direction_to_position(scene_to_direction(tangents))
 
 

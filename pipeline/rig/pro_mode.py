@@ -171,13 +171,14 @@ def cell_int(cell: bytes) -> int:
 
 def get_value(register: int) -> Frame:
     """Return a request for a register; the reply is its cell."""
-    return Frame(Command.GET_VALUE, count_bytes(register))
+    return Frame(Command.GET_VALUE, register.to_bytes(2, "big"))
 
 
 def set_values(values: Mapping[int, Value]) -> Frame:
     """Return a request that sets 1 to 8 registers at once: integers as such, floats as float32."""
     cells = (int_cell(value) if isinstance(value, int) else float_cell(value) for value in values.values())
-    return Frame(Command.SET_VALUES, count_bytes(len(values)) + b"".join([*map(count_bytes, values), *cells]))
+    head = (number.to_bytes(2, "big") for number in (len(values), *values))
+    return Frame(Command.SET_VALUES, b"".join([*head, *cells]))
 
 
 def get_vector(register: int, start: int, count: int) -> Frame:
@@ -193,11 +194,6 @@ def set_vector(register: int, start: int, cells: bytes) -> Frame:
 def refuse(command: int, code: int) -> Frame:
     """Return the device's reply that refuses a command."""
     return Frame(command | ERROR_FLAG, int_cell(code))
-
-
-def count_bytes(number: int) -> bytes:
-    """Return the two bytes of a count or of a register's id."""
-    return number.to_bytes(2, "big")
 
 
 def read_registers(payload: bytes) -> dict[int, bytes]:

@@ -205,8 +205,7 @@ class RigSource:
     def _whole_references(self, runner: CaptureRunner, folder: str) -> References:
         """Return the dark and white frames of all samples."""
         frames = runner.devices.camera.references(folder, self._kept)
-        missing = [kind for kind in ("dark", "white") if kind not in frames]
-        if missing:
+        if missing := [kind for kind in ("dark", "white") if kind not in frames]:
             raise RigError(
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"

@@ -46,7 +46,6 @@ from storage.archive.manifests import (
     try_manifest,
     write_manifest,
 )
-from storage.archive.records import Run
 from storage.archive.run_folders import RunDraft, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
@@ -109,8 +108,7 @@ class Archive:
 
         Raises IncompleteStoreError: the store is missing or was cleared, or a file is missing or cut short.
         """
-        uri = in_text(address)
-        if uri is not None:
+        if (uri := in_text(address)) is not None:
             check_files(self.root / uri, hashes=False)
             if is_cleared(read_manifest(self.root / uri)):
                 raise IncompleteStoreError(
@@ -186,8 +184,7 @@ class Archive:
     ) -> tuple[StageRef, bool]:
         """Return the store with this key, and whether ``build`` wrote it now or it existed."""
         key = stage_key(stage, version, params, inputs)
-        found = self.find(stage, key)
-        if found is not None:
+        if (found := self.find(stage, key)) is not None:
             return found, False
         with self.publish(stage, key, version=version, params=params, inputs=inputs) as staged:
             if not staged.done:
@@ -308,10 +305,6 @@ class Archive:
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
         """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
-
-    def kept_bytes(self, run: Run) -> int:
-        """Return the bytes kept for a run: its folder, the stores that it names, and their inputs, with manifests."""
-        return sum(self.sizes([run.uri, *run.names]).values())
 
     def take_moved(self) -> int:
         """Return the bytes transferred to and from a bucket since the last call."""

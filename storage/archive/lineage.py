@@ -148,8 +148,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     for part in parts:
         check_name(part)
     name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text
-    runs = [run for run in catalogue.runs if name in (run.folder.name, LATEST)]
-    if runs:
+    if runs := [run for run in catalogue.runs if name in (run.folder.name, LATEST)]:
         return runs[-1]
     if name != text:
         there = [run.uri for run in reversed(catalogue.runs)]

@@ -165,8 +165,7 @@ def manifest_text(content: Mapping[str, Any]) -> str:
     def text(values: Mapping[str, Any]) -> str:
         return json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
-    checksummed = {**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()}
-    return text(checksummed)
+    return text({**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()})
 
 
 @cache

@@ -124,8 +124,7 @@ _teams: dict[WorkerPool, Cluster] = {}  # the workers of open pools, once they a
 
 def _dismiss(pool: WorkerPool) -> None:
     """Abandon the workers of a pool; the next use starts others."""
-    team = _teams.pop(pool, None)
-    if team is not None:
+    if (team := _teams.pop(pool, None)) is not None:
         team.close()
 
 

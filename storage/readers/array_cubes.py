@@ -229,7 +229,8 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int
     tables = {name: f"{name} {array.shape}" for name, array in arrays.items() if array.ndim > 1}
     listing = f"it has {', '.join(tables.values()) or 'none'}"
     if variable is not None:
-        fitting = [name for name in arrays if name == variable] or [one for one in arrays if _base(one) == variable]
+        inner = [name for name in arrays if name.rpartition("/")[2] == variable]
+        fitting = [variable] if variable in arrays else inner
         if len(fitting) != 1:
             raise SceneError(f"{path} has no array {variable}; {listing}; name one: {path.name}:ARRAY")
         return fitting[0], ()
@@ -326,12 +327,8 @@ def _is_line(arrays: Arrays, name: str, count: int) -> bool:
     return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
 
 
-def _base(name: str) -> str:
-    return name.rpartition("/")[2]
-
-
 def _word(name: str) -> str:
-    return _base(name).lower()
+    return name.rpartition("/")[2].lower()
 
 
 def _valid_range(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[float, float]:

@@ -26,11 +26,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
-from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera, flat_positions
+from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
 from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
 from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Axis, Floats, Sweep
+from pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
 from pipeline.ground.georeference import geobox_of_record
 from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
@@ -258,7 +258,7 @@ def _without_mirror(
         scan_px = scan_px / line_m
     scan_px = scan_px - (scan_px.min() + scan_px.max()) / 2
     camera = flat_camera(camera, float(np.abs(scan_px).max()))
-    return camera, [replace(pointing, position=flat_positions(scan_px, camera))]
+    return camera, [replace(pointing, position=scan_positions(0.0, scan_px, camera))]
 
 
 def _timed(
@@ -364,8 +364,7 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
     Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
-    named = _named_run(address)
-    if named is not None:
+    if (named := _named_run(address)) is not None:
         return _run_with_cubes(*named)[2]
     path = Path(_fetched(address))
     if not path.exists():
@@ -435,8 +434,7 @@ def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[
     for folder in reversed(archive.runs()) if name is None else [archive.run_folder(name)]:
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
-        cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
-        if cubes:
+        if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
     which = "no run" if name is None else f"the run {name}"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")

@@ -180,8 +180,7 @@ def _fit(
             " band)"
         )
     known = dict(zip(belongs, values.tolist(), strict=True))
-    missing = [band for band in chosen if band not in known]
-    if missing:
+    if missing := [band for band in chosen if band not in known]:
         raise WavelengthError(f"{where}: nothing for band {missing[0]} (from 0); give --wavelengths with --bands")
     return np.array([known[band] for band in chosen], np.float64)
 
@@ -189,8 +188,7 @@ def _fit(
 def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int, image: Path) -> Bands:
     """Return the rows of nm and FWHM, without the dropped ones (counted from 1)."""
     table = _table(path)
-    bad = [row for row in dropped if not 1 <= row <= len(table)]
-    if bad:
+    if bad := [row for row in dropped if not 1 <= row <= len(table)]:
         raise WavelengthError(f"dropped_bands has {bad[0]}, but {path} has rows 1..{len(table)}; correct the list")
     kept = np.delete(table, [row - 1 for row in set(dropped)], axis=0)
     if len(kept) != file_bands:

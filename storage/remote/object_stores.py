@@ -283,8 +283,7 @@ class Objects:
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove objects; missing ones are ignored."""
-        waiting = list(names)
-        if waiting:
+        if waiting := list(names):
             with answers_of(self.place), suppress(FileNotFoundError):
                 self.store.delete(waiting)
 

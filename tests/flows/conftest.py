@@ -219,13 +219,6 @@ def two_budgets(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) ->
 
 
 @pytest.fixture(scope="session")
-def one_survey(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey) -> tuple[Path, Any]:
-    """Return an archive with one survey of the small picture and its run; do not change it."""
-    out = tmp_path_factory.mktemp("one_survey") / "archive"
-    return out, surveyed_png(out)
-
-
-@pytest.fixture(scope="session")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of three small frames for all evaluations."""
     return write_field(tmp_path_factory.mktemp("evaluate") / "field")

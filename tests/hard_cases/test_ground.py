@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,16 +11,11 @@ from pyproj import Proj
 from pipeline.errors import PoseError
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import ground_grid
-from pipeline.ground.view import GroundView, RigPose
 from tests.pipeline.ground.test_ground_grid import whole
+from tests.pipeline.ground.test_view import IFOV
+from tests.pipeline.ground.test_view import view as view_of
 
-IFOV = 7.4e-3 / 70
-
-
-def view(**changes: Any) -> GroundView:
-    """Return a rig 12 m above the ground that looks down at 40 deg, with ``changes``."""
-    given = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 0.0, "tilt_deg": 40.0, "height_m": 12.0}
-    return GroundView(RigPose(**(given | changes)), IFOV)
+view = partial(view_of, heading_deg=0.0)
 
 
 def test_nadir_view_keeps_the_heading_of_the_rig():

@@ -105,7 +105,7 @@ def _texts(here: Path) -> None:
     square = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 9], [0, 9], [0, 0]]]}
     owned = {"type": "Feature", "properties": {"owner": "Ada"}, "geometry": square}
     (here / "owners.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [owned]}))
-    (here / "bom.toml").write_bytes(b'\xef\xbb\xbfsource = "sim"\nscene = "field.png"\nbudget = 0.8\n')
+    (here / "bom.toml").write_bytes(b'\xef\xbb\xbfsource = "sim"\r\nscene = "field.png"\nbudget = 0.8\n')
     (here / "sweeps.toml").write_text("sweeps = true\n")
     (here / "nobody.toml").write_text('scene = "~nobody-here/field.png"\n')
     (here / "unknown.toml").write_text('scene = "field.png"\nbuget = 0.8\n')

@@ -28,6 +28,7 @@ from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import open_archive, verify_archive
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.prior_work import without_effects
+from tests.storage.readers.test_envi_cubes import write_envi
 
 SHAPE = (52, 70)
 NORTH_UP = Affine(0.05, 0, 534_257.65, 0, -0.05, 5_772_301.4)
@@ -61,12 +62,9 @@ def write_geotiff(path: Path, transform: Affine, *, gap: bool = False, crs: str 
 
 
 def envi(folder: Path) -> tuple[Path, Affine]:
-    (folder / "a.hdr").write_text(
-        f"ENVI\nsamples = {SHAPE[1]}\nlines = {SHAPE[0]}\nbands = 3\ndata type = 1\ninterleave = bip\n"
-        "map info = {UTM, 1, 1, 534257.65, 5772301.4, 0.05, 0.05, 32, North, WGS-84, units=Meters, rotation=25}\n"
-        "wavelength units = nm\nwavelength = {640, 550, 460}\n"
-    )
-    (folder / "a.img").write_bytes(PIXELS.tobytes())
+    place = "{UTM, 1, 1, 534257.65, 5772301.4, 0.05, 0.05, 32, North, WGS-84, units=Meters, rotation=25}"
+    nm = {"wavelength_units": "nm", "wavelength": "{640, 550, 460}"}
+    write_envi(folder / "a.img", PIXELS, "bip", map_info=place, **nm)
     with rasterio.open(folder / "a.img") as file:
         return folder / "a.hdr", file.transform
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 import rioxarray  # noqa: F401 - registers the accessor that users have
 import xarray as xr
 from rasterio.transform import from_origin
@@ -18,6 +17,7 @@ from flows.cli.main import main
 from models.weights.files import describe_weights, load_ood
 from spectralzoom import open as open_archive
 from tests.flows.conftest import command_line
+from tests.storage.readers.test_raster_tags import write
 
 __all__ = ["command_line"]
 
@@ -34,13 +34,10 @@ def write_tile(folder: Path, number: int) -> None:
     spectra = np.stack([np.linspace(300, 3000, 13), np.linspace(2500, 500, 13), 1500 + 500 * np.sin(np.arange(13))])
     values = (spectra[labels] + rng.normal(0, 30, (SIDE, SIDE, 13))).astype(np.uint16)
     place = {"crs": "EPSG:32633", "transform": from_origin(5e5 + 10 * SIDE * number, 5e6, 10, 10)}
-    size = {"driver": "GTiff", "width": SIDE, "height": SIDE, **place}
-    with rasterio.open(folder / "images" / f"t{number}.tif", "w", count=13, dtype="uint16", **size) as file:
-        file.write(np.moveaxis(values, 2, 0))
+    with write(folder / "images" / f"t{number}.tif", np.moveaxis(values, 2, 0), **place) as file:
         for band, centre in enumerate(SENTINEL_NM, 1):
             file.update_tags(band, wavelength=str(centre), wavelength_units="nm")
-    with rasterio.open(folder / "labels" / f"t{number}.tif", "w", count=1, dtype="uint8", **size) as file:
-        file.write(labels, 1)
+    write(folder / "labels" / f"t{number}.tif", labels[None], **place).close()
 
 
 @pytest.fixture(scope="module")

@@ -242,7 +242,7 @@ def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
     folder.mkdir()
     dark, white = (np.full((1, *values.shape[1:]), level, np.uint16) for level in (60, 3500))
     for name, numbers in (("scan", values), ("scan.dark", dark), ("scan.white", white)):
-        write_envi_cube(folder / name, numbers, ".img", wavelength="{640, 550, 460}")
+        write_envi_cube(folder / f"{name}.img", numbers, wavelength="{640, 550, 460}")
     return folder
 
 
@@ -297,7 +297,7 @@ def test_pixels_without_a_valid_line_have_no_class(
     folder, values = pushbroom
     if by_value:
         values[40:72] = 7
-        write_envi_cube(folder / "scan", values, ".img", wavelength="{640, 550, 460}", data_ignore_value=7)
+        write_envi_cube(folder / "scan.img", values, wavelength="{640, 550, 460}", data_ignore_value=7)
     else:
         table(folder, "position_px,valid", [f"{line},{int(not 40 <= line < 72)}" for line in range(96)])
     receipt = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights)).receipt
@@ -338,7 +338,7 @@ def test_bad_input_gives_one_message(
     folder, _ = pushbroom
     flags, message = BAD[mistake]
     monkeypatch.chdir(folder)
-    write_envi_cube(folder / "two", np.full((1, 64, 2), 3500, np.uint16), ".img", wavelength="{640, 550}")
+    write_envi_cube(folder / "two.img", np.full((1, 64, 2), 3500, np.uint16), wavelength="{640, 550}")
     if mistake in POSITIONS:
         table(folder, "position_px", [str(position) for position in POSITIONS[mistake]])
     asked = ["--engine", "plain", *([] if "--out" in flags else ["--out", "a"]), "--weights", weights]

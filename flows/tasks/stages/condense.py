@@ -230,8 +230,7 @@ def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCame
     few = components_of(found, cubes, SignalChoice()) if np.count_nonzero(found.lit) <= FEW_BANDS and whole else None
     for cube in cubes:
         stored = of_sweep[cube.sweep]
-        wrong = differing_lines(cube, stored, camera, few)
-        if wrong:
+        if wrong := differing_lines(cube, stored, camera, few):
             return f"sweep {cube.sweep.name}: {line_values(wrong)} of the signal are not those of the raw lines"
     return None
 

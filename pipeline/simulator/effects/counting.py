@@ -279,8 +279,8 @@ class Saturation(Effect):
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by how far the brightest sample, 6 deviations up, reaches above the lower of both limits."""
-        limit = min(rig.camera.full_scale_e, rig.detector.full_well_e)
         camera = rig.camera
+        limit = min(camera.full_scale_e, rig.detector.full_well_e)
         expected = max(probe.brightest_e, 0.0) + dark_electrons(rig) + most_hot_electrons(rig)
         sd = 0.0 if rig.detector.noiseless else float(np.hypot(np.sqrt(expected), camera.read_noise_e))
         over = max(expected + REACH * sd - limit, 0.0)

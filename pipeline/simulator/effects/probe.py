@@ -15,6 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Floats, Sweep
 from pipeline.simulator.rig_model import Rig
 
@@ -115,9 +116,9 @@ def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1
     return np.full_like(signal, rig.camera.electrons_per_dn / binning)
 
 
-def fixed_variance(rig: Rig) -> float:
+def fixed_variance(camera: LineCamera) -> float:
     """Return the variance of read noise and quantisation, which light does not change. [e-^2]"""
-    return rig.camera.read_noise_e**2 + rig.camera.electrons_per_dn**2 / 12
+    return camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
 
 
 @dataclass(frozen=True)

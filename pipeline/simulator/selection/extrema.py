@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.scan import Floats, Sweep
-from pipeline.simulator.effects.probe import Radiance, steepest_difference
+from pipeline.simulator.effects.probe import Radiance, fixed_variance, steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
 BAND_GROUPS = 8
@@ -165,8 +165,8 @@ class PixelOptics:
 
     @staticmethod
     def of(camera: LineCamera, binning: int, turned: tuple[bool, ...]) -> PixelOptics:
-        fixed = camera.read_noise_e**2 + camera.electrons_per_dn**2 / 12
-        return PixelOptics(_short_kernel(camera.slit_px), _short_kernel(1.0), fixed, binning, turned)
+        slit, pixel = _short_kernel(camera.slit_px), _short_kernel(1.0)
+        return PixelOptics(slit, pixel, fixed_variance(camera), binning, turned)
 
     @property
     def halo(self) -> int:

@@ -166,7 +166,7 @@ def unit_ratio(probe: Probe, rig: Rig, gain: float) -> float:
     """Return the most that a unit is over the one that light multiplied by ``gain`` has."""
     if probe.unit == "dn" or rig.detector.noiseless:
         return 1.0
-    fixed = fixed_variance(rig)
+    fixed = fixed_variance(rig.camera)
     ends = (max(probe.darkest_e, 0.0), max(probe.brightest_e, 0.0))
     return max(math.sqrt((light + fixed) / (gain * light + fixed)) for light in ends)
 
@@ -190,7 +190,7 @@ def light_after(probe: Probe, rig: Rig, gains: Sequence[GainRange], blurred: flo
     apart = float((2 * blurred + ratio * (1 - kept) * probe.level + added / unit_e).max(initial=0.0))
     gaps = rising_gaps(probe.wavelength_nm)
     follows = probe.unit == "sigma" and not rig.detector.noiseless
-    own_e = np.sqrt((np.maximum(added, 0.0) + fixed_variance(rig)) / probe.binning) if follows else unit_e
+    own_e = np.sqrt((np.maximum(added, 0.0) + fixed_variance(rig.camera)) / probe.binning) if follows else unit_e
     return replace(
         probe,
         level=probe.level + added / own_e,

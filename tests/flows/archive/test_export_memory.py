@@ -21,6 +21,7 @@ from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import is_cog
+from tests.storage.readers.test_label_grids import write
 
 SHAPE = (96, 128)
 PATCH = 8
@@ -33,17 +34,14 @@ def harvested(folder: Path, place: str) -> Iterator[Path]:
     values, _ = patchy_scene(SHAPE, 3, seed=5)
     later = values.copy()
     later[54:, 64:] = values[54:, 64:][::-1, ::-1]
-    grid = {"crs": "EPSG:32632", "transform": rasterio.Affine(0.1, 0, 404_000, 0, -0.1, 5_757_000)}
     for number, image in enumerate((values, later)):
         folder.joinpath(f"{number}").mkdir()
         if place != "georeferenced":
             Image.fromarray(image.astype(np.uint8)).save(folder / f"{number}" / "field.png")
             yield folder / f"{number}" / "field.png"
             continue
-        about = {"driver": "GTiff", "height": SHAPE[0], "width": SHAPE[1], "count": 3, "dtype": "uint8"}
-        with rasterio.open(folder / f"{number}" / "field.tif", "w", **about, **grid, photometric="MINISBLACK") as file:
-            file.write(np.moveaxis(image.astype(np.uint8), -1, 0))
-        yield folder / f"{number}" / "field.tif"
+        grid = rasterio.Affine(0.1, 0, 404_000, 0, -0.1, 5_757_000)
+        yield write(folder / f"{number}" / "field.tif", image.astype(np.uint8), grid)
 
 
 @pytest.fixture(scope="module", params=["georeferenced", "posed"])

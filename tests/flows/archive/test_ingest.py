@@ -19,20 +19,14 @@ from storage.archive.archive import Archive
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import verify_archive
 from tests.conftest import QUIET
+from tests.storage.readers.test_envi_cubes import write_envi
 
-NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65}\nfwhm = {0.01, 0.01, 0.02}\n"
-KINDS = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
+NM = {"wavelength_units": "um", "wavelength": "{0.45, 0.55, 0.65}", "fwhm": "{0.01, 0.01, 0.02}"}
 
 
-def write_envi(path: Path, values: NDArray[Any], *, lines: int | None = None, more: str = NM) -> Path:
+def write_cube(path: Path, values: NDArray[Any], **fields: object) -> Path:
     """Write (line, sample, band) values as BIL with their header; return the header."""
-    promised = len(values) if lines is None else lines
-    path.with_suffix(".hdr").write_text(
-        f"ENVI\nsamples = {values.shape[1]}\nlines = {promised}\nbands = {values.shape[2]}\n"
-        f"data type = {KINDS[values.dtype.str[1:]]}\ninterleave = bil\nbyte order = 0\n{more}"
-    )
-    path.write_bytes(values.transpose(0, 2, 1).tobytes())
-    return path.with_suffix(".hdr")
+    return write_envi(path, values, **NM, **fields).with_suffix(".hdr")
 
 
 def ingest(source: Path | str, archive: Path, **flags: Any) -> dict[str, Any]:
@@ -56,9 +50,9 @@ def test_ingest_stores_values_and_metadata(tmp_path: Path, raw: NDArray[np.uint1
     """Plain xarray reads values, wavelengths, times, references, files and headers."""
     folder = tmp_path / "flight 7"
     folder.mkdir()
-    write_envi(folder / "raw_0", raw[:100])
-    write_envi(folder / "raw_100", raw[100:])
-    write_envi(folder / "darkReference", raw[:1] // 8)
+    write_cube(folder / "raw_0", raw[:100])
+    write_cube(folder / "raw_100", raw[100:])
+    write_cube(folder / "darkReference", raw[:1] // 8)
     (folder / "frameIndex_0.txt").write_text("f\tt\n" + "".join(f"{i}\t{5000 + 40 * i}\n" for i in range(100)))
     record = ingest(folder, tmp_path / "archive", name="field-7")
     data = opened(record)
@@ -95,7 +89,7 @@ def test_ingest_keeps_every_value(tmp_path: Path, kind: str, high: int, stored: 
     """Integers of 8 and 16 bits keep their type; all other types become float32."""
     values = np.random.default_rng(1).integers(0, max(high, 0) + 1, (70, 5, 3)).astype(kind)
     values[69, 0, 0] = high
-    data = opened(ingest(write_envi(tmp_path / "a.img", values), tmp_path / "archive"))
+    data = opened(ingest(write_cube(tmp_path / "a.img", values), tmp_path / "archive"))
     assert data["values"].dtype == np.dtype(stored)
     np.testing.assert_array_equal(data["values"], values)
 
@@ -103,14 +97,14 @@ def test_ingest_keeps_every_value(tmp_path: Path, kind: str, high: int, stored: 
 def test_the_same_content_is_stored_once(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
     """Name and folder of the files do not count; a given name, other bytes, wavelengths or dark frames do."""
     archive = tmp_path / "archive"
-    first = ingest(write_envi(tmp_path / "a.img", raw), archive)
+    first = ingest(write_cube(tmp_path / "a.img", raw), archive)
     (tmp_path / "elsewhere").mkdir()
-    again = ingest(write_envi(tmp_path / "elsewhere" / "b.raw", raw), archive)
+    again = ingest(write_cube(tmp_path / "elsewhere" / "b.raw", raw), archive)
     assert (first["cached"], again["cached"], again["key"]) == (False, True, first["key"])
     others = [
         ingest(tmp_path / "a.hdr", archive, name="n"),
         ingest(tmp_path / "a.hdr", archive, wavelengths=[400, 500, 600]),
-        ingest(write_envi(tmp_path / "c.img", raw + 1), archive),
+        ingest(write_cube(tmp_path / "c.img", raw + 1), archive),
         ingest(tmp_path / "a.hdr", archive, dark=str(tmp_path / "c.hdr")),
     ]
     assert len({record["key"] for record in [first, *others]}) == 5
@@ -118,7 +112,7 @@ def test_the_same_content_is_stored_once(tmp_path: Path, raw: NDArray[np.uint16]
 
 def test_an_ingested_store_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
     """Its folder is a scene, and can be ingested again with all metadata."""
-    record = ingest(write_envi(tmp_path / "a.img", raw[:20], lines=22), tmp_path / "archive")
+    record = ingest(write_cube(tmp_path / "a.img", raw[:20], lines=22), tmp_path / "archive")
     scene = load_scene_file(record["path"])
     np.testing.assert_array_equal(scene.values[:20], raw[:20])
     assert np.isnan(scene.values[20:]).all()
@@ -133,7 +127,7 @@ def test_the_scale_of_scene_toml_is_stored(tmp_path: Path, raw: NDArray[np.uint1
     numbers = raw.astype(np.int16)
     numbers[3, 4] = -1
     numbers[5] = -9999
-    path = write_envi(tmp_path / "a.img", numbers)
+    path = write_cube(tmp_path / "a.img", numbers)
     (tmp_path / "scene.toml").write_text("nodata = -1\n")
     unscaled = ingest(path, tmp_path / "archive")
     assert opened(unscaled).attrs["nodata"] == -1
@@ -149,7 +143,7 @@ def test_the_scale_of_scene_toml_is_stored(tmp_path: Path, raw: NDArray[np.uint1
 
 def test_a_scale_with_a_dark_frame_is_refused(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
     """Dark and white frames need values as the camera gave them."""
-    path, dark = write_envi(tmp_path / "a.img", raw), write_envi(tmp_path / "dark.img", raw[:1] // 8)
+    path, dark = write_cube(tmp_path / "a.img", raw), write_cube(tmp_path / "dark.img", raw[:1] // 8)
     (tmp_path / "scene.toml").write_text("scale = 0.0001\n")
     with pytest.raises(SceneError, match=r"scene.toml has a scale .*remove scale and offset"):
         ingest(path, tmp_path / "archive", dark=dark)
@@ -158,7 +152,7 @@ def test_a_scale_with_a_dark_frame_is_refused(tmp_path: Path, raw: NDArray[np.ui
 @pytest.mark.parametrize("name", ["../out", "/tmp/x", "", "a.part"])
 def test_names_with_a_path_are_refused(tmp_path: Path, raw: NDArray[np.uint16], name: str) -> None:
     """The error comes before an archive is made."""
-    header = write_envi(tmp_path / "a.img", raw)
+    header = write_cube(tmp_path / "a.img", raw)
     with pytest.raises(ArchiveError, match="cannot be a name in an archive"):
         ingest(header, tmp_path / "archive", name=name)
     assert not (tmp_path / "archive").exists()
@@ -166,7 +160,7 @@ def test_names_with_a_path_are_refused(tmp_path: Path, raw: NDArray[np.uint16], 
 
 def test_a_changing_source_is_refused(tmp_path: Path, raw: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
     """Files that change while they are read leave no store."""
-    header = write_envi(tmp_path / "a.img", raw)
+    header = write_cube(tmp_path / "a.img", raw)
     real = flows.archive.ingest_command.write_ingested_cube
 
     def grows(*arguments: Any, **named: Any) -> None:

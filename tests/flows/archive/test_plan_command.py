@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from flows.terminal.figures import format_seconds
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
-from tests.conftest import QUIET, Flags
+from tests.conftest import QUIET, Flags, Survey
 from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -40,9 +39,10 @@ def settings(scene_files: Path, flags_png: Flags) -> Settings:
 
 
 @pytest.fixture
-def archive(one_survey: tuple[Path, Any], tmp_path: Path) -> Path:
-    """Return a copy of an archive with one survey."""
-    return Path(shutil.copytree(one_survey[0], tmp_path / "archive"))
+def archive(surveyed_png: Survey, tmp_path: Path) -> Path:
+    """Return an archive with one survey."""
+    surveyed_png(tmp_path / "archive")
+    return tmp_path / "archive"
 
 
 def _plan(settings: Settings, out: Path, **changes: Any) -> dict[str, SimpleNamespace]:

@@ -28,6 +28,7 @@ from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.remote.opening import verify_archive
 from tests.conftest import QUIET, RGB_NM, WeightsMaker, patchy_scene
+from tests.storage.readers.test_raster_tags import write
 
 CORNER = Affine(0.5, 0, 500_000, 0, -0.5, 5_400_000)
 UTM = "EPSG:32632"
@@ -48,12 +49,9 @@ def surveyed(tmp_path: Path, weights: Path) -> Raster:
 def write_tif(path: Path, values: NDArray[Any], place: Affine | None = CORNER, **about: Any) -> Path:
     """Write (y, x, band) values as GeoTIFF in UTM, or without a place; return its path."""
     placed = {} if place is None else {"transform": place, "crs": UTM}
-    height, width, count = values.shape
-    size = {"height": height, "width": width, "count": count, "dtype": values.dtype.name}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        with rasterio.open(path, "w", driver="GTiff", **size, **placed, **about) as file:
-            file.write(np.moveaxis(values, -1, 0))
+        write(path, np.moveaxis(values, -1, 0), **placed, **about).close()
     return path
 
 

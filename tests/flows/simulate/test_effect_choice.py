@@ -29,11 +29,6 @@ def choose(run: CaptureRun) -> StageRef:
     return choose_effects.produce(run.archive, choose_effects.wants(run))[0]
 
 
-def key_of(run: CaptureRun) -> str:
-    """Return the key that the stage requests, without making a store."""
-    return choose_effects.key(choose_effects.wants(run))
-
-
 def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
     """Return a simulation of the small picture."""
     given = {"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(out), "effects": ASKED}
@@ -88,8 +83,9 @@ def test_a_stored_choice_reads_no_scene(scene_files: Path, decided: Decided, mon
 )
 def test_the_key_follows_the_inputs_of_the_choice(scene_files: Path, decided: Decided, flags: dict[str, Any]) -> None:
     """Inputs are the tolerance with its unit, the requested effects, seed, camera, optics and sky."""
-    assert key_of(opened(scene_files, decided[0])) == decided[1].key
-    assert key_of(opened(scene_files, decided[0], **flags)) != decided[1].key
+    same, other = (choose_effects.wants(opened(scene_files, decided[0], **given)) for given in ({}, flags))
+    assert choose_effects.key(same) == decided[1].key
+    assert choose_effects.key(other) != decided[1].key
 
 
 def test_effects_unknown_to_this_version_are_refused(monkeypatch: pytest.MonkeyPatch, decided: Decided) -> None:

@@ -44,10 +44,6 @@ def _open(out: Path, receipt: Any, name: str) -> xr.Dataset:
     return xr.open_zarr(out / receipt["products"][name], consolidated=False)
 
 
-def _classes(out: Path, receipt: Any) -> np.ndarray:
-    return _open(out, receipt, "class_map")["classes"].values
-
-
 def test_the_allowed_loss_sets_the_smallest_gain(cascade: tuple[Path, Any]) -> None:
     """Without a flag 0.3 points are allowed: patches of 0.15 and more are read in order of gain, and no others."""
     out, receipt = cascade
@@ -64,7 +60,8 @@ def test_read_patches_equal_a_full_reading(cascade: tuple[Path, Any], survey_png
     out, receipt = cascade
     everything = survey_png(tmp_path, **RASTER, weights=receipt["settings"]["weights"], expected_loss="0").receipt
     assert "kept" not in everything
-    ours, whole = _classes(out, receipt), _classes(tmp_path, everything)
+    maps = (_open(out, receipt, "class_map"), _open(tmp_path, everything, "class_map"))
+    ours, whole = (one["classes"].values for one in maps)
     patches = _open(out, receipt, "attention")["rank"].values >= 0
     read = patches.repeat(8, 0).repeat(8, 1)[: ours.shape[0], : ours.shape[1]]
     np.testing.assert_array_equal(ours[read], whole[read])

@@ -101,26 +101,21 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
     assert regions != _contents(_store(stages, "segment").path / MAP)
 
 
-@pytest.mark.parametrize("policy", ["gain", "entropy", "sobel"])
-def test_scores_of_regions_equal_those_of_the_field(surveyed: Surveyed, policy: str) -> None:
-    """The halo covers the field; the stage's own scores are the same for its policy."""
+@pytest.mark.parametrize(
+    ("policy", "halo_px", "within"),
+    [("gain", ALL_PX, 1e-12), ("entropy", ALL_PX, 0), ("sobel", ALL_PX, 0), ("sobel", 32, 1e-5)],
+)
+def test_scores_of_regions_equal_those_of_the_field(
+    surveyed: Surveyed, policy: str, halo_px: int, within: float
+) -> None:
+    """The halo covers the field, or one patch, which edges need; the stage's own scores are the same for its policy."""
     run, stages = surveyed
     mosaic = _mosaics(stages)[0]
     whole = run.work.score(policy, mosaic, run.capture, lambda done: None)
-    parts = _work(run, WorkerPool(workers=2), ALL_PX).score(policy, mosaic, run.capture, lambda done: None)
-    np.testing.assert_allclose(parts, whole, rtol=1e-12 if policy == "gain" else 0)  # sums over the field
+    parts = _work(run, WorkerPool(workers=2), halo_px).score(policy, mosaic, run.capture, lambda done: None)
+    np.testing.assert_allclose(parts, whole, rtol=within)  # gains are sums over the field
     if policy == run.settings.policy:
         assert (load_attention(_store(stages, "score").path / "attention.zarr").score == whole).all()
-
-
-def test_edges_need_one_patch_of_halo(surveyed: Surveyed) -> None:
-    """With a halo of 32 px, regions give the sobel scores of the field."""
-    run, stages = surveyed
-    mosaic = _mosaics(stages)[0]
-    whole = run.work.score("sobel", mosaic, run.capture, lambda done: None)
-    np.testing.assert_allclose(
-        _work(run, WorkerPool(), 32).score("sobel", mosaic, run.capture, lambda done: None), whole, rtol=1e-5
-    )
 
 
 def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_ti
 from pipeline.source import References
 from storage.archive.keys import StageRef
 from storage.arrays.cubes import SweepHeader
-from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 from storage.parallel.pool import WorkerPool
 from tests.storage.plain_mosaic import plain_writer, write_plain_sweep
@@ -49,18 +48,14 @@ def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
     return MosaicRecipe(StageRef("condense", "key", folder), CAMERA, GRID)
 
 
-def mosaic_at(path: Path) -> MosaicWriter:
-    """Return a writer of an empty mosaic on the grid."""
-    return plain_writer(path, GRID.shape, BANDS)
-
-
 def test_memory_limits_the_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:
     """Memory for one tile allows one worker of three; one byte less is refused."""
     work = recipe_of(cubes)
-    least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, pool=ONE).projected
-    assert write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, pool=THREE).workers == 1
+    first, second, third = (plain_writer(tmp_path / f"{name}.zarr", GRID.shape, BANDS) for name in "abc")
+    least = write_mosaic(work, first, memory=PLENTY, pool=ONE).projected
+    assert write_mosaic(work, second, memory=least, pool=THREE).workers == 1
     with pytest.raises(SettingsError, match=r"projected memory \d+ MiB exceeds --memory \d+ MiB: one tile of 64 x 640"):
-        write_mosaic(work, mosaic_at(tmp_path / "c.zarr"), memory=least - 1)
+        write_mosaic(work, third, memory=least - 1)
 
 
 def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[SignalCube]) -> None:

@@ -14,9 +14,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import rasterio
 import torch
 import xarray as xr
+from affine import Affine
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ from storage.archive.records import read_run
 from tests.conftest import CLASSES, QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects
+from tests.storage.readers.test_label_grids import write
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -181,11 +182,8 @@ def test_a_map_of_another_place_is_no_prior_map(
 ) -> None:
     """Tiles of one mosaic look alike, so the coordinates in their files decide."""
     for name, east, code in (("here", 0.0, 32632), ("there", east_m, epsg)):
-        values = np.moveaxis(patchy_scene((96, 128), 3, seed=1)[0].astype(np.uint8), -1, 0)
-        place = {"crs": f"EPSG:{code}", "transform": rasterio.Affine(10.0, 0, 4e5 + east, 0, -10.0, 5e6)}
-        kind: dict[str, Any] = {"driver": "GTiff", "height": 96, "width": 128, "count": len(values), "dtype": "uint8"}
-        with rasterio.open(tmp_path / f"{name}.tif", "w", **kind, **place) as file:
-            file.write(values)
+        values = patchy_scene((96, 128), 3, seed=1)[0].astype(np.uint8)
+        write(tmp_path / f"{name}.tif", values, Affine(10.0, 0, 4e5 + east, 0, -10.0, 5e6), code, photometric="RGB")
     flags = {"labels": None, "name": "tile", "prior": "latest"}
     survey_png(visited, **{**RASTER, **flags}, scene=str(tmp_path / "here.tif"), visit=FIRST)
     words, run = words_of(visited, survey_png, **flags, scene=str(tmp_path / "there.tif"), visit=LATER)

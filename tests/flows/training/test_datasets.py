@@ -11,38 +11,28 @@ from PIL import Image
 
 from flows.training.data import load_data_set
 from pipeline.errors import SceneError
+from tests.flows.small_fields import write_field
 
+NUMBERS = ("003", "010", "021")
 MASK_TO_CLASS = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)
-
-
-def _folder(root: Path) -> Path:
-    (root / "images").mkdir()
-    (root / "annotations").mkdir()
-    (root / "scene.toml").write_text(
-        'labels = "annotations/{number}_annotation.png"\n[classes]\nsoil = [0, 0, 0]\ncrop = [0, 255, 0]\n'
-    )
-    for number in ("003", "010", "021"):
-        Image.new("RGB", (6, 5), (int(number), 0, 0)).save(root / "images" / f"{number}_image.png")
-        Image.new("RGB", (6, 5), (0, 255, 0)).save(root / "annotations" / f"{number}_annotation.png")
-    return root
 
 
 def test_scenes_are_named_by_number(tmp_path: Path) -> None:
     """Each image is a scene with its own labels; held-out scenes are listed by name."""
-    data = load_data_set(_folder(tmp_path), hold_out=["010"])
-    assert tuple(data.files) == ("003", "010", "021")
+    data = load_data_set(write_field(tmp_path, names=NUMBERS), hold_out=["010"])
+    assert tuple(data.files) == NUMBERS
     assert data.held_out == ("010",)
     scene = data.load("010")
     assert scene.labels is not None
-    assert (scene.labels == 1).all()
-    assert scene.values[0, 0, 0] == 10
+    np.testing.assert_array_equal(scene.values, np.asarray(Image.open(tmp_path / "images" / "010_image.png")))
+    np.testing.assert_array_equal(scene.labels, scene.values[..., 1] > 100)
 
 
 def test_all_scenes_cannot_be_held_out(tmp_path: Path) -> None:
     """Holding out all three scenes would leave none to train on."""
-    _folder(tmp_path)
+    write_field(tmp_path, names=NUMBERS)
     with pytest.raises(SceneError, match="leaves none to train on"):
-        load_data_set(tmp_path, hold_out=["003", "010", "021"])
+        load_data_set(tmp_path, hold_out=NUMBERS)
 
 
 def test_a_mask_splits_the_labels(tmp_path: Path) -> None:

@@ -209,15 +209,25 @@ def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
     assert "a training scene" not in notes["002"]
 
 
+def _masked(folder: Path, rows: slice | None, out: Path, **more: Any) -> TrainRequest:
+    """Write a labelled cube of 40 x 40 px, and request a training on these rows of it."""
+    labels = np.random.default_rng(4).integers(1, 3, (40, 40)).astype(np.uint8)
+    np.save(folder / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
+    np.save(folder / "labels.npy", labels)
+    given = {"labels": str(folder / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
+    if rows is not None:
+        mask = np.zeros_like(labels)
+        mask[rows] = labels[rows]
+        np.save(folder / "mask.npy", mask)
+        given["train_mask"] = str(folder / "mask.npy")
+    return _request(folder / "cube.npy", out, choices=given, **more)
+
+
 def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
     """After training with a mask, the survey of the same file keeps the labels outside of the mask only."""
-    labels = np.random.default_rng(4).integers(1, 3, (40, 40)).astype(np.uint8)
-    np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
-    np.save(tmp_path / "labels.npy", labels)
-    np.save(tmp_path / "mask.npy", np.where(np.arange(40)[:, None] < 10, labels, 0).astype(np.uint8))
-    given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
-    train_weights(_request(tmp_path / "cube.npy", out, choices={**given, "train_mask": str(tmp_path / "mask.npy")}))
-    flags = given | {"scene": str(tmp_path / "cube.npy"), "source": "sim", "weights": str(out), "budget": 1}
+    train_weights(_masked(tmp_path, slice(10), out))
+    flags = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800], "source": "sim", "budget": 1}
+    flags |= {"scene": str(tmp_path / "cube.npy"), "weights": str(out)}
     run = open_run(load_settings(None, flags | {"out": str(tmp_path / "a")}))
     assert (run.labels[:10] == 255).all()
     assert (run.labels[10:] != 255).all()
@@ -350,21 +360,9 @@ def test_continued_training_refuses_other_scenes_of_the_same_names(folder: Path,
 @pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])
 def test_continued_training_needs_all_first_pixels(out: Path, tmp_path: Path, rows: int | None, held: bool) -> None:
     """A new mask must contain the first one; without a mask every pixel is trained on."""
-    labels = np.random.default_rng(4).integers(1, 3, (16, 16)).astype(np.uint8)
-    np.save(tmp_path / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
-    np.save(tmp_path / "labels.npy", labels)
-
-    def asked(rows: slice | None, out: Path, **more: Path) -> TrainRequest:
-        given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
-        if rows is not None:
-            mask = np.zeros_like(labels)
-            mask[rows] = labels[rows]
-            np.save(tmp_path / "mask.npy", mask)
-            given["train_mask"] = str(tmp_path / "mask.npy")
-        return _request(tmp_path / "cube.npy", out, validation=0, choices=given, **more)
-
-    train_weights(asked(slice(2, 10), out))
-    again = asked(None if rows is None else slice(rows), tmp_path / "b.safetensors", start=out)
+    train_weights(_masked(tmp_path, slice(2, 10), out, validation=0))
+    part = None if rows is None else slice(rows)
+    again = _masked(tmp_path, part, tmp_path / "b.safetensors", validation=0, start=out)
     if held:
         train_weights(again)
     else:

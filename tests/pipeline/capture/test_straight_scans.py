@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.straight_scans import angles_to_positions, covered_field, fit_sweep, flat_camera, flat_positions
+from pipeline.capture.straight_scans import angles_to_positions, covered_field, fit_sweep, flat_camera
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
-from pipeline.geometry.scan import CostModel, Sweep, line_positions, points_of_scan, shifted_position
+from pipeline.geometry.scan import CostModel, Sweep, line_positions, points_of_scan, scan_positions, shifted_position
 from pipeline.planning.coverage import cheapest_full
 
 CAMERA = LineCamera()
@@ -128,7 +128,7 @@ def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None
     """Every sample lies within 0.011 px of a parallel line, and the scan keeps its length."""
     flat = flat_camera(CAMERA, extent_px)
     scan = np.linspace(-extent_px, extent_px, 9)
-    tangents = direction_to_scene(position_to_direction(flat_positions(scan, flat))) / flat.ifov_rad
+    tangents = direction_to_scene(position_to_direction(scan_positions(0.0, scan, flat))) / flat.ifov_rad
     np.testing.assert_allclose(tangents, np.stack([np.zeros(9), scan], axis=-1), atol=1e-6)
     along, across = points_of_scan(0.0, flat, scan[:, None], flat.pixel_slopes())
     np.testing.assert_allclose(along, np.broadcast_to(np.arange(640) - 319.5, along.shape), atol=0.011)

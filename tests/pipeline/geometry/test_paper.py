@@ -20,6 +20,7 @@ from tests.pipeline.geometry.test_mirror import E1, E3, tilted
 
 CAMERA = LineCamera()
 IFOV = CAMERA.ifov_rad
+SCAN_PX = np.linspace(-640, 640, 1450)  # of the lines of a straight scan
 
 
 def paper_position(normal: np.ndarray) -> np.ndarray:
@@ -64,11 +65,6 @@ def aim(xi_px: object, eta_px: object) -> np.ndarray:
 def viewed(position: np.ndarray) -> np.ndarray:
     """Return the scene points (xi, eta) that positions look at. [px]"""
     return mirror.direction_to_scene(mirror.position_to_direction(position)) / IFOV
-
-
-def sweep_of_1450(xi_px: float) -> np.ndarray:
-    """Return positions of 1450 lines over 1280 px of the scan, straight in the scene."""
-    return aim(xi_px, np.linspace(-640, 640, 1450))
 
 
 def turn_of(position: np.ndarray) -> np.ndarray:
@@ -189,7 +185,7 @@ def test_e8_the_slope_errs_by_up_to_twelve_and_a_half_degrees():
 
 def test_e8_the_slope_is_ill_conditioned():
     """40 urad of noise: 47 deg rms by slope, 1.8e-2 px by position; %.6f: 1.6 px by slope, 7.5e-5 px by position."""
-    exact = sweep_of_1450(1000.0)
+    exact = aim(1000.0, SCAN_PX)
     normal = mirror.direction_to_normal(mirror.position_to_direction(exact))
     shaken = normal + np.random.default_rng(0).normal(0, 40e-6, normal.shape)
     noisy = mirror.normal_to_position(shaken / np.linalg.norm(shaken, axis=-1, keepdims=True))
@@ -221,7 +217,7 @@ def test_e9_the_slope_is_vertical_on_the_rigs_own_path(xi_px: float, seed_deg: f
 
 def test_e9_repeated_positions_have_no_slope():
     """At four decimals 313 of 1450 positions repeat the previous one: the slope is 0/0, and atan2 returns 0."""
-    path = np.round(sweep_of_1450(0.0), 4)
+    path = np.round(aim(0.0, SCAN_PX), 4)
     step = np.diff(path, axis=0) + 0.0  # no negative zeros
     angle = slope_rotation(path)
     assert int(np.isnan(angle).sum()) == int((step == 0).all(axis=1).sum()) == 313

@@ -37,14 +37,13 @@ class Waves:
     def pixels(self) -> RasterScene:
         """Return the scene in pixels, wider than the field by the margin that lines see next to it."""
         y, x = np.mgrid[-BESIDE : self.shape[0] + BESIDE, -BESIDE : self.shape[1] + BESIDE]
-        values = self.field_of(y.ravel(), x.ravel()).reshape(*y.shape, 2)
-        return made_scene(values, np.full(2, FULL), [500.0, 700.0])
+        return made_scene(self.field_of(y, x), np.full(2, FULL), [500.0, 700.0])
 
     def field_of(self, y: np.ndarray, x: np.ndarray, damping: np.ndarray | float = 1.0) -> np.ndarray:
-        """Return values (n, 2) at points, each wave damped by a factor; even waves are in band 0, odd in band 1."""
+        """Return values (..., 2) at points, each wave damped by a factor; even waves are in band 0, odd in band 1."""
         turns = np.multiply.outer(y, self.frequency[:, 0]) + np.multiply.outer(x, self.frequency[:, 1])
         waves = np.cos(2 * np.pi * turns + self.phase) * (self.height * damping)
-        return 0.5 + np.stack([waves[:, ::2].sum(axis=1), waves[:, 1::2].sum(axis=1)], axis=1)
+        return 0.5 + np.stack([waves[..., ::2].sum(axis=-1), waves[..., 1::2].sum(axis=-1)], axis=-1)
 
     def damping(self, along: Axis, step: int) -> NDArray[np.float64]:
         """Return each wave's damping by pixels, slit, detector, held positions and binning, in closed form."""

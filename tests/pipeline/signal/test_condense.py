@@ -204,39 +204,32 @@ def test_noise_of_a_field_marks_at_most_the_stated_number() -> None:
     assert total <= 8 * poisson.ppf(0.999, 80 / 8)
 
 
-@pytest.mark.parametrize("sigma", [1.0, 2.0, 5.0, 20.0])
-@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], sigma: float) -> None:
-    """A random signature of 1 to 20 sigma per band is planted at 30 places of a field of 60 bands.
-
-    At 1 sigma more than half of the single pixels are marked, and nine in ten of the others.
-    """
+def kept_of_planted(condensed: tuple, shape: tuple[int, int], sigma: float) -> float:
+    """Plant a random signature of so many sigma per band at 36 places of a field; return the fraction marked."""
     made, found, law = condensed
     rng = np.random.default_rng(8)
-    values = made.values.copy()
-    there = np.zeros(made.values.shape[:2], np.bool_)
-    for number in range(30):
-        line, sample = 3 + 15 * (number // 6), 2 + 15 * (number % 6)
+    values, there = made.values.copy(), np.zeros(made.values.shape[:2], np.bool_)
+    for line, sample in 4 + 15 * np.argwhere(np.ones((6, 6))):
         place = np.s_[line : line + shape[0], sample : sample + shape[1]]
         values[place] += (sigma * rng.choice([-1, 1], 60) * made.noise).astype(np.float32)
         there[place] = True
-    kept = marked(values, found, law)[there].mean()
+    return float(marked(values, found, law)[there].mean())
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 5.0, 20.0])
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_planted_spectra_are_marked(condensed: tuple, shape: tuple[int, int], sigma: float) -> None:
+    """A random signature of 1 to 20 sigma per band is planted at 36 places of a field of 60 bands.
+
+    At 1 sigma more than half of the single pixels are marked, and nine in ten of the others.
+    """
+    kept = kept_of_planted(condensed, shape, sigma)
     assert kept >= (0.9 if sigma == 1 and shape != (1, 1) else 0.55 if sigma == 1 else 1.0)
 
 
 def test_neighbours_are_found_together_below_the_threshold_of_one(condensed: tuple) -> None:
     """At 0.7 sigma per band few single pixels are rare, but most blocks and lines of 8 are."""
-    made, found, law = condensed
-    rng = np.random.default_rng(9)
-    kept = {}
-    for name, shape in SHAPES.items():
-        values = made.values.copy()
-        there = np.zeros(made.values.shape[:2], np.bool_)
-        for line, sample in np.ndindex(6, 6):
-            place = np.s_[4 + 15 * line : 4 + 15 * line + shape[0], 4 + 15 * sample : 4 + 15 * sample + shape[1]]
-            values[place] += (0.7 * rng.choice([-1, 1], 60) * made.noise).astype(np.float32)
-            there[place] = True
-        kept[name] = marked(values, found, law)[there].mean()
+    kept = {name: kept_of_planted(condensed, shape, 0.7) for name, shape in SHAPES.items()}
     assert kept["a pixel"] < 0.3
     assert kept["2 x 2 px"] > kept["a pixel"] + 0.3
     assert kept["a line of 8"] > 0.9

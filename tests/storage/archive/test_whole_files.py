@@ -103,12 +103,6 @@ def test_remove_leftovers_deletes_only_folders_of_killed_writers(tmp_path: Path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".export-mine", "mine.part"]
 
 
-def test_toml_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
-    """Some editors write a byte order mark at the start of a file."""
-    (tmp_path / "survey.toml").write_bytes(b"\xef\xbb\xbfseed = 1\r\n")
-    assert read_toml(tmp_path / "survey.toml") == {"seed": 1}
-
-
 @pytest.mark.parametrize(
     ("content", "why"),
     [

@@ -38,10 +38,6 @@ def _run(small: Small) -> str:
     return f"runs/{small.run.name}"
 
 
-def _two(archive: Archive) -> tuple[Small, Small]:
-    return small_survey(archive), small_survey(archive, kernel="nearest")
-
-
 def _pictured(archive: Archive, asked: dict[str, Any], **facts: Any) -> Path:
     """Publish a run of a receipt and a picture, and return its folder."""
     with archive.new_run("farm") as draft:
@@ -56,7 +52,8 @@ def _moments(archive: Archive) -> dict[str, int]:
 
 def test_repair_makes_only_broken_stores_again(archive: Archive) -> None:
     """The inputs and dependents of a broken store stay, and so does the other survey."""
-    small, _ = _two(archive)
+    small = small_survey(archive)
+    small_survey(archive, kernel="nearest")
     before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
     done = _repair(archive)
@@ -93,7 +90,8 @@ def test_a_changed_scene_file_does_not_replace_a_run(archive: Archive) -> None:
 @pytest.mark.parametrize("how", ["flip", "manifest", "lost", "gone"])
 def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how: str) -> None:
     """A flipped bit, a damaged or lost manifest or a lost store: both surveys that name the lines run again."""
-    small, _ = _two(archive)
+    small = small_survey(archive)
+    small_survey(archive, kernel="nearest")
     if how == "flip":
         flip(small.raw.path / "data.bin")
     elif how == "manifest":

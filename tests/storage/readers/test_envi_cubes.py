@@ -15,19 +15,18 @@ from pipeline.rig.camera.camera_texts import parse_envi_header
 from storage.readers.envi_files import load_envi_header, open_envi_cube
 from storage.readers.open_cubes import open_cube
 
-CODES = {"u1": 1, "f4": 4, "u2": 12}
+CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
 AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
 
 
-def write_envi(path: Path, values: NDArray[Any], interleave: str = "bil", *, offset: int = 0) -> Path:
-    """Write (line, sample, band) values and their header beside them; return the data file's path."""
-    lines, samples, bands = values.shape
-    code = CODES[values.dtype.str[1:]]
-    path.with_suffix(".hdr").write_text(
-        f"ENVI\nsamples = {samples}\nlines = {lines}\nbands = {bands}\nheader offset = {offset}\n"
-        f"data type = {code}\ninterleave = {interleave}\nbyte order = 0\n"
-    )
-    path.write_bytes(b"x" * offset + values.transpose(AXES[interleave]).tobytes())
+def write_envi(path: Path, values: NDArray[Any], order: str = "bil", *, offset: int = 0, **fields: object) -> Path:
+    """Write (line, sample, band) values and their header, with these fields (None: without); return the data's path."""
+    sizes = dict(zip(("lines", "samples", "bands"), values.shape, strict=True))
+    kind = {"header offset": offset, "data type": CODES[values.dtype.str[1:]], "interleave": order, "byte order": 0}
+    said = sizes | kind | {key.replace("_", " "): value for key, value in fields.items()}
+    text = "".join(f"{key} = {value}\n" for key, value in said.items() if value is not None)
+    path.with_suffix(".hdr").write_text("ENVI\n" + text)
+    path.write_bytes(b"x" * offset + values.transpose(AXES[order]).tobytes())
     return path
 
 

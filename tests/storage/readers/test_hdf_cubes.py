@@ -21,6 +21,7 @@ from pipeline.errors import SceneError, WavelengthError
 from storage.readers.cube_sources import read_by_chunks
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
+from tests.storage.readers.test_raster_tags import write as write_bands
 
 RNG = np.random.default_rng(5)
 NM = np.array([450.0, 550.0, 660.0, 800.0, 900.0])
@@ -231,50 +232,35 @@ def test_rows_from_south_to_north_have_gdals_position(tmp_path: Path) -> None:
     """GDAL writes the southern row first, under the GeoTransform of the upright image."""
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     upright = rasterio.transform.from_origin(500_000, 5_000_030, 10, 10)
-    size = {"height": 3, "width": 4, "count": 1, "dtype": "float32"}
-    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", crs="EPSG:32632", transform=upright, **size) as file:
-        file.write(values, 1)
+    write_bands(tmp_path / "a.tif", values[None], crs="EPSG:32632", transform=upright).close()
     rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT="NC4")
     cube = open_cube(f"{tmp_path / 'a.nc'}:Band1")
     assert cube.geobox.affine.to_gdal() == (500_000, 10, 0, 5_000_000, 0, 10)
     assert np.array_equal(cube.read(0, 3)[::-1, :, 0], values)
 
 
+SCALED, NAN = {"scale_factor": 0.01}, float("nan")
+COUNTS = np.int16([0, 101, -3, -9])
+
+
 @pytest.mark.parametrize(
     ("stored", "about", "read"),
     [
-        (np.int8([0, 100, -128, -1]), {"_Unsigned": "true", "_FillValue": np.int8(-1)}, [0, 1, 1.28, np.nan]),
-        (np.int16([0, 101, -3, 9]), {"valid_min": np.int16(0), "valid_max": np.int16(100)}, [0, np.nan, np.nan, 0.09]),
-        (np.int16([0, 101, -3, 9]), {"valid_range": np.int16([0, 200])}, [0, 1.01, np.nan, 0.09]),
-        (
-            np.int16([5, -9, -3, 9]),
-            {"_FillValue": np.int16(-9), "missing_value": np.int16(-3)},
-            [0.05, np.nan, np.nan, 0.09],
-        ),
+        (np.int8([0, 100, -128, -1]), {**SCALED, "_Unsigned": "true", "_FillValue": np.int8(-1)}, [0, 1, 1.28, NAN]),
+        (COUNTS, {**SCALED, "valid_min": np.int16(0), "valid_max": np.int16(100)}, [0, NAN, NAN, NAN]),
+        (COUNTS, {**SCALED, "valid_range": np.int16([0, 200])}, [0, 1.01, NAN, NAN]),
+        (COUNTS, {**SCALED, "_FillValue": np.int16(-9), "missing_value": np.int16(-3)}, [0, 1.01, NAN, NAN]),
+        (COUNTS, {"_FillValue": np.int16(-9), "valid_range": np.int16([0, 100])}, np.int16([0, -9, -9, -9])),
+        (COUNTS, {"valid_range": np.int16([0, 100])}, [0, NAN, NAN, NAN]),
+        (np.float32(COUNTS), {"_FillValue": np.float32(NAN), "missing_value": -3.0}, [0, 101, NAN, -9]),
     ],
-    ids=["unsigned", "least and most", "range", "two fills"],
+    ids=["unsigned", "least and most", "range", "two fills", "filled", "not filled", "floats"],
 )
-def test_netcdf_packing_is_decoded(tmp_path: Path, stored: Any, about: dict[str, Any], read: list[float]) -> None:
-    """Unsigned numbers, valid ranges and several fill values are decoded."""
+def test_netcdf_packing_is_decoded(tmp_path: Path, stored: Any, about: dict[str, Any], read: Any) -> None:
+    """Unsigned numbers, valid ranges and fill values are decoded; whole numbers with a fill value stay whole."""
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file["values"] = stored.reshape(1, 4, 1)
-        file["values"].attrs.update({"scale_factor": 0.01, **about})
-    np.testing.assert_allclose(open_cube(f"{tmp_path / 'a.nc'}:values").read(0, 1)[0, :, 0], read, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("stored", "about", "kind", "read"),
-    [
-        (np.int16, {"_FillValue": np.int16(-9), "valid_range": np.int16([0, 100])}, np.int16, [0, -9, -9, -9]),
-        (np.int16, {"valid_range": np.int16([0, 100])}, np.float32, [0, np.nan, np.nan, np.nan]),
-        (np.float32, {"_FillValue": np.float32("nan"), "missing_value": -3.0}, np.float32, [0, 101, np.nan, -9]),
-    ],
-)
-def test_values_out_of_valid_range_are_nodata(tmp_path: Path, stored: Any, about: Any, kind: Any, read: Any) -> None:
-    """Unscaled whole numbers stay whole if there is a fill value; else they become floats with NaN."""
-    with h5py.File(tmp_path / "a.nc", "w") as file:
-        file["values"] = stored([0, 101, -3, -9]).reshape(1, 4, 1)
         file["values"].attrs.update(about)
     cube = open_cube(f"{tmp_path / 'a.nc'}:values")
-    assert cube.dtype == kind
-    np.testing.assert_array_equal(cube.read(0, 1)[0, :, 0], read)
+    assert cube.dtype == (np.float32 if isinstance(read, list) else read.dtype)
+    np.testing.assert_allclose(cube.read(0, 1)[0, :, 0], read, rtol=1e-6 if "scale_factor" in about else 0)

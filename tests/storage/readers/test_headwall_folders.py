@@ -14,20 +14,17 @@ from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import times_of_lines
 from storage.readers.envi_files import load_frame_index
 from storage.readers.open_cubes import open_cube
+from tests.storage.readers.test_envi_cubes import write_envi
 
 DROPPED = "1 frames between the first and the last were dropped by the camera"
-NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
+NM = {"wavelength_units": "nm", "wavelength": "{\n400.0\n,500.0\n,600.0\n}"}
+NO_NM = dict.fromkeys(NM)
 
 
-def write_part(folder: Path, name: str, values: NDArray[Any], *, lines: int | None = None, more: str = NM) -> None:
+def write_part(folder: Path, name: str, values: NDArray[Any], **fields: object) -> None:
     """Write (line, sample, band) values as the camera does: BIL without a file ending, the header beside it."""
     folder.mkdir(exist_ok=True)
-    promised = len(values) if lines is None else lines
-    (folder / f"{name}.hdr").write_text(
-        f"ENVI\n;Exposure (ms) = 4.5\nsamples = {values.shape[1]}\nlines = {promised}\nbands = {values.shape[2]}\n"
-        f"header offset = 0\nfile type = ENVI Standard\ndata type = 12\ninterleave = bil\nbyte order = 0\n{more}"
-    )
-    (folder / name).write_bytes(values.transpose(0, 2, 1).tobytes())
+    write_envi(folder / name, values, **{";Exposure (ms)": 4.5, "file type": "ENVI Standard", **NM, **fields})
 
 
 @pytest.fixture
@@ -86,8 +83,8 @@ def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) ->
 def test_references_are_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """Dark and white frames are averaged over their lines, in any letter case; the argument `dark` has priority."""
     write_part(tmp_path, "raw_0", lines)
-    write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), more="")
-    write_part(tmp_path, "WhiteReference_01", lines[5:6], more="")
+    write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), **NO_NM)
+    write_part(tmp_path, "WhiteReference_01", lines[5:6], **NO_NM)
     source = open_cube(tmp_path)
     np.testing.assert_array_equal(source.dark, lines[1])
     np.testing.assert_array_equal(source.white, lines[5])
@@ -99,10 +96,10 @@ def test_references_are_found_by_name(tmp_path: Path, lines: NDArray[np.uint16])
 def test_unsuitable_references_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A frame that does not fit the cube is refused, and so are two of a kind."""
     write_part(tmp_path, "raw_0", lines)
-    write_part(tmp_path, "darkReference", lines[:1, :2], more="")
+    write_part(tmp_path, "darkReference", lines[:1, :2], **NO_NM)
     with pytest.raises(SceneError, match=r"dark frame is \(2, 3\) \(sample, band\), .* is \(4, 3\)"):
         open_cube(tmp_path)
-    write_part(tmp_path, "darkReference_2", lines[:1], more="")
+    write_part(tmp_path, "darkReference_2", lines[:1], **NO_NM)
     with pytest.raises(SceneError, match=r"several dark frames .* name one with --dark"):
         open_cube(tmp_path)
     assert open_cube(tmp_path, dark=tmp_path / "darkReference_2.hdr").dark is not None

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 from pyproj import Transformer
@@ -16,6 +15,7 @@ from flows.training.data import load_data_set
 from flows.training.init_command import draft_scene
 from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file, open_scene_file
+from tests.storage.readers.test_raster_tags import write as write_bands
 
 WEST = 600_000.0
 NORTH = 5_700_000.0
@@ -28,12 +28,8 @@ SOUTH_UP = Affine(1, 0, WEST, 0, 1, NORTH - SIDE)
 
 def write(path: Path, values: NDArray[Any], transform: Affine = NORTH_UP, crs: Any = 32632, **about: Any) -> Path:
     """Write a GeoTIFF of (y, x) or (y, x, band) values, and return its path."""
-    planes = np.moveaxis(np.atleast_3d(values), -1, 0)
-    count, height, width = planes.shape
-    kind = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype}
     place = {"crs": crs, "transform": transform} if crs else {}
-    with rasterio.open(path, "w", photometric="MINISBLACK", **kind, **place, **about) as file:
-        file.write(planes)
+    write_bands(path, np.moveaxis(np.atleast_3d(values), -1, 0), **place, **about).close()
     return path
 
 

@@ -18,6 +18,7 @@ from flows.training.init_command import draft_scene, run_init
 from pipeline.errors import SceneError
 from storage.readers.scene_files import load_scene_file
 from tests.conftest import QUIET
+from tests.storage.readers.test_raster_tags import write
 
 pytestmark = pytest.mark.filterwarnings("ignore:'crs' was not provided")
 PLACE = Affine(2, 0, 400_000, 0, -2, 5_700_000)
@@ -34,8 +35,7 @@ def scene(folder: Path, name: str = "field.tif", place: Affine | None = PLACE) -
     path = folder / name
     path.parent.mkdir(exist_ok=True)
     known: dict[str, Any] = {} if place is None else {"crs": "EPSG:32632", "transform": place}
-    with rasterio.open(path, "w", "GTiff", SHAPE[1], SHAPE[0], 2, dtype="uint8", **known) as file:
-        file.write(np.arange(240, dtype=np.uint8).reshape(2, *SHAPE))
+    with write(path, np.arange(240, dtype=np.uint8).reshape(2, *SHAPE), **known) as file:
         file.descriptions = ["500 nm", "600 nm"]
     return path
 
@@ -126,8 +126,7 @@ def test_labels_are_found_by_their_names(name: str, tmp_path: Path) -> None:
     found = load_scene_file(image)
     assert found.labels_found
     np.testing.assert_array_equal(found.labels, TRUTH)
-    with rasterio.open(tmp_path / "field_mask.tif", "w", "GTiff", SHAPE[1], SHAPE[0], 1, dtype="uint8") as file:
-        file.write(np.ones((1, *SHAPE), np.uint8))
+    write(tmp_path / "field_mask.tif", np.ones((1, *SHAPE), np.uint8)).close()
     assert load_scene_file(image).class_names == ("class_1",)
 
 
@@ -145,8 +144,7 @@ def test_scenes_of_a_folder_share_their_classes(tmp_path: Path) -> None:
         "oats": (2, 30),
         "wheat": (3, 40),
     }
-    with rasterio.open(tmp_path / "c_mask.tif", "w", "GTiff", SHAPE[1], SHAPE[0], 1, dtype="uint8") as file:
-        file.write(np.ones((1, *SHAPE), np.uint8))
+    write(tmp_path / "c_mask.tif", np.ones((1, *SHAPE), np.uint8)).close()
     scene(tmp_path, "c.tif")
     with pytest.raises(SceneError, match=r"some labels are polygons .* and some are pictures"):
         _ = load_data_set(tmp_path).classes

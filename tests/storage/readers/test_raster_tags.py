@@ -30,8 +30,8 @@ NM = [450.0, 550.0, 660.5, 800.0]
 def write(path: Path, values: Any = VALUES, **profile: Any) -> rasterio.io.DatasetWriter:
     """Return an open GeoTIFF of (band, y, x) values, to which metadata can be added."""
     count, height, width = values.shape
-    known = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype.name}
-    file = rasterio.open(path, "w", photometric="MINISBLACK", **known, **profile)
+    size = {"count": count, "height": height, "width": width, "dtype": values.dtype.name}
+    file = rasterio.open(path, "w", **{"driver": "GTiff", "photometric": "MINISBLACK", **size, **profile})
     file.write(values)
     return file
 

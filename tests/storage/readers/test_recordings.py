@@ -177,19 +177,7 @@ def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.read(0, 38), cube.read(42, 80))
 
 
-def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields: object) -> None:
-    """Write an ENVI cube in BIL whose header has the given fields."""
-    lines, samples, bands = values.shape
-    code = {"u2": 12, "u1": 1, "i2": 2, "f4": 4}[values.dtype.str[1:]]
-    said: dict[str, object] = {
-        **{"samples": samples, "lines": lines, "bands": bands, "data type": code, "interleave": "bil"},
-        **{"byte order": 0, "wavelength units": "nm"},
-        "wavelength": "{" + ", ".join(str(500 + 100 * band) for band in range(bands)) + "}",
-    }
-    said |= {key.replace("_", " "): one for key, one in fields.items()}
-    text = "".join(f"{key} = {value}\n" for key, value in said.items() if value is not None)
-    stem.with_name(stem.name + ".hdr").write_text("ENVI\n" + text)
-    stem.with_name(stem.name + ending).write_bytes(values.transpose(0, 2, 1).tobytes())
+write_envi_cube = partial(write_envi, wavelength_units="nm", wavelength="{500, 600, 700}")
 
 
 VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
@@ -269,9 +257,7 @@ def test_a_zarr_cube_of_other_programs_is_a_recording(tmp_path: Path, version: A
 def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
     """Parts are joined; timestamps, exposures and references of the folder are used."""
     for first, last in ((0, 4), (4, 6)):
-        write_envi_cube(tmp_path / f"raw_{first}", VALUES[first:last])
-        text = (tmp_path / f"raw_{first}.hdr").read_text().replace("ENVI\n", "ENVI\n;Exposure (ms) = 4.0\n")
-        (tmp_path / f"raw_{first}.hdr").write_text(text)
+        write_envi_cube(tmp_path / f"raw_{first}", VALUES[first:last], **{";Exposure (ms)": 4.0})
         rows = [f"{frame}\t{5000 + 10000 * frame}" for frame in range(first, last)]
         (tmp_path / f"frameIndex_{first}.txt").write_text("\n".join(["Frame#\tTimestamp", *rows]))
     write_envi_cube(tmp_path / "darkReference", np.full((2, 16, 3), 60, "<u2"))

@@ -14,6 +14,7 @@ from affine import Affine
 from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file, open_scene_file
+from tests.storage.readers.test_raster_tags import write
 
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}
 
@@ -37,8 +38,7 @@ def test_jpeg_2000_is_read(tmp_path: Path) -> None:
 
 def write_tiff(path: Path, scales: tuple[float, ...] | None = None, offsets: tuple[float, ...] = (0, 0)) -> Path:
     values = np.arange(24, dtype=np.int16).reshape(2, 3, 4) * 100
-    with rasterio.open(path, "w", "GTiff", 4, 3, 2, dtype="int16", nodata=0, photometric="MINISBLACK") as file:
-        file.write(values)
+    with write(path, values, nodata=0) as file:
         if scales is not None:
             file.scales, file.offsets = scales, offsets
     return path

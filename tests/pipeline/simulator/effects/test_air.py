@@ -114,15 +114,10 @@ def test_relief_sets_the_distance_of_each_row():
 BREEZE = Air(distance_m=30.0, wind_amplitude_m=0.02, wind_hz=1.0)
 
 
-def wind_shown(sweep: Sweep = SWEEP, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacement of all points by the breeze."""
-    return shown(BREEZE, sweep, WIND, seed)
-
-
 def test_wind_sway_matches_hand_calculation():
     """2 cm at 30 m are 6.3 px. At 1 Hz a line of 100 ms is a tenth of a period, up to 3.9 px per line."""
     assert sway_px(Rig(air=BREEZE)) == pytest.approx(6.3, abs=0.01)
-    along, scan = wind_shown()
+    along, scan = shown(BREEZE, SWEEP, WIND)
     assert np.hypot(along, scan).max() == pytest.approx(6.306, rel=0.01)
     moved = np.hypot(np.diff(along[:, 320]), np.diff(scan[:, 320])).max()
     assert 0.9 < moved / (2 * 6.306 * math.sin(0.1 * math.pi)) < 1.01
@@ -132,7 +127,7 @@ def test_wind_sway_matches_hand_calculation():
 def test_crop_sways_along_the_wind(along: str):
     """The motion follows the heading that is drawn for the survey, on the scene's own axes."""
     heading = survey_stream(0, WIND.name).uniform(0, 2 * math.pi, 2)[1]
-    first, second = wind_shown(replace(SWEEP, along=along))
+    first, second = shown(BREEZE, replace(SWEEP, along=along), WIND)
     right, down = (first, second) if along == "x" else (second, first)
     np.testing.assert_allclose(right * math.sin(heading), down * math.cos(heading), atol=1e-9)
     assert np.abs(right).max() == pytest.approx(6.306 * abs(math.cos(heading)), rel=0.02)
@@ -147,4 +142,4 @@ def test_all_sweeps_see_the_same_sway():
     across = replace(block, sweep=replace(line, name="other", along="y"))
     turned = WIND.displaced(across, *point[::-1], "exact")
     np.testing.assert_allclose(turned[::-1], seen)
-    assert not np.allclose(wind_shown(seed=3), wind_shown())
+    assert not np.allclose(shown(BREEZE, SWEEP, WIND, 3), shown(BREEZE, SWEEP, WIND))

@@ -73,23 +73,20 @@ def test_scene_in_focus_or_without_distance_has_no_defocus(distance: float | Non
     assert DEFOCUS.bound(steep_probe((1.0, 1.0)), rig).value == 0
 
 
-def keystone_rig_of(keystone_px: float) -> Rig:
-    """Return a rig with this keystone."""
-    return Rig(optics=Optics(keystone_px=keystone_px))
-
-
 @given(st.floats(0, 3), st.floats(400, 1000))
 def test_keystone_shift_is_linear_over_wavelength(keystone: float, nm: float):
     """The shift is -k/2 at 400 nm, 0 at 700 and k/2 at 1000; a band's shift does not depend on other bands."""
-    shift = keystone_shift(keystone_rig_of(keystone), np.array([400.0, 700.0, 1000.0, nm]))
+    rig = Rig(optics=Optics(keystone_px=keystone))
+    shift = keystone_shift(rig, np.array([400.0, 700.0, 1000.0, nm]))
     assert shift[:3] == pytest.approx([-keystone / 2, 0, keystone / 2])
     assert shift[3] == pytest.approx(keystone * (nm - 700) / 600, abs=1e-12)
-    assert keystone_shift(keystone_rig_of(keystone), np.array([nm])) == pytest.approx(shift[3])
+    assert keystone_shift(rig, np.array([nm])) == pytest.approx(shift[3])
 
 
 def test_keystone_shift_is_constant_beyond_the_spectrograph():
     """Bands of other sensors, outside of 400 to 1000 nm, are shifted like the first or last band."""
-    assert keystone_shift(keystone_rig_of(0.4), np.array([300.0, 2500.0])) == pytest.approx([-0.2, 0.2])
+    rig = Rig(optics=Optics(keystone_px=0.4))
+    assert keystone_shift(rig, np.array([300.0, 2500.0])) == pytest.approx([-0.2, 0.2])
 
 
 RENDERED_BLURS_NM = np.array([400.0, 600.0, 1000.0])

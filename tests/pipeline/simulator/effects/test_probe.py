@@ -60,7 +60,7 @@ def test_even_gains_do_not_change_the_spectral_slope():
 def test_errors_grow_with_the_light_over_its_noise():
     """Doubling the darkest 100 e-, with 402 e-^2 of fixed noise, turns an error of 1 unit into 2 sqrt(502 / 602)."""
     probe = even_probe()
-    fixed = fixed_variance(RIG)
+    fixed = fixed_variance(RIG.camera)
     assert error_growth(probe, RIG, None, 2.0) == pytest.approx(2 * np.sqrt((100 + fixed) / (200 + fixed)))
     assert error_growth(replace(probe, unit="dn"), RIG, None, 2.0) == 2.0
 
@@ -69,8 +69,9 @@ def test_shadow_counts_by_the_noise_within_it():
     """Half of 10,000 e- counts as 5,000 e- over the noise of 5,000 e-."""
     rig = Rig()
     growth = error_growth(even_probe(darkest_e=1e4), rig, GainRange.between(0.5, 1, 1), 1.0)
-    lost = 1e4 / np.sqrt(1e4 + fixed_variance(rig)) / 2 * growth
-    assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed_variance(rig)))
+    fixed = fixed_variance(rig.camera)
+    lost = 1e4 / np.sqrt(1e4 + fixed) / 2 * growth
+    assert lost == pytest.approx(5e3 / np.sqrt(5e3 + fixed))
 
 
 def test_spectral_slope_is_that_of_the_steeper_neighbour():
