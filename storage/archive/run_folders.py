@@ -82,7 +82,8 @@ class RunDraft:
         final = self.published
         with refusals(self._root, "write to the archive"):
             self._write_manifest(rests_on, facts)
-            (take_its_place if self.extends else rename_into_place)(self.folder, final)
+            put_in_place = take_its_place if self.extends else rename_into_place
+            put_in_place(self.folder, final)
         self._done = True
         if self.send is not None:
             self.send(f"runs/{self.id}")
