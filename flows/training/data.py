@@ -320,7 +320,8 @@ def open_training_data(
     if validation is None:
         validation = min(4, len(names) // 8)
     if validation >= len(names) and validation:
-        raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
+        of = counted(len(names), "scene")
+        raise SceneError(f"--validation {validation} leaves none of {of} to train on; take fewer")
     kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
     train = tuple(name for name in names if name not in kept)
     return TrainingData(

@@ -111,7 +111,7 @@ CASES = {
     "no steps": (2, TRAIN.replace("--steps 1", "--steps 0") + "apart", "--steps must be above 0"),
     "scenes of files": (2, TRAIN + "apart --scenes 3", "--scenes is for built-in scenes"),
     "no patch": (2, TRAIN + "apart --patch 0", "--patch must be above 0, got 0"),
-    "too many for validation": (1, TRAIN + "apart --validation 3", "leave none of 2 to train on"),
+    "too many for validation": (1, TRAIN + "apart --validation 3", "leaves none of 2 scenes to train on"),
     "band that is no number": (2, TRAIN + "apart --bands a", "whole numbers with commas, got 'a'"),
     "no -o": (2, "train apart", "--out requires an argument"),
     "hold-out of the farm": (2, "train farm -o new.safetensors --hold-out 1", "--hold-out is for scene files"),

@@ -27,16 +27,16 @@ def example(seed: int = 1) -> Example:
     return Example("e", columns.astype(np.float16), (columns[..., 0] > 0).astype(np.uint8), (32, 32))
 
 
-def test_killed_training_resumes_to_the_same_weights(tmp_path: Path) -> None:
+@pytest.mark.parametrize("deep", [False, True])
+def test_killed_training_resumes_to_the_same_weights(tmp_path: Path, deep: bool) -> None:
     """Started again after it was killed at step 5, training takes steps 5 and 6 and ends with the same weights."""
     file = tmp_path / "c"
     steps = []
-    undisturbed, _ = train(CONFIG, [example()], SHIFT, SETTINGS)
+    scenes = replace(CONFIG, deep=deep), [example()], SHIFT, SETTINGS
+    undisturbed, _ = train(*scenes)
     with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(5), checkpoint=file, keep_every_s=0)
-    again, summary = train(
-        CONFIG, [example()], SHIFT, SETTINGS, lambda now: steps.append(now.step), checkpoint=file, keep_every_s=99
-    )
+        train(*scenes, killed_after(5), checkpoint=file, keep_every_s=0)
+    again, summary = train(*scenes, lambda now: steps.append(now.step), checkpoint=file, keep_every_s=99)
     assert steps == [5, 6]
     assert summary["steps"] == 6
     for name, tensor in undisturbed.state_dict().items():
