@@ -165,7 +165,8 @@ def manifest_text(content: Mapping[str, Any]) -> str:
     def text(values: Mapping[str, Any]) -> str:
         return json.dumps(values, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
-    return text({**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()})
+    checksummed = {**content, "seal": hashlib.sha256(text(content).encode()).hexdigest()}
+    return text(checksummed)
 
 
 @cache
