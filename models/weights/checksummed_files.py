@@ -24,6 +24,7 @@ TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the t
 DAMAGED = (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError, RuntimeError)
 CHECKPOINT = "spectralzoom-checkpoint/2"
 REMEDY = "restore a copy of it, name another file, or move it elsewhere and train or measure it again"
+ANOTHER = "it is of another version; train anew: spectralzoom train DATASET -o FILE.safetensors, or name another file"
 
 
 def write_checksummed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -53,8 +54,8 @@ def refusing(path: Path) -> Iterator[None]:
         raise
     except DAMAGED as error:
         other = type(error) in (TypeError, RuntimeError)  # of sizes and layers that this version does not know
-        why = "it is of another version" if other else " ".join(str(error).split())[:300]
-        raise WeightsError(f"cannot read {path}: {why}; {REMEDY}") from error
+        why = ANOTHER if other else f"{' '.join(str(error).split())[:300]}; {REMEDY}"
+        raise WeightsError(f"cannot read {path}: {why}") from error
 
 
 def read_about(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:

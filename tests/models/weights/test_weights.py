@@ -97,7 +97,7 @@ def test_another_format_is_refused(saved: Path):
     ("changes", "words"),
     [
         ({"classes": 1}, "2 to 255 classes, got 1"),
-        ({"depth": 3}, "it is of another version"),
+        ({"depth": 3}, "it is of another version; train anew: spectralzoom train"),
         ({"dim": 32}, "it is of another version"),
         ({"columns": 7}, "a basis of 4 columns from 400 to 1000 nm, expected 7"),
         ({"layers": 10_000_000}, "layers of a segmenter must be at least 1 and at most 256"),
