@@ -176,8 +176,8 @@ class SecondPass:
 
 
 def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
-    """Return the exposure [ms] whose noise is the mean of that of lines of two exposures."""
-    return 1 / (first_fraction / first_ms + (1 - first_fraction) / later_ms)
+    """Return the exposure [ms] whose read noise is the mean, as a variance, of that of lines of two exposures."""
+    return float((first_fraction / first_ms**2 + (1 - first_fraction) / later_ms**2) ** -0.5)
 
 
 def every_nth(full: Sequence[Sweep], step: int = FIRST_STEP, exposure_ms: float | None = None) -> list[Sweep]:

@@ -189,7 +189,7 @@ def _runs(paths: Sequence[SweepPath], camera: LineCamera, grid: PixelGrid | None
             start_px=float(px[run[0]]),
             lines=len(run),
             step=int(apart[first]),
-            exposure_ms=float(1 / (1 / exposure_ms[part[run]]).mean()),  # with the mean noise of the lines
+            exposure_ms=float((exposure_ms[part[run]] ** -2.0).mean() ** -0.5),  # with the mean read noise of the lines
         )
         lines = InterlacedLines.of(sweep, [one.lines for one in parts], np.searchsorted(used, part[run]), number[run])
         usable, shift = (np.concatenate([getattr(one, name) for one in paths])[run] for name in ("usable", "shift_px"))

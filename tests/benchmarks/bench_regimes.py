@@ -57,6 +57,8 @@ OTHER = (  # light, fraction of interest, swaths, seconds, farms
     *((1.0, share, 8, 27.3, UNSEEN) for share in (1 / 16, 1.0)),
     *((light, 1 / 16, 8, seconds, UNSEEN) for light, seconds in ((1.0, 22.1), (1.0, 37.6))),
     *((0.25, 1 / 16, 8, seconds, UNSEEN) for seconds in (37.6, 58.2, 99.4)),
+    *((1.0, 1 / 8, 8, seconds, UNSEEN) for seconds in (22.1, 27.3, 37.6)),
+    *((0.25, 1 / 8, 8, seconds, UNSEEN) for seconds in (37.6, 58.2, 99.4)),
     *((1 / 16, share, 8, 181.8, farms) for share in (1 / 16, 1 / 4, 1.0) for farms in (SEEDS, UNSEEN)),
     *((1.0, 1 / 4, 8, seconds, (64, 65, 66)) for seconds in (21.0, 27.3)),
     *((1.0, share, 8, 58.0, SEEDS) for share in (1 / 16, 1.0)),

@@ -28,7 +28,7 @@ from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
-ATTENTION = Product("score", version=19, files=("attention.zarr", "plan.json"), by_weights=True)
+ATTENTION = Product("score", version=20, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
 @dataclass(frozen=True)

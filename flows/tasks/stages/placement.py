@@ -54,7 +54,7 @@ SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their 
 POINTING = Product("register", version=2, files=(REGISTRATION,))
 GEOLOCATION = Product("locate", version=4, files=(TIE_POINTS,))
 MOSAIC = Product("rectify", version=7, files=("mosaic.zarr",))
-MERGED = Product("rectify_fine", version=5, files=("mosaic.zarr",))
+MERGED = Product("rectify_fine", version=6, files=("mosaic.zarr",))
 MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores have less noise
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
