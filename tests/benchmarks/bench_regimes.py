@@ -215,7 +215,8 @@ def draw(measured: Sequence[Cell], picture: Path) -> None:
         axes.set_xlabel("interesting fraction of the field")
         for place, gain in enumerate(gains):
             y, x = divmod(place, len(SHARES))
-            axes.text(x, y, f"{gain:+.1f}", ha="center", va="center", color="white" if abs(gain) > 3 else "black")
+            text = f"{round(gain, 1) + 0.0:+.1f}"  # never -0.0
+            axes.text(x, y, text, ha="center", va="center", color="white" if abs(gain) > 3 else "black")
     panels[0].set_ylabel("light of a clear sky, capture time")
     figure.colorbar(image, ax=panels, label="mIoU over the best\nuniform scan [points]", shrink=0.7)
     figure.savefig(picture)
