@@ -17,9 +17,9 @@ from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing, memory_loads
+from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing, memory_loads, merged_ms
 from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
-from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between, merged_ms
+from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between
 from pipeline.planning.partial_scans import sweeps_of_runs
 from pipeline.planning.uniform_scans import (
     LOSS,
@@ -350,7 +350,8 @@ def choose_first_pass(
                 rest = lines_between(full, first, step=step)
                 rest_ms = longest_exposure(left_s, rest, layout.camera, layout.cost, shortest, longest)
                 if rest_ms is not None:
-                    scores.append(record.expected(step, merged_ms(first_ms, rest_ms, step / first_step))[MIOU])
+                    mean_ms = merged_ms((first_ms, rest_ms), (step, first_step - step))
+                    scores.append(record.expected(step, mean_ms)[MIOU])
             found.append(FirstPass(first_step, first_ms, max(scores)))
     best = max((one.expected for one in found), default=0.0)
     good = [one for one in found if one.expected >= best - LOSS]

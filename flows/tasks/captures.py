@@ -151,11 +151,10 @@ def _captured_elsewhere(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> s
         "sweeps": sweeps,
         "inputs": [ref.uri for ref in inputs],
     }
+    once = uuid4().hex  # the client repeats a request that got no answer: it starts no second capture
     try:
         run: Any = prefect_deployments.run_deployment(
-            survey.capture_deployment,
-            parameters=parameters,
-            idempotency_key=uuid4().hex,  # the client repeats a request without an answer: it starts no second capture
+            survey.capture_deployment, parameters=parameters, idempotency_key=once
         )
     except (prefect_exceptions.ObjectNotFound, ValueError):  # ValueError: no FLOW/NAME
         raise RigError(

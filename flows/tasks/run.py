@@ -335,9 +335,10 @@ class SurveyRun(CaptureRun):
         self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None
     ) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
-        asked, everything = self.settings, self.kept_patches
+        settings = self.settings
+        everything = self.kept_patches
         return {
-            "asked": {"macs": asked.macs, "least_gain": self.least_gain, "expected_loss": asked.expected_loss},
+            "asked": {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss},
             "patches": len(patch_index),
             "of_patches": len(everything),
             "multiply_adds": {

@@ -71,6 +71,11 @@ def exposing(camera: LineCamera, sweep: Sweep) -> LineCamera:
     return camera if sweep.exposure_ms in (None, camera.exposure_ms) else replace(camera, exposure_ms=sweep.exposure_ms)
 
 
+def merged_ms(exposure_ms: ArrayLike, weights: Sequence[float] | None = None) -> float:
+    """Return the exposure [ms] of lines of several exposures: its read noise is the mean of theirs, as a variance."""
+    return float(np.average(np.asarray(exposure_ms, np.float64) ** -2.0, weights=weights) ** -0.5)
+
+
 @dataclass(frozen=True)
 class CostModel:
     """Capture time of a plan. Values are assumed until measured on a rig; settings name their source."""

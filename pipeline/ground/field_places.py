@@ -196,9 +196,8 @@ class PosedField:
     @property
     def outline(self) -> BaseGeometry:
         seen = shapely.segmentize(self._seen(0.0), max(self.shape) / EDGE_PARTS)
-        return shapely.transform(
-            seen, lambda points: self.grid.frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1]))
-        )
+        frame = self.grid.frame
+        return shapely.transform(seen, lambda points: frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1])))
 
     def _seen(self, border_px: float) -> BaseGeometry:
         """Return the part of the field that the map reaches, (x, y) from its centre [px]."""

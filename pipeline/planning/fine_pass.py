@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing
+from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, merged_ms
 from pipeline.planning.coverage import some_lines
 from pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
@@ -150,7 +150,8 @@ class SecondPass:
             last = longest_exposure(self.seconds, every, self.camera, self.cost, shortest, longest)
             tried = {*np.geomspace(shortest, longest, EXPOSURES).round(1).tolist(), *([] if last is None else [last])}
             for exposure_ms in self.recorded_ms or sorted(tried):
-                mean_ms = merged_ms(first_ms, exposure_ms, step / first.step if self.interlaces else 0.0)
+                of_first = step / first.step if self.interlaces else 0.0
+                mean_ms = merged_ms((first_ms, exposure_ms), (of_first, 1 - of_first))
                 mean_ms = float(np.clip(mean_ms, shortest, longest))
                 if record.expected(step, mean_ms)[MIOU] >= least:
                     plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
@@ -173,11 +174,6 @@ class SecondPass:
     def _apart(self) -> int:
         """Return the distance of the lines that new ones lie between; 1 with pointing errors."""
         return self.first_pass[0].step if self.interlaces else 1
-
-
-def merged_ms(first_ms: float, later_ms: float, first_fraction: float) -> float:
-    """Return the exposure [ms] whose read noise is the mean, as a variance, of that of lines of two exposures."""
-    return float((first_fraction / first_ms**2 + (1 - first_fraction) / later_ms**2) ** -0.5)
 
 
 def every_nth(full: Sequence[Sweep], step: int = FIRST_STEP, exposure_ms: float | None = None) -> list[Sweep]:

@@ -150,6 +150,7 @@ def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int
     """Return the sizes of the blocks of raw lines of a tile, by sweep, block and samples."""
     blocks = {}
     for sweep, (one, scan_paths) in enumerate(zip(placed, tile.reach, strict=True)):
+        bands = one.signal.bands
         for (scan_path, _), near in zip(one.scan_paths, scan_paths, strict=True):
             knots = slice(0, 0) if near is None else near.knots(tile.rows)
             if near is None or knots.start == knots.stop:
@@ -157,9 +158,7 @@ def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int
             members = member_lines(scan_path, knots)
             held = held_samples(one.lines, near.samples)
             for number in line_blocks(slice(int(members.min()), int(members.max()) + 1)):
-                blocks[sweep, number, held.start, held.stop] = (
-                    BLOCK_LINES * (held.stop - held.start) * one.signal.bands * 2
-                )
+                blocks[sweep, number, held.start, held.stop] = BLOCK_LINES * (held.stop - held.start) * bands * 2
     return blocks
 
 

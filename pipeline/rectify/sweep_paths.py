@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, exposing
+from pipeline.geometry.scan import Sweep, exposing, merged_ms
 from pipeline.rectify.placed import PixelGrid, PlacedSweep, place
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.scan_paths import LineNumbers, number_lines
@@ -189,7 +189,7 @@ def _runs(paths: Sequence[SweepPath], camera: LineCamera, grid: PixelGrid | None
             start_px=float(px[run[0]]),
             lines=len(run),
             step=int(apart[first]),
-            exposure_ms=float((exposure_ms[part[run]] ** -2.0).mean() ** -0.5),  # with the mean read noise of the lines
+            exposure_ms=merged_ms(exposure_ms[part[run]]),
         )
         lines = InterlacedLines.of(sweep, [one.lines for one in parts], np.searchsorted(used, part[run]), number[run])
         usable, shift = (np.concatenate([getattr(one, name) for one in paths])[run] for name in ("usable", "shift_px"))

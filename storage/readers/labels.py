@@ -254,9 +254,8 @@ def _index(
     values, inverse = np.unique(codes, return_inverse=True)
     table = {_code(value): index for index, value in enumerate(classes.values())}
     if none is not None and none in table:
-        raise SceneError(
-            f"scene.toml has {_shown(none, classes)} as unlabelled and as class {tuple(classes)[table[none]]}; keep one"
-        )
+        name = tuple(classes)[table[none]]
+        raise SceneError(f"scene.toml has {_shown(none, classes)} as unlabelled and as class {name}; keep one")
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, NO_VALUE)]
     if unknown:
         count = int((codes == unknown[0]).sum())

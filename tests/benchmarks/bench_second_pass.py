@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from flows.survey_command import run_survey
-from pipeline.geometry.scan import exposing
-from pipeline.planning.fine_pass import FinePlan, SecondPass, merged_ms
+from pipeline.geometry.scan import exposing, merged_ms
+from pipeline.planning.fine_pass import FinePlan, SecondPass
 from pipeline.planning.uniform_scans import ScanPerformance
 
 CASES = ((1.0, 22.1, 1 / 16), (1.0, 22.1, 1 / 8), (0.25, 58.2, 1 / 8))  # light, seconds, fraction of interest
@@ -47,7 +47,7 @@ def compare(second: SecondPass, record: ScanPerformance, gain_of: Gains) -> Fine
     gains, times = [], []
     for step in (1, 2):
         for exposure_ms in np.geomspace(shortest, longest, EXPOSURES):
-            mean_ms = merged_ms(first_ms, exposure_ms, step / first.step)
+            mean_ms = merged_ms((first_ms, exposure_ms), (step, first.step - step))
             gains.append(
                 second.rows.sums(np.fmax(gain_of(step, float(np.clip(mean_ms, shortest, longest))), 0)).ravel()
             )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from models.network.photo_stem import NormedConv, PhotoStem
 from models.network.segmenter import Segmenter
 from models.network.sizes import PLANES, SegmenterConfig
-from models.weights.files import load_encoder
+from models.weights.files import load_encoder, load_weights, save_weights
+from tests.models.conftest import make_weights
 
 
 @pytest.mark.parametrize(("kernel", "stride", "seen"), [(3, 1, (3, 5)), (3, 2, (4, 6)), (5, 1, (2, 6)), (5, 2, (3, 7))])
@@ -45,3 +48,19 @@ def test_colours_are_the_last_middle_and_first_column(columns: int) -> None:
     assert torch.equal(weight.sum(dim=1), torch.full((3,), 0.5))
     places = (weight[:, :columns] * torch.arange(columns)).sum(dim=1) / 0.5
     torch.testing.assert_close(places, torch.tensor([columns - 1, (columns - 1) / 2, 0.0]))
+
+
+def test_batch_norms_are_stored(tmp_path: Path) -> None:
+    """Weights read from a file have the means and variances of a training, and so the same overview."""
+    weights = make_weights(columns=2, patch=32, deep=True)
+    for name, tensor in weights.segmenter.state_dict().items():
+        if name.endswith("running_var"):
+            tensor.fill_(0.5)
+    save_weights(weights, tmp_path / "a.safetensors")
+    image = torch.randn(1, 2 + PLANES, 32, 32)
+    with torch.no_grad():
+        before, after = (
+            one.segmenter.eval().read_overview(image) for one in (weights, load_weights(tmp_path / "a.safetensors"))
+        )
+    assert torch.equal(before.logits, after.logits)
+    assert torch.equal(before.features, after.features)

@@ -260,12 +260,15 @@ def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
     torch.testing.assert_close(alone[0][0, :, 8, 8], told)
 
 
-def test_halfway_network_has_the_mean_of_each_weight() -> None:
-    """Both networks themselves stay as they are."""
-    one, other = (Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2)) for _ in range(2))
-    before = [parameter.clone() for parameter in (*one.parameters(), *other.parameters())]
+@pytest.mark.parametrize("deep", [False, True])
+def test_halfway_network_has_the_mean_of_each_weight(deep: bool) -> None:
+    """The means and variances of batch norms are those of both too; both networks themselves stay as they are."""
+    one, other = (Segmenter(replace(DEEP, deep=deep)) for _ in range(2))
+    for norm in (one for one in other.modules() if isinstance(one, torch.nn.BatchNorm2d)):
+        norm.running_mean.fill_(3.0)
+    before = [tensor.clone() for tensor in (*one.state_dict().values(), *other.state_dict().values())]
     for middle, first, second in zip(
-        *(net.parameters() for net in (training.halfway(one, other), one, other)), strict=True
+        *(net.state_dict().values() for net in (training.halfway(one, other), one, other)), strict=True
     ):
-        torch.testing.assert_close(middle, (first + second) / 2)
-    assert all(map(torch.equal, before, (*one.parameters(), *other.parameters())))
+        torch.testing.assert_close(middle, ((first + second) / 2).to(middle.dtype))
+    assert all(map(torch.equal, before, (*one.state_dict().values(), *other.state_dict().values())))

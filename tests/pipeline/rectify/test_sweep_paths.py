@@ -73,7 +73,7 @@ def test_later_lines_and_first_pass_lines_become_one_sweep(step: int) -> None:
     wanted = Sweep("run", "fine", "x", 0.0, -20.0, len(here), step, held=1)
     np.testing.assert_allclose(run.position, line_positions(wanted, CAMERA), atol=1e-12)
     first = np.isin(here, FIRST[0].line_px())
-    assert run.sweep.exposure_ms == pytest.approx(np.where(first, 50.0**-2, 100.0**-2).mean() ** -0.5)
+    assert run.sweep.exposure_ms == pytest.approx((first.mean() / 50.0**2 + (1 - first.mean()) / 100.0**2) ** -0.5)
 
 
 def test_a_run_that_repeats_first_pass_lines_stays_a_separate_sweep() -> None:
