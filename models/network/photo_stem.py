@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
+from models.network.layers import pointwise
 from models.network.sizes import PHOTO_FIRST, PHOTO_STAGES, PLANES
 
 EPSILON = 1e-3  # of its batch norms
@@ -22,7 +23,8 @@ class NormedConv(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups, bias=False)
+        filters = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups, bias=False)
+        self.conv = pointwise(inputs, outputs, bias=False) if kernel == 1 else filters
         self.norm = nn.BatchNorm2d(outputs, EPSILON)
         self.before, self.after = (kernel - stride) // 2, (kernel - stride + 1) // 2
 
@@ -56,8 +58,8 @@ class PhotoStem(nn.Module):
 
     def __init__(self, inputs: int, widths: list[int]) -> None:
         super().__init__()
-        self.enter = nn.Conv2d(inputs, widths[0], 1)
-        self.colours = nn.Conv2d(inputs, 3, 1)
+        self.enter = pointwise(inputs, widths[0])
+        self.colours = pointwise(inputs, 3)
         self.first = NormedConv(3, PHOTO_FIRST, 3, 2)
         stages, before = [], PHOTO_FIRST
         for channels, kernel, stride, ratio, blocks in PHOTO_STAGES:
@@ -66,9 +68,9 @@ class PhotoStem(nn.Module):
             before = channels
         self.stages = nn.ModuleList(stages)
         self.sides = nn.ModuleList(
-            nn.Conv2d(stage[0], width, 1) for stage, width in zip(PHOTO_STAGES, widths[1:], strict=False)
+            pointwise(stage[0], width) for stage, width in zip(PHOTO_STAGES, widths[1:], strict=False)
         )
-        self.low = nn.Conv2d(before, widths[-1], 1)
+        self.low = pointwise(before, widths[-1])
         columns = inputs - PLANES
         with torch.no_grad():  # red, green and blue: the last, the middle and the first column
             places = torch.linspace(columns - 1, 0, 3)[:, None]

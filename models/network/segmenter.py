@@ -19,8 +19,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
+from models.network.layers import mean_around, pointwise
 from models.network.photo_stem import PhotoStem
-from models.network.sizes import AROUND_PX, BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
+from models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
 from pipeline.errors import ShapeError
 
 LONGEST_PERIOD = 128.0  # cells of a token; the shortest is 2
@@ -106,14 +107,6 @@ def joined(patches: Tensor, columns: int) -> Tensor:
     return cells.reshape(b, c, n // columns * p, columns * p)
 
 
-def mean_around(image: Tensor) -> Tensor:
-    """Return means of up to ``AROUND_PX`` x ``AROUND_PX`` neighbours of each pixel, (B, c, y, x)."""
-    reach = AROUND_PX // 2
-    for size, padding in (((AROUND_PX, 1), (reach, 0)), ((1, AROUND_PX), (0, reach))):  # faster than both at once
-        image = F.avg_pool2d(image, size, 1, padding, count_include_pad=False)
-    return image
-
-
 class ChannelNorm(nn.Module):
     """Root-mean-square norm over the channels of each pixel, (P, c, y, x)."""
 
@@ -144,7 +137,7 @@ class Stem(nn.Module):
 
     def __init__(self, inputs: int, widths: list[int]) -> None:
         super().__init__()
-        self.enter = nn.Conv2d(inputs, widths[0], 1)
+        self.enter = pointwise(inputs, widths[0])
         self.blocks = nn.ModuleList(map(Residual, widths))
         self.down = nn.ModuleList(nn.Conv2d(upper, lower, 2, stride=2) for upper, lower in pairwise(widths))
 
@@ -165,7 +158,7 @@ class Head(nn.Module):
 
     def __init__(self, widths: list[int], deep: bool = False) -> None:
         super().__init__()
-        self.up = nn.ModuleList(nn.Conv2d(lower, 4 * upper, 1) for upper, lower in pairwise(widths))
+        self.up = nn.ModuleList(pointwise(lower, 4 * upper) for upper, lower in pairwise(widths))
         self.blocks = nn.ModuleList(
             nn.Identity() if deep and not level else Residual(width) for level, width in enumerate(widths[:-1])
         )
@@ -200,7 +193,7 @@ class Segmenter(nn.Module):
         self.encoder = Encoder(config.dim, config.layers, config.heads, config.mlp_ratio)
         self.from_token = nn.Conv2d(config.dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths, config.deep)
-        self.overview_classes = nn.Conv2d(config.overview_width, config.classes, 1)
+        self.overview_classes = pointwise(config.overview_width, config.classes)
         self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier that the U-Net corrects
         widths = level_widths(config.width, config.patch)
         self.full_stem = Stem(inputs + config.overview_width, widths)
@@ -242,9 +235,9 @@ class Segmenter(nn.Module):
             read[:, valid] = self.encoder(tokens[:, valid])
         features[-1] = features[-1] + F.pixel_shuffle(self.from_token(read.transpose(1, 2).reshape(grid.shape)), BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
-        columns = image[:, : self.config.columns].permute(0, 2, 3, 1)
+        spectral = F.pad(self.spectral.weight, (0, 0, 0, 0, 0, PLANES))
         # the mean of the logits is that of the mean spectrum
-        alone = mean_around(F.linear(columns, self.spectral.weight.flatten(1), self.spectral.bias).permute(0, 3, 1, 2))
+        alone = mean_around(F.conv2d(image, spectral, self.spectral.bias, dilation=2))
         return Overview(drawn, self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width])
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:

@@ -94,7 +94,7 @@ class TemporalSizes:
 
 @dataclass(frozen=True)
 class MultiplyAdds:
-    """Multiply-adds of one survey's segmentation. Norms, activations, softmax and interpolation count as 0."""
+    """Multiply-adds of one survey's segmentation. Norms, means, activations, softmax and interpolation count as 0."""
 
     overview: int  # of every pixel
     score: int  # the policy (`models.policies.policies.score_multiply_adds`)

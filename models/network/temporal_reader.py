@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
+from models.network.layers import pointwise
 from models.network.sizes import CELL_PX, GATES, OTHERS, TemporalSizes
 
 FAINT = 10.0  # least log-probability of the inputs, negated
@@ -21,7 +22,7 @@ class Separable(nn.Sequential):
     """A separable convolution: 1 x 1 across channels, then 3 x 3 within each (Howard et al., MobileNets, 2017)."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__(nn.Conv2d(inputs, outputs, 1), nn.Conv2d(outputs, outputs, 3, padding=1, groups=outputs))
+        super().__init__(pointwise(inputs, outputs), nn.Conv2d(outputs, outputs, 3, padding=1, groups=outputs))
 
 
 class TemporalReader(nn.Module):
@@ -35,7 +36,7 @@ class TemporalReader(nn.Module):
         self.coarse_leave = Separable(width, sizes.coarse_width)
         self.enter = Separable(2 * sizes.classes + OTHERS + sizes.coarse_width, width)
         self.middle = Separable(width, width)
-        self.leave = nn.Conv2d(width, sizes.classes + GATES, 1)
+        self.leave = pointwise(width, sizes.classes + GATES)
         for start in self.leave.parameters():
             nn.init.zeros_(start)
         self.gates = nn.Parameter(torch.tensor(STARTS))
@@ -72,7 +73,7 @@ class TemporalReader(nn.Module):
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (prior_map, today)]
         known = rests_on.clamp(min=LEAST_LIGHT).log() / 2
         inputs = [*scaled, seen, torch.log1p(age) / 2, known, taken.expand(-1, -1, *prior_map.shape[-2:]), below]
-        features = F.gelu(self.enter(torch.cat(inputs, dim=1)))
+        features = F.gelu(self.enter(torch.cat(inputs, dim=1).contiguous(memory_format=torch.channels_last)))
         wider = self.middle(F.avg_pool2d(features, CELL_PX))
         features = F.gelu(features + F.interpolate(wider, scale_factor=float(CELL_PX), mode="nearest"))
         added, gates = self.leave(features).split([self.sizes.classes, GATES], dim=1)

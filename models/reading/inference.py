@@ -289,7 +289,8 @@ def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
     valid = None if coarse_pass.valid_tokens is None else torch.from_numpy(coarse_pass.valid_tokens).to(network.device)
     patches = TOKEN_PX / coarse_pass.grid.patch  # of a token
     origin = torch.tensor([coarse_pass.origin], dtype=torch.float64) / patches
-    return network.read_overview(torch.from_numpy(image[None]).permute(0, 3, 1, 2).to(network.device), origin, valid)
+    # numpy's image[None] has a stride of 0, with which torch copies the image in every first layer
+    return network.read_overview(torch.from_numpy(image)[None].permute(0, 3, 1, 2).to(network.device), origin, valid)
 
 
 def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:

@@ -246,7 +246,7 @@ def _finite(values: Floats) -> NDArray[np.bool_]:
 def _image(values: NDArray[np.generic]) -> Tensor:
     """Return (y, x) or (y, x, channel) as a batch of one image, (1, channel, y, x)."""
     deep = values[..., None] if values.ndim == 2 else values
-    return torch.from_numpy(np.ascontiguousarray(deep[None], np.float32)).permute(0, 3, 1, 2)
+    return torch.from_numpy(np.ascontiguousarray(deep, np.float32))[None].permute(0, 3, 1, 2)
 
 
 @dataclass(frozen=True)

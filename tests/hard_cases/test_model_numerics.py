@@ -110,7 +110,7 @@ def test_5_map_without_patches_is_the_overview():
     """With K = 0 training's forward pass, the overview and the survey's map come from the same logits, bit by bit."""
     weights = plain_weights()
     seen = coarse_prediction_of_columns(weights, noise(0, 48, 64, 4).numpy(), SceneGrid(48, 64, 8))
-    image = torch.from_numpy(with_planes(seen.columns, LineSpec())).permute(2, 0, 1)[None]
+    image = torch.from_numpy(with_planes(seen.columns, LineSpec()))[None].permute(0, 3, 1, 2)
     model = weights.segmenter
     logits, patches = read_both(model, image, image, NONE, PLACE)
     whole = model.composite(logits, patches, NONE)
