@@ -32,7 +32,7 @@ from models.policies.placement import CONTROL_FRACTION, ReadTwice, placement_fig
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.train import LabelledPixels, halfway, with_discriminants
+from models.training.train import LabelledPixels, halfway, with_linear
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
@@ -159,20 +159,20 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.ui
 
 FEW_PIXELS = 50_000  # labelled pixels of a training, below which no reading is reliably the best
 WITH_START = "mean with --start"
-READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear discriminants": 0.0})  # network's fraction
+READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear classifier": 0.0})  # network's fraction
 
 
 def better_reading(
     weights: Weights, start: Mapping[str, Any], validation: Sequence[Example], *, few: bool, begun: Weights | None
 ) -> tuple[Weights, dict[str, Any]]:
-    """Choose between the trained network, its initial linear discriminants and the mean of their logits.
+    """Choose between the trained network, its initial linear classifier and the mean of their logits.
 
     A training from weights, ``begun``, also has the mean of both networks. With ``few`` labelled pixels the mean of the
     logits is kept, as few validation pixels cannot tell. Else it is the best by mIoU of the validation scenes; without
     one it is the mean of both networks, or the network. Returns the weights, and all scores.
     """
     readings = {
-        name: replace(weights, segmenter=with_discriminants(weights.segmenter, start, fraction))
+        name: replace(weights, segmenter=with_linear(weights.segmenter, start, fraction))
         for name, fraction in READINGS.items()
     }
     if begun is not None:
@@ -199,7 +199,7 @@ def judge_baselines(
     """Return the mIoU of LDA, logistic regression and a random forest on the same pixels of validation scenes.
 
     Without such scenes they learn from a random half of the training pixels, and the other half judges them. Features
-    are those of `linear_discriminants`. None with a single class, or if each has one pixel to learn from.
+    are those of `linear_classifier`. None with a single class, or if each has one pixel to learn from.
     """
     rng = np.random.default_rng([seed, 0xBA5])
     learnt = LabelledPixels.drawn(train, rng)

@@ -32,7 +32,7 @@ from models.policies.placement import CascadeTable
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.ood_fit import fit_ood
-from models.training.train import PIXELS, LabelledPixels, linear_discriminants, train
+from models.training.train import PIXELS, LabelledPixels, linear_classifier, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
@@ -183,7 +183,7 @@ def _learned(
     rng = np.random.default_rng([0x1DA])
     augmentation = training_capture(normalisation, settings.darkest_ms)
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
-    start = linear_discriminants(pixels, config.classes) | (load_encoder() if config.deep else {})
+    start = linear_classifier(pixels, config.classes) | (load_encoder() if config.deep else {})
     model, summary = train(
         config,
         examples,

@@ -238,7 +238,7 @@ class Segmenter(nn.Module):
         spectral = F.pad(self.spectral.weight, (0, 0, 0, 0, 0, PLANES))
         # the mean of the logits is that of the mean spectrum
         alone = mean_around(F.conv2d(image, spectral, self.spectral.bias, dilation=2))
-        return Overview(drawn, self.overview_classes(F.gelu(drawn)) + alone[:, :, :height, :width])
+        return Overview(drawn, self.overview_classes(F.gelu(drawn)).add_(alone[:, :, :height, :width]))
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
         """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""

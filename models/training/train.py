@@ -1,4 +1,4 @@
-"""Train the segmenter on crops, from linear discriminants of mean spectra, with averaged weights and checkpoints."""
+"""Train the segmenter on crops, from a linear classifier of mean spectra, with averaged weights and checkpoints."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import numpy as np
 import scipy
 import torch
 from numpy.typing import NDArray
+from sklearn.base import clone
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.linear_model import LogisticRegression
 from torch import Tensor, nn
 
 from models.network.machine import PROCESSOR, give_back_freed_memory, keep_freed_memory
@@ -32,8 +34,10 @@ from pipeline.geometry.grid import UNLABELLED
 KEEP_EVERY_S = 120.0  # between checkpoints
 FREED_EVERY = 50  # steps: crops of several sizes leave gaps of 9 MB a step in kept memory
 PIXELS = 60_000  # to fit classifiers to, of all scenes together
-CAPTURES = 16  # simulated for discriminants, of all scenes together or more
+CAPTURES = 16  # simulated for the linear classifier, of all scenes together or more
 ABSENT = -20.0  # logit of a class without a pixel
+# Their mean scores more than either (docs/measurements/accuracy.md); the regression has a weak penalty.
+LINEAR = (LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"), LogisticRegression(C=10.0, max_iter=200))
 KNOWN = ("overview_stem.first.", "overview_stem.stages.")  # parameters of large frames that ImageNet trained
 KNOWN_RATE = 0.3  # of the learning rate, for these
 NORM_BATCHES = 60  # over which the batch norms of the averaged weights are measured
@@ -214,8 +218,8 @@ class LabelledPixels:
     ) -> LabelledPixels:
         """Draw labelled pixels at random, about `PIXELS`, from each scene in proportion to its number.
 
-        With an ``augmentation`` scenes are captured as crops are. Discriminants of bright pixels have large logits, and
-        a training unlearns their errors on dark pixels for thousands of steps.
+        With an ``augmentation`` scenes are captured as crops are. A classifier of bright pixels has large logits, and
+        a training unlearns its errors on dark pixels for thousands of steps.
         """
         counts = [int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples]
         captures = 1 if augmentation is None else math.ceil(CAPTURES / len(examples))
@@ -233,15 +237,16 @@ class LabelledPixels:
         return LabelledPixels(np.concatenate(features), np.concatenate(labels))
 
     def brightened(self, gain_shift: NDArray[np.float32], rng: np.random.Generator) -> LabelledPixels:
-        """Vary the light of each pixel as that of crops: discriminants that rely on it would be unlearned first."""
+        """Vary the light of each pixel as that of crops: a classifier that relies on it would be unlearned first."""
         gain = rng.normal(1.0, BRIGHTNESS, (len(self.features), 1)).astype(np.float32)
         return LabelledPixels(self.features * gain + (gain - 1) * gain_shift, self.labels)
 
 
-def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]:
-    """Fit linear discriminants with shrinkage; return them as tensors of the segmenter's ``spectral`` layer.
+def linear_classifier(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]:
+    """Fit a linear classifier; return it as tensors of the segmenter's ``spectral`` layer.
 
-    A class without a pixel gets the logit `ABSENT`. With pixels of a single class all classes are equally likely.
+    Its logits are the means of those of linear discriminants with shrinkage and of a logistic regression. A class
+    without a pixel gets the logit `ABSENT`. With pixels of a single class all classes are equally likely.
     Raises SceneError: there are as few pixels as classes.
     """
     weight, bias = np.zeros((classes, pixels.features.shape[1])), np.full(classes, ABSENT)
@@ -250,24 +255,24 @@ def linear_discriminants(pixels: LabelledPixels, classes: int) -> dict[str, Tens
         raise SceneError(
             f"{len(pixels.labels)} labelled pixels of {len(known)} classes are too few; label more of each"
         )
+    bias[known] = 0.0
     if len(known) > 1:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Only one sample available", UserWarning)  # of a class of one pixel
-            fitted = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(pixels.features, pixels.labels)
-        slope, offset = fitted.coef_, fitted.intercept_
-        if len(known) == 2:  # one function separates both
-            slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
-        weight[known], bias[known] = slope, offset
-    else:
-        bias[...] = 0.0
+        for classifier in LINEAR:
+            with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a class of one pixel
+                fitted = clone(classifier).fit(pixels.features, pixels.labels)
+            slope, offset = fitted.coef_, fitted.intercept_
+            if len(known) == 2:  # one function separates both
+                slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
+            weight[known] += slope / len(LINEAR)
+            bias[known] += offset / len(LINEAR)
     return {
         "spectral.weight": torch.from_numpy(weight.astype(np.float32))[:, :, None, None],
         "spectral.bias": torch.from_numpy(bias.astype(np.float32)),
     }
 
 
-def with_discriminants(segmenter: Segmenter, start: Mapping[str, Tensor], fraction: float) -> Segmenter:
-    """Return a copy with a ``fraction`` of its own logits, and for the rest those of the discriminants ``start``."""
+def with_linear(segmenter: Segmenter, start: Mapping[str, Tensor], fraction: float) -> Segmenter:
+    """Return a copy with a ``fraction`` of its own logits, and for the rest those of a linear classifier ``start``."""
     mixed = copy.deepcopy(segmenter)
     with torch.no_grad():
         for name, own in mixed.spectral.named_parameters():

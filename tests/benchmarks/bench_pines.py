@@ -41,7 +41,7 @@ from models.network.spectral import SpectralBasis, patches_of
 from models.policies.policies import score_patches
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from models.training.examples import Example, electrons_of, measured_normalisation, normalised
-from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train, with_discriminants
+from models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train, with_linear
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -223,9 +223,9 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
     example = normalised(observed, normalisation, np.ones(basis.columns, bool))
     config = SegmenterConfig(split.classes, basis.columns, grid.patch)
     pixels = LabelledPixels.drawn([example], np.random.default_rng(0))
-    start = linear_discriminants(pixels.brightened(normalisation.gain_shift, np.random.default_rng(1)), split.classes)
+    start = linear_classifier(pixels.brightened(normalisation.gain_shift, np.random.default_rng(1)), split.classes)
     network, record = train(config, [example], normalisation.gain_shift, SETTINGS, start=start)
-    network = with_discriminants(network, start, READINGS["mean of both"])
+    network = with_linear(network, start, READINGS["mean of both"])
     weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
     patches = np.asarray(patches_of(example.columns, grid.patch), np.float32)
     return _judged("file", weights, coarse_prediction_of_columns(weights, example.columns, grid), patches, split.test)

@@ -1,6 +1,6 @@
 """Our network with a part of the patches read in full, against smaller full networks of equal multiply-adds.
 
-All have the same number of training steps, their own discriminants, and the same farms in full light; other farms test.
+All start from linear classifiers and have the same number of steps and the same farms in full light; other farms test.
 A step takes 1 s of one core; all patches score 82.6 with 400 steps, 89.9 with 1200. An accelerator takes 15 minutes.
 `python tests/benchmarks/bench_smaller.py 20` trains for 20 steps instead of `STEPS`.
 
@@ -35,7 +35,7 @@ from models.network.spectral import Normalisation
 from models.policies.placement import ReadTwice, run_controls
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
-from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
+from models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -72,7 +72,7 @@ def trained(asked: TrainRequest, scenes: Scenes, normalisation: Normalisation) -
     rng = np.random.default_rng([0x1DA])
     config = network_config(asked, common)
     shift = normalisation.gain_shift
-    start = linear_discriminants(LabelledPixels.drawn(examples, rng).brightened(shift, rng), config.classes)
+    start = linear_classifier(LabelledPixels.drawn(examples, rng).brightened(shift, rng), config.classes)
     model, summary = train(config, examples, shift, asked.settings, start=start, device=choose_device("auto"))
     print(config, summary, flush=True)
     weights = Weights(model, common.basis, normalisation, common.names, common.colours)

@@ -24,7 +24,7 @@ from flows.training.train_scenes import Common, TrainRequest, network_config
 from models.network.spectral import LineSpec, SpectralBasis
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
 from models.training.examples import measured_normalisation, normalised, observe
-from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_discriminants, train
+from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_classifier, train
 from models.weights.files import ENCODER, Weights, load_encoder, load_weights, save_weights
 from pipeline.errors import SceneError, WeightsError
 from pipeline.geometry.camera import LineCamera
@@ -85,7 +85,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
     common = Common(basis, first.class_names, first.class_colours, patch, first.wavelength_nm)
     config = network_config(TrainRequest(name, path, patch=patch), common)
-    start = linear_discriminants(LabelledPixels.drawn(examples, rng), config.classes)
+    start = linear_classifier(LabelledPixels.drawn(examples, rng), config.classes)
     if config.deep:
         start |= load_encoder()
 

@@ -145,13 +145,13 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
         assert name in shown.getvalue()
     record = describe_weights(out).record
     assert set(record["baselines"]) == {"LDA", "logistic regression", "random forest"}
-    assert set(record["readings"]["miou"]) == {"network", "mean of both", "linear discriminants"}
+    assert set(record["readings"]["miou"]) == {"network", "mean of both", "linear classifier"}
     beside = record["baselines"] | record["readings"]["miou"]
     assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in beside.items())
 
 
 @pytest.mark.parametrize(("few", "validation", "kept"), [(2000, 1, "mean of both"), (0, 1, None), (0, 0, "network")])
-def test_few_labels_give_the_mean_of_network_and_discriminants(
+def test_few_labels_give_the_mean_of_network_and_linear_classifier(
     folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch, few: int, validation: int, kept: str | None
 ) -> None:
     """With more labels the reading with the best validation score is kept; without validation scenes, the network."""

@@ -10,18 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from models.network.layers import mean_around
+from models.network.layers import AROUND_PX, mean_around
 from models.network.segmenter import Head, Segmenter, Stem, cut, joined
-from models.network.sizes import (
-    AROUND_PX,
-    CELL_PX,
-    PLANES,
-    TOKEN_PX,
-    SegmenterConfig,
-    TemporalSizes,
-    level_widths,
-    multiply_adds,
-)
+from models.network.sizes import CELL_PX, PLANES, TOKEN_PX, SegmenterConfig, TemporalSizes, level_widths, multiply_adds
 from models.network.temporal_reader import TemporalReader
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
@@ -126,7 +117,7 @@ def test_cut_and_joined_patches_make_the_image_again(rows: int, columns: int, pa
 )
 @pytest.mark.parametrize("width", [96, 104])  # with patches of 8 px, a part of the last tokens
 def test_multiply_adds_equal_the_counter(sizes: dict[str, int], patch_index: int, width: int) -> None:
-    """The closed form counts just what torch counts while the model runs, without means and weights that are always 0."""
+    """The closed form counts what torch counts while the model runs, less means and weights that are always 0."""
     config = SegmenterConfig(classes=5, columns=6, **sizes)
     grid = SceneGrid(64, width, config.patch)
     model = Segmenter(config).eval()

@@ -1,4 +1,4 @@
-"""Training: crops and patches, losses, skipped steps, discriminants, and equal weights from equal seeds."""
+"""Training: crops and patches, losses, skipped steps, linear classifiers, and equal weights from equal seeds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from models.training import train as training
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from models.training.examples import CropSampler
 from models.training.objective import PHASES, Phase, batch_loss, class_weights, draw_patches, map_loss, pixel_losses
-from models.training.train import LabelledPixels, TrainingSettings, linear_discriminants, train
+from models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import block_example, make_weights, read_both
@@ -193,40 +193,51 @@ def test_absent_classes_are_never_the_likeliest():
     """Two of three classes have pixels and are separated; the third has a logit of -20 everywhere."""
     labels = np.repeat(np.array([0, 2], np.uint8), 50)
     features = (np.random.default_rng(0).normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
-    found = linear_discriminants(LabelledPixels(features, labels), 3)
+    found = linear_classifier(LabelledPixels(features, labels), 3)
     logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
     assert (logits.argmax(axis=1) == labels).all()
     assert (logits[:, 1] == -20).all()
 
 
-def test_a_class_of_one_pixel_has_discriminants() -> None:
-    """All discriminants are finite, and the library gives no warning."""
+def test_few_very_bright_pixels_do_not_mislead_the_linear_classifier() -> None:
+    """Discriminants alone get 64 % of these pixels right; the logistic regression repairs them."""
+    labels = np.repeat(np.array([0, 1], np.uint8), 200)
+    features = np.random.default_rng(0).normal(0, 1, (400, 2)).astype(np.float32)
+    features[:, 0] += 4 * labels
+    features[380:, 0] += 60
+    found = linear_classifier(LabelledPixels(features, labels), 2)
+    logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
+    assert (logits.argmax(axis=1) == labels).mean() > 0.95
+
+
+def test_a_class_of_one_pixel_has_a_linear_classifier() -> None:
+    """All weights are finite, and the library gives no warning."""
     features = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
-    start = linear_discriminants(LabelledPixels(features, np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)), 3)
+    start = linear_classifier(LabelledPixels(features, np.repeat([0, 1, 2], [20, 19, 1]).astype(np.uint8)), 3)
     assert all(torch.isfinite(one).all() for one in start.values())
 
 
 def test_as_few_pixels_as_classes_are_refused() -> None:
     """The error counts both."""
     with pytest.raises(SceneError, match="2 labelled pixels of 2 classes are too few; label more of each"):
-        linear_discriminants(LabelledPixels(np.eye(2, dtype=np.float32), np.array([0, 2], np.uint8)), 3)
+        linear_classifier(LabelledPixels(np.eye(2, dtype=np.float32), np.array([0, 2], np.uint8)), 3)
 
 
-def test_discriminants_do_not_rely_on_brightness() -> None:
+def test_linear_classifiers_do_not_rely_on_brightness() -> None:
     """A feature that depends on brightness loses its weight; one that does not keeps it."""
     labels = np.repeat(np.array([0, 1], np.uint8), 500)
     features = (np.random.default_rng(0).normal(0, 0.1, (1000, 2)) + 1.5 * labels[:, None]).astype(np.float32)
     shift = np.array([100.0, 0.0], np.float32)  # twice the light moves the first feature by so much
     own = LabelledPixels(features, labels)
     weights = [
-        linear_discriminants(one, 2)["spectral.weight"][1, :, 0, 0].abs()
+        linear_classifier(one, 2)["spectral.weight"][1, :, 0, 0].abs()
         for one in (own, own.brightened(shift, np.random.default_rng(1)))
     ]
     assert weights[0][0] > 0.5 * weights[0][1]
     assert weights[1][0] < 0.05 * weights[1][1]
 
 
-def test_discriminants_are_fitted_to_dark_pixels() -> None:
+def test_linear_classifiers_are_fitted_to_dark_pixels() -> None:
     """Weights for dark crops are less than half of those for bright ones; scenes without known noise stay bright."""
     plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
     augmentation = CaptureAugmentation(plain, min_exposure_ms=3.0)
@@ -236,14 +247,14 @@ def test_discriminants_are_fitted_to_dark_pixels() -> None:
         LabelledPixels.drawn([scene], np.random.default_rng(0), how)
         for scene, how in ((noisy, None), (noisy, augmentation), (silent, augmentation))
     ]
-    bright, dark, same = (linear_discriminants(one, 3)["spectral.weight"].abs().max().item() for one in drawn)
+    bright, dark, same = (linear_classifier(one, 3)["spectral.weight"].abs().max().item() for one in drawn)
     assert dark < bright / 2
     assert same == pytest.approx(bright, rel=0.2)
     assert {len(one.labels) for one in drawn} == {64 * 64}
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5, 1.0])
-def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
+def test_logits_mix_with_those_of_the_linear_classifier(fraction: float) -> None:
     """The fraction applies to the overview and to patches; the network stays as it is."""
     own = Segmenter(SegmenterConfig(3, 4, patch=8, width=8, dim=16, layers=1, heads=2))
     with torch.no_grad():
@@ -252,7 +263,7 @@ def test_logits_mix_with_those_of_discriminants(fraction: float) -> None:
     start = {f"spectral.{name}": torch.randn_like(tensor) for name, tensor in own.spectral.named_parameters()}
     flat = torch.randn(1, 4 + PLANES, 1, 1)
     given = flat.expand(-1, -1, 32, 32), torch.randn(1, 4 + PLANES, 32, 32), torch.arange(16)[None]
-    nets = [training.with_discriminants(own, start, share) for share in (fraction, 0.0)]
+    nets = [training.with_linear(own, start, share) for share in (fraction, 0.0)]
     mixed, alone, whole = (read_both(net, *given, torch.zeros(1, 2)) for net in (*nets, own))
     for found, plain, full in zip(mixed, alone, whole, strict=True):
         torch.testing.assert_close(found, fraction * full + (1 - fraction) * plain, rtol=1e-4, atol=1e-3)
