@@ -9,12 +9,12 @@ from torch import Tensor, nn
 from models.network.sizes import AROUND_PX
 
 
-def pointwise(inputs: int, outputs: int, *, bias: bool = True) -> nn.Conv2d:
+def pointwise(inputs: int, outputs: int) -> nn.Conv2d:
     """Return a convolution of single pixels. Its dilation has no effect, but torch is 2 to 4 times as fast with it.
 
     Without a dilation one thread takes a matrix product of planes, for which it copies the image.
     """
-    return nn.Conv2d(inputs, outputs, 1, dilation=2, bias=bias)
+    return nn.Conv2d(inputs, outputs, 1, dilation=2)
 
 
 def mean_around(image: Tensor) -> Tensor:

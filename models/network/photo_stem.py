@@ -23,8 +23,8 @@ class NormedConv(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> None:
         super().__init__()
-        filters = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups, bias=False)
-        self.conv = pointwise(inputs, outputs, bias=False) if kernel == 1 else filters
+        dilation = 2 if kernel == 1 else 1  # as in `pointwise`
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, dilation=dilation, groups=groups, bias=False)
         self.norm = nn.BatchNorm2d(outputs, EPSILON)
         self.before, self.after = (kernel - stride) // 2, (kernel - stride + 1) // 2
 
