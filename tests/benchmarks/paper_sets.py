@@ -5,8 +5,6 @@ Networks that are trained here see the images of the paper's camera: area means 
 
 from __future__ import annotations
 
-import hashlib
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,8 +23,8 @@ from models.network.spectral import LineSpec, SpectralBasis
 from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
 from models.training.examples import measured_normalisation, normalised, observe
 from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_classifier, train
-from models.weights.files import ENCODER, Weights, load_encoder, load_weights, save_weights
-from pipeline.errors import SceneError, WeightsError
+from models.weights.files import Weights, load_encoder, load_weights
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, block_means
 from pipeline.lazy import Once
@@ -69,13 +67,8 @@ class PaperCaptures(CaptureAugmentation):
 
 
 def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: int, steps: int, say: Say) -> Weights:
-    """Train a network, or load it from the temporary folder if it is there."""
-    key = hashlib.sha256(repr((name, sorted(scenes), patch, steps, ENCODER)).encode()).hexdigest()[:12]
-    path = Path(tempfile.gettempdir()) / "spectralzoom-paper" / f"{key}.safetensors"
-    try:
-        return load_weights(path)
-    except WeightsError:
-        say(f"{name}: {len(scenes)} scenes to train on, {steps} steps")
+    """Train a network."""
+    say(f"{name}: {len(scenes)} scenes to train on, {steps} steps")
     made = [make() for make in scenes.values()]
     first = made[0]
     rng = np.random.default_rng(0)
@@ -84,7 +77,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     normalisation = measured_normalisation(seen)
     examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
     common = Common(basis, first.class_names, first.class_colours, patch, first.wavelength_nm)
-    config = network_config(TrainRequest(name, path, patch=patch), common)
+    config = network_config(TrainRequest(name, Path(), patch=patch), common)
     start = linear_classifier(LabelledPixels.drawn(examples, rng), config.classes)
     if config.deep:
         start |= load_encoder()
@@ -97,10 +90,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     seen = PaperCaptures(normalisation)
     model, summary = train(config, examples, normalisation.gain_shift, asked, progress, start=start, augmentation=seen)
     record = {"training": summary, "split": {"train": dict.fromkeys(scenes, "")}}
-    weights = Weights(model, basis, normalisation, first.class_names, first.class_colours, record)
-    path.parent.mkdir(exist_ok=True)
-    save_weights(weights, path)
-    return weights
+    return Weights(model, basis, normalisation, first.class_names, first.class_colours, record)
 
 
 def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
