@@ -86,7 +86,7 @@ def _compose(data: QuicklookData) -> Figure:
     page = 18.0 if len(counts) != 2 else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
     tall = [min(max(page * tallness / count, 1.1), 12.0) + 0.55 for count in counts]  # with words above
     figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
-    about = [data.survey, f"{width} × {height} px", data.about, f"seed {data.seed}"]  # noqa: RUF001
+    about = [data.survey, f"{width} × {height} px", data.about, f"seed\u00a0{data.seed}"]  # noqa: RUF001
     title = fill("   ·   ".join(filter(None, about)), int(page * TITLE_LETTERS))
     figure.suptitle(title, x=0.01, ha="left", size=15, weight="bold")
     panels = iter((_draw_rectified, _draw_attention, _draw_classes, _draw_truth))
