@@ -64,6 +64,11 @@ OTHER = (  # light, fraction of interest, swaths, seconds, farms
     *((1.0, share, 8, 58.0, SEEDS) for share in (1 / 16, 1.0)),
     *((light, share, 4, seconds, SEEDS) for light, seconds in ((1.0, 14.2), (1 / 16, 91.4)) for share in (1 / 16, 1.0)),
     *(
+        (light, share, 4, seconds, UNSEEN)
+        for light, seconds in ((1.0, 14.2), (1 / 16, 91.4))
+        for share in (1 / 16, 0.25)
+    ),
+    *(
         (light, share, 1, seconds, SEEDS)
         for light, seconds in ((1.0, 4.3), (1 / 16, 23.6))
         for share in (1, 1 / 4, 1 / 16)
