@@ -246,6 +246,7 @@ def _finite(values: Floats) -> NDArray[np.bool_]:
 def _image(values: NDArray[np.generic]) -> Tensor:
     """Return (y, x) or (y, x, channel) as a batch of one image, (1, channel, y, x)."""
     deep = values[..., None] if values.ndim == 2 else values
+    # not deep[None], as in `models.reading.inference.overview_of`
     return torch.from_numpy(np.ascontiguousarray(deep, np.float32))[None].permute(0, 3, 1, 2)
 
 
