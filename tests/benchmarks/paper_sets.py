@@ -88,9 +88,8 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
 
     asked = TrainingSettings(steps=steps, minutes=1e6)
     seen = PaperCaptures(normalisation)
-    model, summary = train(config, examples, normalisation.gain_shift, asked, progress, start=start, augmentation=seen)
-    record = {"training": summary, "split": {"train": dict.fromkeys(scenes, "")}}
-    return Weights(model, basis, normalisation, first.class_names, first.class_colours, record)
+    model, _ = train(config, examples, normalisation.gain_shift, asked, progress, start=start, augmentation=seen)
+    return Weights(model, basis, normalisation, first.class_names, first.class_colours)
 
 
 def with_bands(scene: RasterScene, wanted_nm: Sequence[float]) -> RasterScene:
