@@ -93,7 +93,7 @@ def gc(
     keep_days
         Stores younger than this stay: an unfinished survey may need them.
     raw_too
-        Also remove raw lines of a rig, and ingested cubes, that no run names; they cannot be captured again.
+        Also remove raw lines of a rig that no run names; they cannot be captured again.
     dry_run
         Only print what would be removed, and its size.
     """

@@ -19,7 +19,6 @@ VERBS = {  # verb: module of its function, loaded on demand
     "verify": "flows.archive.commands",
     "gc": "flows.archive.commands",
     "export": "flows.archive.export_command",
-    "ingest": "flows.archive.ingest_command",
     "reprocess": "flows.archive.reprocess_command",
     "serve": "flows.cli.serve_command",
     "report": "flows.archive.history",

@@ -19,7 +19,7 @@ from storage.archive.keys import LATEST, StageRef, in_text, published_runs, publ
 from storage.archive.records import LINE_PRODUCTS, Run, Store, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME, check_name
 
-CAPTURED, INGESTED = "capture", "ingest"  # stages of lines as they came
+CAPTURED = "capture"  # stage of lines as they came
 RASTER_ROLE = "condense_raster"  # the stage that reads the pixels of a raster
 
 
@@ -112,8 +112,6 @@ class Catalogue:
         So is a store that was made of such lines, if they were cleared away or are missing.
         """
         stage = uri.partition("/")[2].partition("/")[0]
-        if stage == INGESTED:  # runs read it, and do not make it
-            return True
         if stage != CAPTURED and RASTER_ROLE not in self.roles(uri):
             known = {one: self.stores.get(one) for one in self.inputs_of(uri)}
             gone = [one for one, store in known.items() if store is None or store.cleared]

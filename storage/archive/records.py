@@ -114,19 +114,7 @@ class Run:
     @cached_property
     def names(self) -> frozenset[str]:
         """Return the addresses of its stores and of all their inputs; empty where its manifest is damaged."""
-        named = {uri for uri in as_table(self.facts.get(RESTS_ON)) if in_text(uri) == uri}
-        if not named:
-            return frozenset()
-        root = self.folder.resolve().parents[1]
-        for name in ("scene", "sweeps"):  # the survey may have read ingested cubes of this archive
-            path = Path(_text(self.settings.get(name))).resolve()
-            parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
-            if parts[:2] == ("stages", "ingest") and len(parts) > 2:
-                named.add("/".join(parts[:3]))
-            _, there, key = _text(self.settings.get(name)).rpartition("/stages/ingest/")
-            if there and in_text(uri := f"stages/ingest/{key.split('/')[0]}") == uri:  # of a bucket or a moved archive
-                named.add(uri)
-        return frozenset(named)
+        return frozenset(uri for uri in as_table(self.facts.get(RESTS_ON)) if in_text(uri) == uri)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -84,7 +84,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     """Find stores that no run names, and leftovers of dead processes.
 
     Stores younger than ``keep_days`` stay with their inputs: a running survey may name them. ``raw_too`` also takes raw
-    lines of a rig or ingested ones that no run names; they cannot be captured again.
+    lines of a rig that no run names; they cannot be captured again.
     Raises SettingsError: ``keep_days`` is negative or no number.
     """
     if not (math.isfinite(keep_days) and keep_days >= 0):

@@ -6,7 +6,7 @@ The size that a file claims is checked against its bytes and the machine before 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -85,7 +85,6 @@ class LineFacts:
     valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
     exposure_ms: NDArray[np.float64] | None = None  # (line,)
-    frame: NDArray[np.int64] | None = None  # (line,) as the camera counts; -1 where not known
 
 
 @dataclass(frozen=True)
@@ -115,14 +114,7 @@ class CubeSource:
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
-    headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
-    root: Path | None = None  # of a store or folder whose file names are part of the content
     notes: tuple[str, ...] = ()
-
-    @property
-    def lost_lines(self) -> int:
-        """Return the number of missing lines."""
-        return int(np.count_nonzero(~self.valid))
 
     @property
     def valid(self) -> NDArray[np.bool_]:

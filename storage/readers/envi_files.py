@@ -189,14 +189,11 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         raise SceneError(f"every part of {folder} is empty; copy the folder again")
     frames = {(cube.values.shape[1:], str(cube.values.dtype)) for cube in opened.values()}
     if len(frames) > 1:
-        raise SceneError(
-            f"the parts of {folder} have frames of {sorted(frames)} (sample, band); ingest them one by one"
-        )
+        raise SceneError(f"the parts of {folder} have frames of {sorted(frames)} (sample, band); name them one by one")
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
-    source = replace(source, root=folder)  # the names of files are part of the content
     listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
     if not indices:
@@ -258,14 +255,12 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         bands=bands,
         nodata=cubes[0].header.nodata,
         bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
-        headers={one.header_path.name: one.header_path.read_bytes().decode("utf-8", errors="replace") for one in cubes},
         notes=tuple(notes),
     )
 
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     """Add the times of frame indices."""
-    lines = replace(lines, frame=times.frame)
     known = times.stamp_us >= 0
     if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         return lines

@@ -36,7 +36,7 @@ from storage.readers.envi_files import (
 )
 from storage.readers.image_files import IMAGE_ENDINGS, open_image
 from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
-from storage.readers.zarr_files import INGESTED, find_zarr_store, with_ingested, zarr_arrays
+from storage.readers.zarr_files import find_zarr_store, zarr_arrays
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
@@ -75,26 +75,21 @@ def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image
     return "envi" if of_envi else "none"
 
 
-def open_cube(
-    address: str | Path, *, dark: str | Path | None = None, white: str | Path | None = None, labels: bool = False
-) -> CubeSource:
+def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
     """Open a cube; only headers, and coordinates of arrays, are read.
 
-    ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
-    of reference frames, averaged over their lines; they replace those in a Headwall folder. ``labels`` are read without
-    scale, and an array with two axes is preferred. Raises SceneError: there is no such file, it is damaged, or its kind
-    or shape cannot be used.
+    ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. A Headwall folder's reference frames are
+    averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred. Raises
+    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
     """
     path, variable = split_variable(address)
-    frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]
     match reader_of(address):
         case "zarr":
             source = _open_arrays(find_zarr_store(path) or path, variable, labels=labels)
         case "headwall":
-            source = open_headwall_cube(path)
-            frames = [(kind, frame or find_reference(path, kind)) for kind, frame in frames]
+            source = _with_frames(open_headwall_cube(path), path)
         case "envi":
-            source = open_envi_source(path, scaled=not labels and dark is None and white is None)
+            source = open_envi_source(path, scaled=not labels)
         case "image":
             source = open_image(path, scaled=not labels)
         case "array":
@@ -106,12 +101,17 @@ def open_cube(
         case "none":
             ending = path.suffix.lower() or "nothing"
             raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
-    for kind, named in frames:
-        if named is not None:
-            values, more = load_frame(named)
-            notes = (*source.notes, f"{kind} frame from {Path(named).name}")
-            source = replace(source, **{kind: values}, files=(*source.files, *more), notes=notes)  # type: ignore[arg-type]
     check_cube_source(source)
+    return source
+
+
+def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
+    """Return a Headwall cube with the dark and white frames of its folder, if there are some."""
+    for kind in ("dark", "white"):
+        if (named := find_reference(folder, kind)) is not None:
+            values, more = load_frame(named)
+            notes = (*source.notes, f"{kind} frame from {named.name}")
+            source = replace(source, **{kind: values}, files=(*source.files, *more), notes=notes)  # type: ignore[arg-type]
     return source
 
 
@@ -140,8 +140,8 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
             source, bad_bands=marked_bands(near, source.shape[2]), geobox=geobox, notes=(*notes, *plain, *where)
         )
         if path.is_dir():
-            source = replace(source, root=path, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
-        return with_ingested(source, arrays, about) if about.get("kind") == INGESTED else source
+            source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
+        return source
 
 
 def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:

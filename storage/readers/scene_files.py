@@ -133,26 +133,6 @@ def open_scene_file(
 load_scene_file = partial(open_scene_file, labels_needed=True, keep=True)
 
 
-def with_stated_values(source: CubeSource, address: str | Path) -> CubeSource:
-    """Return a cube with no-data value, scale and offset of the ``scene.toml`` beside it.
-
-    Scaled numbers are float32, NaN without data. Raises SceneError: the cube has dark or white frames and a scale.
-    """
-    settings = find_scene_settings(split_variable(address)[0])
-    values = FileValues.of(source, list(range(source.shape[2])), settings)
-    stated = () if settings.nodata is None else (f"{SETTINGS_NAME} nodata {settings.nodata!r}",)
-    scaling = " ".join(filter(None, (source.scaling, *stated, values.scaling)))
-    if not values.scaling:
-        return replace(source, nodata=source.nodata if settings.nodata is None else settings.nodata, scaling=scaling)
-    if source.dark is not None or source.white is not None:
-        raise SceneError(
-            f"{settings.path} has a scale or offset, and {address} dark or white frames, so its numbers are stored as "
-            "they are; remove scale and offset from the scene.toml"
-        )
-    notes = (*source.notes, *values.notes(Path(SETTINGS_NAME))[0])
-    return replace(source, read=values.read, dtype=np.dtype(np.float32), nodata=None, scaling=scaling, notes=notes)
-
-
 def _light_hash(
     content: str, variable: str | None, values: FileValues, light: Bands, *, used: bool, stated: float | None
 ) -> str:

@@ -1,16 +1,7 @@
-"""List the arrays of Zarr stores, and ingest cubes as such stores.
+"""List the arrays of Zarr stores.
 
 A store is checked before it is opened. Links out of it and codecs other than those of numbers (such as ``pickle``) are
-refused, so that reading never runs code of the store. A cube of files is ingested as one immutable store:
-
-::
-
-    cube.zarr/values          (line, sample, band): uint8, uint16 and int16 as in the file, else float32
-    cube.zarr/wavelength      (band,) nm, fwhm beside it, if known
-    cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame if known
-    cube.zarr/dark, white     (sample, band) reference frames, if there are some
-
-Attributes have file names without folders, sizes, SHA-256, header texts and notes.
+refused, so that reading never runs code of the store.
 """
 
 from __future__ import annotations
@@ -20,21 +11,16 @@ import json
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.arrays.georeference import GRID_MAPPING, ON_THE_MAP, grid_mapping, map_attributes
-from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small, zarr
-from storage.readers.array_cubes import Arrays, FileArray
-from storage.readers.cube_sources import BLOCK_LINES, CubeSource, LineFacts
+from storage.arrays.layout import zarr
+from storage.readers.array_cubes import FileArray
 
-INGESTED = "ingested cube"  # of this project
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 CODECS = {
     *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),  # checksums
@@ -42,9 +28,6 @@ CODECS = {
     *("bytes", "transpose", "sharding_indexed", "shuffle"),  # orders
     *("delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"),  # of numbers
 }
-LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
-
-Report = Callable[[float], None]
 
 
 def find_zarr_store(path: Path) -> Path | None:
@@ -106,25 +89,6 @@ def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     )
 
 
-def with_ingested(source: CubeSource, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:
-    """Return a cube with the lines, reference frames and bad bands of an ingested one."""
-    lines, samples, bands = source.shape
-
-    def known(name: str, *shape: int) -> NDArray[Any] | None:
-        return np.asarray(arrays[name][...]) if name in arrays and arrays[name].shape == shape else None
-
-    valid = known("valid_line", lines)
-    valid = None if valid is None else valid.astype(np.bool_)
-    return replace(
-        source,
-        lines=LineFacts(valid, known("time", lines), known("exposure_ms", lines), known("frame", lines)),
-        dark=known("dark", samples, bands),
-        white=known("white", samples, bands),
-        nodata=attributes.get("nodata", source.nodata),
-        bad_bands=tuple(int(band) for band in attributes.get("bad_bands", ())),
-    )
-
-
 def _check_store(path: Path) -> None:
     """Refuse links out of the store, special files, and unknown codecs (SceneError)."""
     home = path.resolve()
@@ -159,85 +123,3 @@ def _codecs(content: object) -> Iterator[str]:
             for codec in listed if isinstance(listed, list) else [listed]:
                 yield str(codec.get("name", codec.get("id"))) if isinstance(codec, dict) else str(codec)
                 yield from _codecs(codec.get("configuration") if isinstance(codec, dict) else None)
-
-
-@dataclass(frozen=True)
-class SourceFile:
-    """A file of a cube."""
-
-    name: str  # relative to the store, else without folders
-    size: int
-    sha256: str
-
-
-def write_ingested_cube(
-    folder: Path, source: CubeSource, files: Sequence[SourceFile], *, name: str, report: Report = lambda done: None
-) -> None:
-    """Write a cube as ``cube.zarr`` into a folder, 64 lines at a time.
-
-    ``report`` is called with the progress, 0..1. Raises SceneError: lines cannot be read.
-    """
-    kind = source.dtype if source.dtype in (np.uint8, np.uint16, np.int16) else np.dtype(np.float32)
-    group = create_group(folder / "cube.zarr", f"{INGESTED} {name}", _attributes(source, files, name))
-    about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
-    array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
-    for start in range(0, source.shape[0], BLOCK_LINES):
-        stop = min(start + BLOCK_LINES, source.shape[0])
-        lines = source.read(start, stop)
-        valid = source.valid[start:stop]
-        with np.errstate(over="ignore"):  # values beyond float32 become infinite: missing
-            block = lines.astype(kind)
-        if not valid.all():
-            block[~valid] = np.nan if kind.kind == "f" else 0
-        array[start:stop] = block
-        report(stop / source.shape[0])
-
-
-def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:
-    facts: dict[str, Any] = {
-        "kind": INGESTED,
-        "name": name,
-        "files": [asdict(file) for file in files],
-        "headers": {file: text[:LONGEST_HEADER] for file, text in source.headers.items()},
-        "source_dtype": source.dtype.str,
-        "lost_lines": source.lost_lines,
-        "notes": list(source.notes),
-        "wavelength_origin": source.bands.origin or "nothing says the wavelengths",
-    }
-    if source.nodata is not None and np.isfinite(source.nodata):
-        facts["nodata"] = source.nodata
-    if source.bad_bands:
-        facts["bad_bands"] = list(source.bad_bands)
-    if source.geobox is not None:
-        facts |= {**map_attributes(source.geobox), "spatial:dimensions": ["line", "sample"]}
-    return facts
-
-
-def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
-    """Write lines, bands, place and reference frames; return the attributes of the values that name them."""
-    write_counts(group, line=source.shape[0], sample=source.shape[1])
-    names: list[str] = []
-    if source.bands.wavelength_nm is not None:
-        names.append(write_bands(group, source.bands.wavelength_nm, source.bands.fwhm_nm))
-    columns: Mapping[str, tuple[NDArray[Any] | None, dict[str, Any]]] = {
-        "time": (source.lines.time_s, {"long_name": "since the first stamp of a frame", "units": "s"}),
-        "exposure_ms": (source.lines.exposure_ms, {"units": "ms"}),
-        "frame": (source.lines.frame, {"long_name": "number that the camera gave, -1 where not known", "units": "1"}),
-        "valid_line": (source.valid, {"long_name": "line is whole in its file"}),
-    }
-    for name, (values, about) in columns.items():
-        if values is not None:
-            write_small(group, name, ("line",), np.asarray(values), about)
-            names.append(name)
-    frames: Mapping[str, tuple[NDArray[Any] | None, str]] = {
-        "dark": (source.dark, "dark reference frame"),
-        "white": (source.white, "white reference frame"),
-    }
-    for name, (frame, title) in frames.items():
-        if frame is not None:
-            write_small(group, name, ("sample", "band"), np.asarray(frame), {"long_name": title, "units": "1"})
-    placed = {} if source.geobox is None else ON_THE_MAP
-    if source.geobox is not None:
-        write_small(group, GRID_MAPPING, *grid_mapping(source.geobox))
-        names.append(GRID_MAPPING)
-    return {**placed, **({"coordinates": " ".join(names)} if names else {})}

@@ -1,4 +1,4 @@
-"""Small files of every format that `ingest` reads, to be mutated, and one reading of an arbitrary file.
+"""Small files of every format that is read, to be mutated, and one reading of an arbitrary file.
 
 A reading has a time limit, and its memory is traced.
 """
@@ -183,7 +183,7 @@ def try_reading(address: Path) -> Reading:
     try:
         with at_most(LONGEST_S):
             source = open_cube(address)
-            held = source.shape[0] - source.lost_lines
+            held = int(source.valid.sum())
             source.read(0, min(held, 64))
             source.read(max(held - 64, 0), held)
     except PipelineError as error:

@@ -1,4 +1,4 @@
-"""Mutate files of every ingested format: each must give a cube or one clear error, soon, in bounded memory.
+"""Mutate files of every format that is read: each must give a cube or one clear error, soon, in bounded memory.
 
 ``python tests/faults headers files`` changes values, keys, lines and characters of ENVI headers, real and made. It also
 flips, overwrites, cuts, doubles and moves bytes in small files of each format. Each cube is opened and read.
@@ -247,7 +247,7 @@ def file_rows(quick: bool = False) -> Sequence[Row]:
             tally.add(Tally(**one))
     words = [*crashed, tally.words(), f"a process of {BATCH} grew by {grown / 1e6:.0f} MB at most"]
     met = not crashed and not tally.wrong
-    injected = "random changes in files of every kind that is ingested"
+    injected = "random changes in files of every kind that is read"
     demanded = "a cube or one clear error, soon, in bounded memory"
     return [Row("mutated files", injected, count, demanded, "; ".join(words), met)]
 

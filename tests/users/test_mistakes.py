@@ -59,7 +59,6 @@ CASES = {
     # which array
     "several arrays": (1, SURVEY + "two.npz" + BANDS, r"north \(12, 16, 5\), south.*name one: two.npz:ARRAY"),
     "no such variable": (1, SURVEY + "two_cubes.mat:west" + BANDS, r"no array west; it has north \(12, 16, 5\)"),
-    "a table": (1, "ingest table.mat never", "table of 198 x 10000 numbers.*reshape"),
     "a table as a scene": (1, SURVEY + "table.npy --wavelengths 550", "table of 198 x 10000"),
     "series without a step": (1, SURVEY + "series.npy" + BANDS, "3 steps of time.*series.npy:0 to .*series.npy:2"),
     "step that is not there": (1, SURVEY + "series.npy:3" + BANDS, "3 steps of time, counted from 0; got :3"),

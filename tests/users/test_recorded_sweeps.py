@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -353,41 +352,6 @@ def test_source_recorded_needs_sweeps(command_line: CommandLine, tmp_path: Path)
     command_line("survey", "--source", "recorded", "--scene", "field", "--out", tmp_path / "a").refused(
         2, "source = 'recorded' reads sweeps that were taken before; give --sweeps"
     )
-
-
-def test_ingest_names_the_survey_as_the_next_step(
-    command_line: CommandLine, tmp_path: Path, pushbroom: Pushbroom, weights: Path
-) -> None:
-    """The named command surveys the stored cube with the stored frames, and gives the map of the original files."""
-    folder, _ = pushbroom
-    frames = ("--dark", folder / "scan.dark.hdr", "--white", folder / "scan.white.hdr")
-    ended = command_line("ingest", folder / "scan.hdr", tmp_path / "store", *frames)
-    line = next(line for line in ended.err.splitlines() if line.startswith("next: "))
-    words = shlex.split(line.removeprefix("next: "))[1:]
-    assert words[:3] == ["survey", "--source", "recorded"]
-    words[words.index("WEIGHTS.safetensors")] = str(weights)
-    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
-    assert surveyed.code == 0, surveyed.err
-    of_files = survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights))
-    assert digest_of_map(tmp_path / "a", json.loads(surveyed.out)) == digest_of_map(tmp_path / "b", of_files.receipt)
-
-
-@pytest.mark.parametrize(
-    ("name", "given", "words"),
-    [
-        ("a.npy", ("--wavelengths", "500,600"), " --wavelengths 500,600"),
-        ("a.npy", (), " --wavelengths NM,NM,..."),
-        ("a.png", (), ""),
-    ],
-)
-def test_the_next_step_names_missing_wavelengths(
-    name: str, given: tuple[str, ...], words: str, command_line: CommandLine, tmp_path: Path
-) -> None:
-    """The command has the given wavelengths or a placeholder; a picture is surveyed as a scene without them."""
-    np.save(tmp_path / "a.npy", np.zeros((16, 24, 2), np.float32))
-    Image.fromarray(np.zeros((16, 24, 3), np.uint8)).save(tmp_path / "a.png")
-    ended = command_line("ingest", tmp_path / name, tmp_path / "store", *given)
-    assert f"next: spectralzoom survey --scene {tmp_path / name}{words} --weights" in ended.err
 
 
 def test_a_rig_survey_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:

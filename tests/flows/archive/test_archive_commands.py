@@ -149,14 +149,6 @@ def test_a_partial_repair_is_reported(archive: Path, capsys: pytest.CaptureFixtu
     (archive / "stages" / "notes.txt").unlink()
     assert run_verify(archive, QUIET) == DONE
     assert "19 stores and runs are as published, out of 19" in capsys.readouterr().out
-    with opened.publish("ingest", "cube") as staged:
-        (staged.path / "data.bin").write_bytes(b"light")
-    for path in (opened.refs("rectify_fine")[0].path / "lines.json", archive / "stages/ingest/cube/data.bin"):
-        flip(path)
-    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), PARTLY)
-    assert "restore it from a copy" in content["repair"]["hopeless"]["stages/ingest/cube"]
-    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), FAILED)
-    assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
 
 
 def test_missing_stores_and_empty_receipts_count_as_damaged(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,6 @@
 """Check that a stage's code changes with its version alone; else an archive would pass off old stores as new results.
 
-After a change, raise the version of the stage's product, beside the stage (that of ingest in its command).
+After a change, raise the version of the stage's product, beside the stage.
 If the change has no effect on the output of the stage, keep the version. Then record the current code:
 
     python tests/flows/tasks/test_stage_versions.py
@@ -22,19 +22,18 @@ import pytest
 ROOT = Path(__file__).parents[3]
 sys.path[:0] = [str(ROOT)] if __name__ == "__main__" else []
 
-from flows.archive import ingest_command  # noqa: E402
 from flows.settings.survey_settings import Settings  # noqa: E402
 from flows.tasks.open_survey import STAGES, versions  # noqa: E402
 from flows.tasks.run import SurveyRun  # noqa: E402
 from storage.archive.keys import StageRef  # noqa: E402
 from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # noqa: E402
 
-VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
+VERSIONS = versions()
 RECORD = Path(__file__).with_name("stage_digests.json")
 # sources of the lines: runs bring them, no stage names them
 LIGHT = ("farm_scene", "scouting_scene", "raster_from_values", "make_source")
 BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "_open_source"), "evaluate": ("judged_labels",)}
-ROOTS = {ingest_command.STAGE: ("run_ingest",)}
+ROOTS: dict[str, tuple[str, ...]] = {}
 for _one in STAGES.values():
     _function = f"{_one.wants.__module__}.{_one.wants.__name__}"
     ROOTS[_one.product.name] = (*ROOTS.get(_one.product.name, BESIDES.get(_one.product.name, ())), _function)
@@ -49,8 +48,6 @@ BARRIERS = {
     "free_tiles": "gives memory back",
     "read_manifest": "whether a store is whole",
     "visible": "words of refusals",
-    "StageProgress": "what the terminal shows",
-    "ingest_command._print": "what the terminal shows",
 }
 
 
@@ -76,7 +73,7 @@ def digest_of(stage: str, code: Sources) -> str:
 
 def closure_of(stage: str, code: Sources) -> set[Target]:
     """Return every definition that affects the output of the stage."""
-    return code.closure([*ROOTS[stage], *(OF_RUNS if stage != ingest_command.STAGE else ())], BARRIERS)
+    return code.closure([*ROOTS[stage], *OF_RUNS], BARRIERS)
 
 
 def record() -> dict[str, dict[str, int | str]]:

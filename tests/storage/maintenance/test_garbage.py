@@ -182,15 +182,3 @@ def test_a_negative_age_is_refused(tmp_path: Path) -> None:
     for days in (-1.0, float("nan")):
         with pytest.raises(SettingsError, match="expected a number of days"):
             clear_up(Archive.open(tmp_path), keep_days=days)
-
-
-@pytest.mark.parametrize("place", ["", "s3://bucket/prefix"], ids=["folder", "bucket"])
-def test_gc_keeps_an_ingested_cube_that_a_run_surveyed(archive: Archive, place: str) -> None:
-    """The survey names it as its scene and cannot be repeated without it."""
-    small = small_survey(archive)
-    with archive.publish("ingest", "cube") as staged:
-        (staged.path / "data.bin").write_bytes(b"light")
-    settings = {"scene": f"{place or archive.root}/stages/ingest/cube"}
-    archive.new_run("field").publish(settings=settings, rests_on=archive.manifest_hashes([small.map]))
-    assert clear_up(archive, keep_days=0, raw_too=True).removals == ()
-    assert problems(archive) == []

@@ -157,16 +157,6 @@ def test_condensed_lines_whose_raw_lines_were_cleared_stay(archive: Archive, how
         assert before == {path: path.read_bytes() for path in (archive.root / "stages").rglob("*.*")}
 
 
-def test_repair_keeps_a_damaged_ingested_cube(archive: Archive) -> None:
-    """Surveys read it and cannot make it, even those of simulated rigs."""
-    cube = make_store(archive, "ingest", {}, [])
-    archive.new_run("farm").publish(settings=settings(scene=str(cube.path)), rests_on=archive.manifest_hashes([cube]))
-    flip(cube.path / "data.bin")
-    given = NOW | {"versions": {"ingest": 1}, "can_capture": lambda run: True}
-    assert list(repair(archive, verify_archive(archive), Mock(), **given).plan.hopeless) == [cube.uri]
-    assert cube.path.exists()
-
-
 @pytest.mark.parametrize("error", [SceneError("no scene farm.png; give the file"), KeyboardInterrupt()])
 def test_verify_names_a_store_that_repair_could_not_make(archive: Archive, error: BaseException) -> None:
     """The scene is missing, or repair was interrupted; the same command succeeds once the cause is removed."""

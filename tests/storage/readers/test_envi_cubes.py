@@ -45,7 +45,7 @@ def test_truncated_cubes_keep_their_whole_lines(tmp_path: Path, interleave: str)
                 open_envi_cube(path)
             continue
         cube, source = open_envi_cube(path), open_cube(path)
-        assert (cube.lost_lines, source.lost_lines, source.shape) == (5 - held, 5 - held, (5, 3, 2))
+        assert (cube.lost_lines, (~source.valid).sum(), source.shape) == (5 - held, 5 - held, (5, 3, 2))
         assert cube.notes == ((f"a.img is cut off: {held} of 5 lines are whole",) if held < 5 else ())
         np.testing.assert_array_equal(cube.values, values[:held])
         np.testing.assert_array_equal(source.read(0, held), values[:held])
@@ -224,10 +224,10 @@ def test_lines_beyond_the_file_are_flagged_or_left_out(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(bytes(48))
     (tmp_path / "a.hdr").write_text(PLAIN.replace("lines = 3", "lines = 5"))
     source = open_cube(tmp_path / "a.hdr")
-    assert (source.shape[0], source.lost_lines) == (5, 2)
+    assert (source.shape[0], (~source.valid).sum()) == (5, 2)
     (tmp_path / "a.hdr").write_text(PLAIN.replace("lines = 3", "lines = 1000000000000"))
     source = open_cube(tmp_path / "a.hdr")
-    assert (source.shape[0], source.lost_lines) == (3, 0)
+    assert (source.shape[0], (~source.valid).sum()) == (3, 0)
     assert any("999999999997 lines that a.bin lacks are not filled up" in note for note in source.notes)
 
 

@@ -40,11 +40,10 @@ def test_parts_are_joined_in_order_of_their_frames(tmp_path: Path, lines: NDArra
         rows = [f"{frame}{between}{1000 + 10 * frame}" for frame in range(first, last)]
         (tmp_path / f"frameIndex_{first}.txt").write_text("\r\n".join([f"Frame#{between}Timestamp", *rows]))
     source = open_cube(tmp_path)
-    assert (source.shape, source.dtype, source.lost_lines, source.notes) == ((30, 4, 3), np.uint16, 0, ())
+    assert (source.shape, source.dtype, source.valid.all(), source.notes) == ((30, 4, 3), np.uint16, True, ())
     np.testing.assert_array_equal(source.read(0, 30), lines)
     np.testing.assert_array_equal(source.read(6, 22), lines[6:22])
     np.testing.assert_allclose(source.lines.time_s, np.arange(30) * 1e-5)
-    np.testing.assert_array_equal(source.lines.frame, np.arange(30))
     np.testing.assert_array_equal(source.lines.exposure_ms, np.full(30, 4.5))
     np.testing.assert_array_equal(source.bands.wavelength_nm, [400, 500, 600])
     assert len(source.files) == 9
@@ -81,7 +80,7 @@ def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) ->
 
 
 def test_references_are_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """Dark and white frames are averaged over their lines, in any letter case; the argument `dark` has priority."""
+    """Dark and white frames are averaged over their lines, in any letter case."""
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), **NO_NM)
     write_part(tmp_path, "WhiteReference_01", lines[5:6], **NO_NM)
@@ -89,8 +88,6 @@ def test_references_are_found_by_name(tmp_path: Path, lines: NDArray[np.uint16])
     np.testing.assert_array_equal(source.dark, lines[1])
     np.testing.assert_array_equal(source.white, lines[5])
     assert source.notes == ("dark frame from darkReference.hdr", "white frame from WhiteReference_01.hdr")
-    np.save(tmp_path / "d.npy", lines[9])
-    np.testing.assert_array_equal(open_cube(tmp_path, dark=tmp_path / "d.npy").dark, lines[9])
 
 
 def test_unsuitable_references_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -102,7 +99,6 @@ def test_unsuitable_references_are_refused(tmp_path: Path, lines: NDArray[np.uin
     write_part(tmp_path, "darkReference_2", lines[:1], **NO_NM)
     with pytest.raises(SceneError, match=r"several dark frames .* name one with --dark"):
         open_cube(tmp_path)
-    assert open_cube(tmp_path, dark=tmp_path / "darkReference_2.hdr").dark is not None
 
 
 def test_parts_that_do_not_fit_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:

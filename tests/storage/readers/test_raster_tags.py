@@ -1,4 +1,4 @@
-"""Metadata of GeoTIFF, PNG and Zarr files, as scenes and ingested cubes keep it."""
+"""Metadata of GeoTIFF, PNG and Zarr files, as scenes keep it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,7 @@ from rasterio.control import GroundControlPoint
 
 from pipeline.setting_fields import numbers_of
 from storage.readers.image_files import bad_bands
-from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import bands_text, load_scene_file
-from storage.readers.zarr_files import write_ingested_cube
 
 PLACE = Affine(0.5, 0, 400_000, 0, -0.5, 5_700_000)
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
@@ -140,20 +138,6 @@ def test_a_zarr_store_is_georeferenced_in_three_ways(tmp_path: Path) -> None:
         else:
             assert geobox.crs.epsg == 25832
             np.testing.assert_allclose(geobox.affine[:6], PLACE[:6])
-
-
-def test_an_ingested_cube_keeps_its_metadata(tmp_path: Path) -> None:
-    """Georeference, gaps and bad bands of the stored cube are those of the file."""
-    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), write(tmp_path / "a.tif", crs=25832, transform=PLACE) as file:
-        say_in_a_list(file)
-        file.update_tags(bbl="1 1 0 1")
-        file.write_mask(np.where(np.arange(42).reshape(6, 7) < 9, 0, 255).astype(np.uint8))
-    write_ingested_cube(tmp_path / "stored", open_cube(tmp_path / "a.tif"), [], name="a")
-    scene, cube = load_scene_file(tmp_path / "a.tif"), load_scene_file(tmp_path / "stored")
-    assert cube.geobox == scene.geobox is not None
-    np.testing.assert_array_equal(cube.values, scene.values)
-    assert cube.wavelength_nm.tolist() == [450.0, 550.0, 800.0]
-    assert np.isnan(cube.values).all(axis=-1).sum() == 9
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=40))

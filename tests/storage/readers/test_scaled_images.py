@@ -96,7 +96,7 @@ def test_invalid_scales_are_refused(tmp_path: Path, toml: str) -> None:
 
 
 def test_envi_reflectance_scale_factor_is_applied(tmp_path: Path) -> None:
-    """Numbers are divided by it, except for labels and for cubes with dark and white frames."""
+    """Numbers are divided by it, except for labels."""
     numbers = np.arange(24, dtype=np.uint16).reshape(3, 4, 2) * 400
     head = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bip\nbyte order = 0\n"
     (tmp_path / "a.hdr").write_text(f"{head}reflectance scale factor = 10000\ndata ignore value = 0\n")
@@ -104,7 +104,3 @@ def test_envi_reflectance_scale_factor_is_applied(tmp_path: Path) -> None:
     scene = load_scene_file(tmp_path / "a.hdr", wavelengths=[500, 600])
     np.testing.assert_allclose(scene.values, np.where(numbers == 0, np.nan, numbers / 10_000), rtol=1e-6)
     np.testing.assert_array_equal(open_cube(tmp_path / "a.hdr", labels=True).read(0, 3), numbers)
-    for name, level in (("dark", 0.0), ("white", 8000.0)):
-        np.save(tmp_path / f"{name}.npy", np.full((1, 4, 2), level, np.float32))
-    raw = open_cube(tmp_path / "a.hdr", dark=tmp_path / "dark.npy", white=tmp_path / "white.npy")
-    np.testing.assert_array_equal(raw.read(0, 3), numbers)

@@ -276,5 +276,5 @@ def test_a_run_of_a_bucket_is_a_recording(bucket: str, machine: Machine) -> None
     with pytest.raises(ArchiveError, match="has no run 'other'"):
         open_recording(f"{bucket}/runs/other", CAMERA)
     assert find_recorded_run(f"{bucket}/{ref.uri}") is None
-    with pytest.raises(IncompleteStoreError, match="stages/ingest/0123"):
-        open_recording(f"{bucket}/stages/ingest/0123", CAMERA)
+    with pytest.raises(IncompleteStoreError, match="stages/capture/0123"):
+        open_recording(f"{bucket}/stages/capture/0123", CAMERA)
