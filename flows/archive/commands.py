@@ -288,13 +288,13 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 def command(settings: Mapping[str, Any], out: str) -> str:
     """Return the command line of these settings into the archive ``out``; tables are only named.
 
-    A chosen uniform scan stands for the time or goal that it was chosen by. Recorded lines have their own exposures.
+    A chosen uniform scan stands for the time that it was chosen by. Recorded lines have their own exposures.
     Two passes of recorded lines that state an exposure repeat the plan of their run.
     """
     if not settings:
         return ""
     chosen = settings.get("scan_step") and settings.get("zoom") != ALWAYS
-    left_out: set[str] = {"seconds", "goal"} if chosen else set()
+    left_out: set[str] = {"seconds"} if chosen else set()
     if settings.get("source") == RECORDED:
         repeated = settings.get("coarse_exposure_ms") is not None
         left_out |= {"coarse_exposure_ms", "scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}

@@ -294,7 +294,6 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, dict[str
         len(run.scene.wavelength_nm),
         captured,
         is_farm=run.settings.scene in BUILT_IN_SCENES,
-        most=run.settings.kept_bytes,
     )
     kept = Estimate(kept_bytes, KEPT_FROM)
     if run.settings.keep != KEEP_SIGNAL:
@@ -344,15 +343,14 @@ def _score(run: SurveyRun) -> Estimate:
     return Estimate(whole, source, at_most=run.chooses or not run.plan.plain)
 
 
-def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool, most: float | None = None) -> float:
+def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool) -> float:
     """Return the bytes that a run keeps of a field without its raw lines, by a fit to surveys.
 
-    ``captured`` is the size of the raw lines, 0 for a raster; ``most`` limits the size of the scores.
+    ``captured`` is the size of the raw lines, 0 for a raster.
     """
     spectra = pixels + captured / (BYTES_PER_SAMPLE * bands)  # of the mosaic and of the lines
     of_farm = FARM_SCORES if pixels < SMALL_FIELD else LARGE_FARM_SCORES
     scores = spectra * (of_farm if is_farm else FILE_SCORES * bands**BANDS_POWER)
-    scores = scores if most is None else min(scores, most)
     return PAGE + PICTURE_SIDE * math.sqrt(pixels) + MAP_PIXEL * pixels + scores
 
 

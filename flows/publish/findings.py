@@ -206,10 +206,9 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     They were compared for maps of uniform scans segmented in full without a prior map. Pixels without a class do not
     count. A score with too large an error is not predicted.
     """
-    step = run.settings.scan_step
     if (
         run.map_scores is None
-        or step is None
+        or run.raster is not None
         or not run.plan.plain
         or run.settings.extent != EXTENT_WHOLE
         or run.settings.macs is not None
@@ -221,7 +220,7 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
     high = SHARD_ROWS * int(np.clip(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1, 4))
     strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
     exposure_ms = (run.settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
-    score = run.map_scores.expected(expected_counts(strips, len(names)), step, exposure_ms)
+    score = run.map_scores.expected(expected_counts(strips, len(names)), run.step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
     if score.error > MOST_ERROR:

@@ -249,7 +249,7 @@ def _format_asked(run: SurveyRun, plan: FinePlan) -> str:
     if run.raster is not None:
         return "raster"
     if run.plan.plain:
-        return format_scan(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
+        return format_scan(run.step, run.settings.scan_exposure_ms or run.camera.exposure_ms)
     first = format_scan(run.plan.coarse[0].step, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
     return f"first {first}; {plan.reason}"
 

@@ -126,14 +126,13 @@ TABLES = {
     if isinstance(one.kind, type) and dataclasses.is_dataclass(one.kind)
 }
 
-OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, "macs", "scan_exposure_ms", "extent", "kept_bytes")
+OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, "macs", "scan_exposure_ms", "extent")
 OF_THE_RUN = (
     *("camera", "cost", "rig", "pose", "map", "zones", "resampling", "pointing_px", "seed", "sky", "weights"),
     *("unknown", "expected_loss", "signal"),
 )
 OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
-LIMITS = ("kept_bytes", "macs")  # of a uniform scan, which they do not choose
 FLAGS = {  # of settings in tables; other keys of tables have none
     **{"camera.exposure_ms": "exposure_ms", "sky.light": "sky", "sky.light_fraction": "light_fraction"},
     **{f"zones.{name}": name for name in ("area", "no_go", "plots", "plots_name")},
@@ -143,9 +142,8 @@ FLAGS = {  # of settings in tables; other keys of tables have none
 def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     """Return the defaults of the settings beside ``sweeps``: those of the run that took them, where one is named.
 
-    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did, and its visit is the time of that run. Without a run,
-    budget or scan, every recorded line is used as it is. Raises SceneError, ArchiveError: there is no such recording or
-    run.
+    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did, and its visit is the time of that run.
+    Raises SceneError, ArchiveError: there is no such recording or run.
     """
     if table.get("source", RECORDED) != RECORDED:
         return {}
@@ -155,15 +153,13 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     if found is not None:
         run, shape, _ = found
         uniform = run.settings.get("zoom") != ALWAYS and any(run.settings.get(name) is not None for name in UNIFORM)
-        another_plan = requested - {*LIMITS} if uniform else requested & {*UNIFORM, *LIMITS}
+        another_plan = requested - {"macs"} if uniform else requested & {*UNIFORM, "macs"}
         names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
         usual |= {"name": str(run.receipt.get("survey") or run.folder.name), "visit": time_of_visit(run)}
         usual |= {} if shape is None else {"size": shape[::-1]}
         if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
             usual["weights"] = BUILT_IN_WEIGHTS
-    elif not requested - {*LIMITS}:
-        usual["scan"] = RECORDED
     return usual
 
 
@@ -201,7 +197,7 @@ def load_settings(
     if (zooms or stated & {*OF_TWO_PASSES}) and all(requested.get(name) is None for name in limits):
         requested |= {} if _is_map(requested) else {"budget": USUAL_BUDGET}
     if requested.get("prior", AUTO) not in (AUTO, "none") and "extent" not in stated and not _is_map(requested):
-        others = {"sweeps", "kept_bytes", "pointing_px", "macs", *UNIFORM} - {"seconds"}
+        others = {"sweeps", "pointing_px", "macs", *UNIFORM} - {"seconds"}
         chosen = any(requested.get(name) is not None for name in others) or requested.get("zoom") == ALWAYS
         if requested.get("seconds") is not None and not chosen:  # the prior map can choose the lines of a revisit
             requested["extent"] = EXTENT_PART
@@ -329,8 +325,8 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
         )
     for exposure in named(("coarse_exposure_ms", "scan_exposure_ms")) if "sweeps" in stated else ():
         yield f"{exposure} is for a camera, and recorded lines have their own: leave it out"
-    by_hand = named(("scan_step", "scan_exposure_ms", "scan"))
-    if by_hand and not zooms and stated & {"seconds", "goal"}:
+    by_hand = named(("scan_step", "scan_exposure_ms"))
+    if by_hand and not zooms and "seconds" in stated:
         yield f"{uniform[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
     if "scan_exposure_ms" in stated and "scan_step" not in stated:
         yield f"{by_hand[0]} is for a uniform scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
@@ -446,8 +442,8 @@ def _recorded_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[s
 
 def _extent_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings of a partial scan without one, or that contradict it."""
-    if settings.extent != EXTENT_WHOLE and (settings.zooms or settings.goal is not None):
-        yield f"{at('extent')} is for one uniform scan without a goal; leave it out, or goal, zoom and budget"
+    if settings.extent != EXTENT_WHOLE and settings.zooms:
+        yield f"{at('extent')} is for one uniform scan; leave it out, or zoom and budget"
     if settings.extent == EXTENT_PART and settings.seconds is None:
         yield f"{at('extent')} = 'part' needs a time budget: give --seconds too"
     if settings.extent not in (EXTENT_WHOLE, EXTENT_PART) and settings.scan_step is None:
@@ -463,17 +459,15 @@ def _extent_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str
 
 
 def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
-    """Yield errors: a line spacing, or a limit of kept bytes or multiply-adds, that the survey cannot use."""
+    """Yield errors: a line spacing, or a limit of multiply-adds, that the survey cannot use."""
     if settings.zooms and settings.scan_step not in (None, *FIRST_STEPS):
         yield (
             f"{at('scan_step')} = {settings.scan_step}: the first of two passes takes every 4th or 8th line; give "
             f"{' or '.join(map(str, FIRST_STEPS))}, or leave it out"
         )
-    if settings.kept_bytes is not None and settings.is_map:
-        yield f"{at('kept_bytes')} is for a uniform scan, and the scene {settings.scene} is a raster: leave it out"
-    for name in (one for one in LIMITS if settings.zooms and getattr(settings, one) is not None):
+    if settings.zooms and settings.macs is not None:
         yield (
-            f"{at(name)} is for a uniform scan, and the survey takes two passes: leave it out, or --budget, "
+            f"{at('macs')} is for a uniform scan, and the survey takes two passes: leave it out, or --budget, "
             "--zoom always, --coarse-exposure-ms and --policy"
         )
     if settings.macs is not None and settings.extent != EXTENT_WHOLE:

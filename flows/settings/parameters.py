@@ -99,9 +99,9 @@ class SurveySettings(BaseModel):
 
     @classmethod
     def planned(cls, settings: Settings) -> SurveySettings:
-        """Return planned settings as parameters: a chosen scan stands for the time or goal that it was chosen by."""
+        """Return planned settings as parameters: a chosen scan stands for the time that it was chosen by."""
         if settings.scan_step is not None and settings.zoom != ALWAYS:
-            settings = replace(settings, seconds=None, goal=None, max_age=None, skip_below_error=None)
+            settings = replace(settings, seconds=None, max_age=None, skip_below_error=None)
         return cls.of(settings)
 
     def with_rig_of(self, file: str) -> SurveySettings:

@@ -18,11 +18,9 @@ from flows.settings.values import (
     UNKNOWN_OFF,
     Bands,
     Budget,
-    Bytes,
     Compute,
     Effects,
     Extent,
-    Goal,
     Keep,
     Memory,
     Name,
@@ -53,10 +51,10 @@ USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # scene in front of a rig or in a recording: only its size and bands are known
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # settings that depend on the machine of the survey
 OF_A_PART = ("max_age", "skip_below_error")  # settings of a partial scan
-OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
+OF_RECORDINGS = ("sweeps", "pointing", "dark", "white")
 USUAL_BUDGET = 0.5  # of a zoomed survey
 MOST_STEP = 8  # greatest line spacing [px]
-UNIFORM = ("seconds", "goal", "scan_step", "scan")  # each of these requests a uniform scan
+UNIFORM = ("seconds", "scan_step")  # each of these requests a uniform scan
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # each of these requests two passes
 OF_CHOOSING = ("policy", "mask")  # also valid for a uniform scan with --macs
 PATHS = (
@@ -170,7 +168,7 @@ class Settings:
     scene: str = stated(
         "farm",
         "Scene: farm or scouting (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others."
-        " Patterns for repeated visits: {date:%Y-%m-%d}.tif, {new}.tif (newest one not yet surveyed)",
+        " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"
@@ -188,7 +186,7 @@ class Settings:
     sweeps: str | None = stated(
         None,
         "Recorded sweeps: an archive, ARCHIVE/runs/NAME, s3://bucket/prefix, a folder of ENVI cubes or of a Headwall"
-        " camera, or one ENVI or Zarr cube",
+        " camera, or one ENVI or Zarr cube. Without another scan or budget, every line is used as it was taken",
         example="sweeps",
     )
     pointing: str | None = stated(
@@ -203,22 +201,11 @@ class Settings:
     white: str | None = stated(
         None, "White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr", example="white.hdr"
     )
-    scan: Literal["recorded"] | None = stated(
-        None,
-        "Use every recorded line as it was taken, as one uniform scan; default for recordings without another scan or"
-        " budget",
-        example="recorded",
-    )
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
     keep: Keep = stated(
         "signal",
         "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), raw, or raw for"
         " a limited time: raw 7d",
-    )
-    kept_bytes: Bytes | None = stated(
-        None,
-        "Byte limit for a uniform scan's scores of lines and mosaic; uses coarser quantisation than [signal] if needed",
-        example="8MB",
     )
     budget: Budget | None = stated(
         None,
@@ -238,11 +225,6 @@ class Settings:
         0.1,
         1e6,
         example=30.0,
-    )
-    goal: Goal | None = stated(
-        None,
-        "Selects the cheapest uniform scan with this expected mIoU in percent, or IoU of classes: 92,weed=70",
-        example="92",
     )
     scan_step: int | None = stated(
         None,
@@ -359,7 +341,15 @@ class Settings:
     @property
     def plain(self) -> bool:
         """Return whether the field is captured in one pass: by a uniform scan, or as a raster."""
-        return self.is_map or (not self.zooms and any(getattr(self, name) is not None for name in UNIFORM))
+        return self.is_map or (
+            not self.zooms and (self.as_taken or any(getattr(self, name) is not None for name in UNIFORM))
+        )
+
+    @property
+    def as_taken(self) -> bool:
+        """Return whether every line of a recording is used as it was taken: no scan or budget is requested."""
+        others = (self.budget, *(getattr(self, name) for name in UNIFORM))
+        return self.source == RECORDED and self.zoom != ALWAYS and all(one is None for one in others)
 
     @property
     def zooms(self) -> bool:
@@ -369,8 +359,7 @@ class Settings:
     @property
     def may_zoom(self) -> bool:
         """Return whether the planner may choose two passes: a time budget is the only limit of the capture."""
-        others = (self.kept_bytes, self.macs, *(getattr(self, name) for name in UNIFORM if name != "seconds"))
-        free = self.seconds is not None and all(one is None for one in others)
+        free = self.seconds is not None and self.macs is None and self.scan_step is None
         whole = self.extent == EXTENT_WHOLE and not self.pointing_px
         return self.zoom == AUTO and free and whole and self.source in (SIM, RIG)
 

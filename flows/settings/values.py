@@ -16,7 +16,6 @@ from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError
 from pipeline.planning.partial_scans import LineRun
-from pipeline.planning.uniform_scans import MIOU
 from pipeline.setting_fields import format_number, numbers_of
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.render import BY_NAME
@@ -124,28 +123,6 @@ def parse_size(value: object) -> tuple[int, int]:
     if len(sides) != 2 or not all(1 <= side <= 100_000 for side in sides):
         raise ValueError(f"must be WIDTHxHEIGHT in px, such as 1280x1024, got {value!r}")
     return sides[0], sides[1]
-
-
-def parse_goals(value: object) -> dict[str, float]:
-    """Return the least IoU, 0..1, by class or for the mIoU: from 92, weed=70 or both with commas, in percent."""
-    goals: dict[str, float] = {}
-    for item in _items(value) or [""]:
-        name, _, text = str(item).rpartition("=")
-        percent = _to_float(text if isinstance(item, str) else item)
-        if percent is None or not 0 < percent <= 100 or (name := name.strip() or MIOU) in goals:
-            raise ValueError(
-                "must be the least mIoU of the map in percent, above 0 and at most 100, or that of classes, each once: "
-                f"92, weed=70 or 92,weed=70; got {value!r}"
-            )
-        goals[name] = percent / 100
-    return goals
-
-
-def parse_goal(value: object) -> str:
-    """Return goals as text; see `parse_goals`."""
-    return ",".join(
-        f"{100 * least:g}" if name == MIOU else f"{name}={100 * least:g}" for name, least in parse_goals(value).items()
-    )
 
 
 def parse_effects(value: object) -> str:
@@ -302,9 +279,7 @@ Name = Annotated[str, PlainValidator(parse_name)]
 VisitName = Annotated[str, PlainValidator(parse_visit)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
 Unknown = Annotated[str, PlainValidator(parse_unknown)]
-Goal = Annotated[str, PlainValidator(parse_goal)]
 Compute = Annotated[str, PlainValidator(parse_compute)]
-Bytes = Annotated[int, PlainValidator(parse_bytes)]
 Memory = Annotated[int, PlainValidator(parse_memory)]
 Scheduler = Annotated[str, PlainValidator(lambda value: WorkerPool(parse_text(value)).scheduler)]
 Size = Annotated[tuple[int, int], PlainValidator(parse_size)]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import ALWAYS, AUTO, NEVER, RECORDED, Settings
-from flows.settings.values import EXTENT_WHOLE, parse_extent_runs, parse_goals
+from flows.settings.values import EXTENT_WHOLE, parse_extent_runs
 from models.weights.files import Description
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
@@ -81,18 +81,20 @@ class PassLayout:
         recorded: RecordedPasses | None = None,
     ) -> PassLayout:
         """Return the layout that the settings request."""
+        as_taken = None if recorded is None or not settings.as_taken else recorded.uniform_scan()
+        step = None if settings.zooms else settings.scan_step
         return cls(
             grid,
             settings.camera,
             settings.cost,
             settings.pointing_px,
-            None if settings.zooms else settings.scan_step,
+            step if as_taken is None else max(sweep.step for sweep in as_taken),
             settings.scan_exposure_ms,
             settings.coarse_exposure_ms,
             settings.extent,
             FIRST_STEP if settings.scan_step is None else settings.scan_step,
-            settings.scan == RECORDED,
-            None if settings.scan == RECORDED else shown,
+            as_taken is not None,
+            shown if as_taken is None else None,
             recorded,
         )
 
@@ -205,11 +207,10 @@ def choose_uniform_scan(
 ) -> ScanChoice:
     """Choose line spacing and exposure of the uniform scan, by the scan performance of the weights in ``path``.
 
-    A scan with limits or goals is the best within them. Without any setting it is the reference scan. A line spacing in
-    the layout is kept. A recording offers the scans that its lines contain, with their exposure.
-    Raises WeightsError: the weights lack the table; BudgetError: no scan is within the limits or reaches the goals;
-    SettingsError: the weights lack the class of a goal, or the table starts at longer exposures than the camera's;
-    PoseError: the field exceeds the mirror's range.
+    With a time it is the best within it. Without any setting it is the reference scan. A line spacing in the layout is
+    kept. A recording offers the scans that its lines contain, with their exposure.
+    Raises WeightsError: the weights lack the table; BudgetError: no scan ends in time; SettingsError: the table
+    starts at longer exposures than the camera's; PoseError: the field exceeds the mirror's range.
     """
     content = weights.record.get("scans")
     if content is None:
@@ -217,15 +218,10 @@ def choose_uniform_scan(
             by_hand = "--scan-step" + ("" if settings.source == RECORDED else " and --scan-exposure-ms")
             raise WeightsError(
                 f"the weights {path.name} have no record of uniform scans to choose by: give {by_hand} instead of "
-                "--seconds and --goal, or train weights with --min-exposure-ms 3 and validation scenes"
+                "--seconds, or train weights with --min-exposure-ms 3 and validation scenes"
             )
         return ScanChoice()
     record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
-    goals = {} if settings.goal is None else parse_goals(settings.goal)
-    for name in goals:
-        if name not in record.scores:
-            known = ", ".join(one for one in record.scores if one != MIOU)
-            raise SettingsError(f"--goal {name}={100 * goals[name]:g}: no class of the weights; give one of {known}")
     camera = layout.camera
     sweeps: dict[int, list[Sweep]] = {}  # by line spacing: those that fit the field, or that recorded lines contain
     for step in (one for one in record.steps if one <= camera.samples):
@@ -244,16 +240,16 @@ def choose_uniform_scan(
         pass
     elif layout.step in sweeps and record.knows(exposure_ms):
         chosen = priced_scan(record, sweeps[layout.step], camera, layout.cost, bands, exposure_ms)
-    elif settings.plain and layout.step is None:
+    elif settings.seconds is not None and settings.plain and layout.step is None:
         if not scans:
             start = f"the scan performance of the weights starts at {record.exposures_ms[0]:g} ms"
-            advice = "--scan-step instead of --seconds and --goal"
+            advice = "--scan-step instead of --seconds"
             if recorded_ms is None:
                 offered = f"camera.exposure_ms = {camera.exposure_ms:g}"
                 raise SettingsError(f"{offered}: {start}; give longer exposures, or {advice}")
             exposures = ", ".join(f"{one:g}" for one in sorted({*recorded_ms.values()}))
             raise SettingsError(f"recorded lines of {exposures} ms: {start}; give {advice}")
-        chosen = choose_scan(scans, settings.seconds, goals)
+        chosen = choose_scan(scans, settings.seconds)
     elif scans and not settings.plain and not settings.zooms:
         chosen = reference_scan(scans)
     return ScanChoice(tuple(scans), chosen)
@@ -301,7 +297,8 @@ def lay_out_passes(
         return layout.plan(settings.budget, settings.seconds), replace(scans, chosen=None), settings, notes
     if chosen is not None and (layout.step is None or (layout.recorded is not None and not layout.as_taken)):
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
-    settings = replace(settings, scan_step=layout.step, scan_exposure_ms=layout.exposure_ms, extent=layout.extent)
+    step = None if layout.as_taken else layout.step
+    settings = replace(settings, scan_step=step, scan_exposure_ms=layout.exposure_ms, extent=layout.extent)
     if layout.step is not None or settings.plain:
         return layout.plan(None), scans, settings, ()
     why = "have no record of scans to choose by" if content is None else "know no scan of this exposure or shorter"

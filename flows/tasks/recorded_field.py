@@ -106,7 +106,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
             raise SettingsError("camera.exposure_ms is for a camera, and recorded lines have their own: leave it out")
         geobox = run.geobox if run.shape == shape and settings.pose is None else None
     settings = replace(settings, camera=camera, size=shape[::-1])
-    if settings.scan == RECORDED:
+    if settings.as_taken:
         step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
         if step > MOST_STEP:
             raise SceneError(
@@ -114,7 +114,6 @@ def open_recorded(settings: Settings) -> OpenedRecording:
                 f"uniform scan may have up to {MOST_STEP} px between lines; correct the pointing, or "
                 "camera.focal_length_mm"
             )
-        settings = replace(settings, scan_step=step)
     return OpenedRecording(
         settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes), geobox
     )

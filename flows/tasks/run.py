@@ -247,12 +247,18 @@ class SurveyRun(CaptureRun):
         return self.settings.extent != EXTENT_WHOLE
 
     @property
+    def step(self) -> int:
+        """Return the line spacing of the first pass or of the uniform scan [px]; 1 of a raster."""
+        return max((sweep.step for sweep in self.plan.coarse), default=1)
+
+    @property
     def capture(self) -> LineSpec:
         """Return line spacing and light of the first pass or of the uniform scan."""
-        exposure_ms, step = self.settings.scan_exposure_ms, self.settings.scan_step or 1
-        if not self.plan.plain:
-            exposure_ms, step = self.settings.coarse_exposure_ms, self.plan.coarse[0].step
-        return LineSpec(self.light.light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, step)
+        chosen_ms = self.settings.scan_exposure_ms if self.plan.plain else self.settings.coarse_exposure_ms
+        exposure_ms = chosen_ms or self.camera.exposure_ms
+        return LineSpec(
+            self.light.light * (exposure_ms or self.camera.exposure_ms) / self.camera.exposure_ms, self.step
+        )
 
     @property
     def light(self) -> LineSpec:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import glob
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, SIM, Settings
 from models.weights.files import Description
-from pipeline.errors import NoSceneYet, NothingToMend, SceneError, SettingsError
+from pipeline.errors import NoSceneYet, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
@@ -29,57 +28,31 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
-from storage.archive.keys import published_runs
-from storage.archive.records import read_run
 from storage.readers.cube_sources import ONE_FILE, machine_bytes
-from storage.readers.label_files import is_label_name
-from storage.readers.open_cubes import reader_of, split_variable
+from storage.readers.open_cubes import split_variable
 from storage.readers.scene_files import SceneFile, load_scene_file, open_scene_file
-from storage.remote.opening import is_archive, open_archive
 
 # Peak of a survey of the farm, without the scene on disk: 1.42 GB for 1280 x 1024 px, 1.57 GB for 2560 x 2048 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_350_000_000, 60
 POSE_WINS = "[pose] replaces the georeference of the scene; leave [pose] out to keep it"
-DATE, NEW = "{date", "{new}"
+DATE = "{date"
 
 
 def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
     """Return the settings with the file that a scene pattern stands for; other settings unchanged.
 
-    ``{date:%Y-%m-%d}`` is the date of ``moment``, in any strftime format. ``{new}`` is any text, and selects the newest
-    file that no run of the archive surveyed. Raises SettingsError: other braces; NoSceneYet: there is no such file;
-    NothingToMend: all files were surveyed.
+    ``{date:%Y-%m-%d}`` is the date of ``moment``, in any strftime format. Raises SettingsError: other braces;
+    NoSceneYet: there is no such file.
     """
-    if DATE not in settings.scene and NEW not in settings.scene:
+    if DATE not in settings.scene:
         return settings
     try:
-        named = settings.scene.format(date=moment, new=NEW)
+        found = settings.scene.format(date=moment)
     except (KeyError, IndexError, ValueError) as error:
-        raise SettingsError(
-            f"--scene {settings.scene}: {error} is not allowed; braces are {{date:%Y-%m-%d}} or {NEW}"
-        ) from None
-    found = _newest_unseen(settings, named) if NEW in named else named
+        raise SettingsError(f"--scene {settings.scene}: {error} is not allowed; braces are {{date:%Y-%m-%d}}") from None
     if not split_variable(found)[0].exists():
         raise NoSceneYet(f"there is no file {found} yet, which --scene {settings.scene} stands for")
     return replace(settings, scene=found)
-
-
-def _newest_unseen(settings: Settings, pattern: str) -> str:
-    """Return the newest file of a pattern that no run of the archive surveyed; raises as `scene_of_visit`."""
-    there = [Path(one) for one in glob.glob("*".join(map(glob.escape, pattern.split(NEW))))]  # noqa: PTH207 - escaped
-    there = [one for one in there if reader_of(one) != "none" and not is_label_name(one)]
-    if not there:
-        raise NoSceneYet(f"there is no file yet that --scene {pattern} stands for")
-    seen = dict[str, str]()
-    if is_archive(settings.out):
-        runs = published_runs(open_archive(settings.out, create=False, write=False).root)
-        seen = {str(read_run(folder).settings.get("scene")): folder.name for folder in runs}
-    left = [one for one in there if str(one.absolute()) not in seen]
-    newest = max(left or there, key=lambda one: (one.stat().st_mtime, one.name))
-    if not left:
-        run = seen[str(newest.absolute())]
-        raise NothingToMend(run, f"nothing new: {run} surveyed {newest}, the newest that --scene {pattern} stands for")
-    return str(newest)
 
 
 def check_scene_there(scene: str) -> None:

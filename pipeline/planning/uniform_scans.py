@@ -22,7 +22,7 @@ from pipeline.planning.coverage import raw_bytes
 EXPOSURES_AN_OCTAVE = 8  # candidates
 LOSS = 0.001  # of mIoU: scans that differ by less count as equal
 REFERENCE_LOSS = 0.005  # of mIoU: the reference for savings is this near the best scan
-MIOU = "mIoU"  # as a goal: the mean over classes
+MIOU = "mIoU"  # the mean over classes
 _DIGITS = 1  # of an exposure in ms, so that settings can be read
 
 
@@ -60,7 +60,7 @@ class ScanPerformance:
 
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
-    scores: Mapping[str, NDArray[np.float64]]  # by the goals' names, (step, exposure) 0..1
+    scores: Mapping[str, NDArray[np.float64]]  # mIoU and IoU by class, (step, exposure) 0..1
     scenes: int
     spread: NDArray[np.float64] | None = None  # of mIoU, (step, exposure), from scene to scene
     light_fraction: float = 1.0  # of today's light over a clear sky's, in which the scenes were scanned
@@ -182,40 +182,21 @@ def longest_exposure(
     return low / scale if taken_s(low / scale) <= seconds else shortest
 
 
-def choose_scan(
-    scans: Sequence[UniformScan], seconds: float | None = None, goals: Mapping[str, float] | None = None
-) -> UniformScan:
-    """Return the scan with the highest expected mIoU in the time; with goals the cheapest that reaches them.
+def choose_scan(scans: Sequence[UniformScan], seconds: float) -> UniformScan:
+    """Return the scan with the highest expected mIoU in the time.
 
-    ``goals`` are scores by name, 0..1. Scans within `LOSS` of the best count as equal, and the cheapest of them is
-    taken. Ties go to the higher mIoU, then to the first.
-
-    Raises BudgetError: no scan ends in time; names the least time. Or no scan reaches the goals; names the best.
+    Scans within `LOSS` of the best count as equal, and the cheapest of them is taken. Ties go to the higher mIoU, then
+    to the first. Raises BudgetError: no scan ends in time; names the least time.
     """
-    paid = [scan for scan in scans if seconds is None or scan.seconds <= seconds]
+    paid = [scan for scan in scans if scan.seconds <= seconds]
     if not paid:
         fastest = min(scans, key=lambda scan: scan.seconds)
         raise BudgetError(
             f"no uniform scan that the weights know ends within --seconds {seconds:g}; the least is "
             f"{fastest.seconds + 0.005:.2f} s ({fastest.summary})"
         )
-    if not goals:
-        best = max(scan.expected[MIOU] for scan in paid)
-        return min((scan for scan in paid if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
-    reaching = [scan for scan in scans if all(scan.expected[name] >= least for name, least in goals.items())]
-    if not reaching:
-        asked = " and ".join(
-            f"{'' if name == MIOU else f'{name}='}{100 * least:g}, where the best scan has "
-            f"{math.floor(1000 * max(scan.expected[name] for scan in scans)) / 10}"
-            for name, least in goals.items()
-        )
-        raise BudgetError(f"no scan of these weights reaches --goal {asked}; ask for less")
-    cheapest = min(reaching, key=lambda scan: scan.price)
-    if seconds is not None and cheapest.seconds > seconds:
-        raise BudgetError(
-            f"--goal takes {cheapest.seconds + 0.005:.2f} s ({cheapest.summary}), --seconds is {seconds:g}; give more"
-        )
-    return cheapest
+    best = max(scan.expected[MIOU] for scan in paid)
+    return min((scan for scan in paid if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
 
 
 def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:

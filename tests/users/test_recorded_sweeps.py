@@ -113,7 +113,6 @@ def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.Monk
     plan = asked if "budget" in asked else {}
     of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=f"{SIZE[0]}x{SIZE[1]}", **plan)
     assert digest_of_map(tmp_path / "files", of_files.receipt) == expected
-    assert load_settings(None, {"sweeps": str(folder), "macs": "60%"}).scan == "recorded"  # as without a limit
     of_run = survey_sweeps(tmp_path / "again", published.folder)
     assert digest_of_map(tmp_path / "again", of_run.receipt) == expected
     assert of_run.receipt["survey"] == published.receipt["survey"]
@@ -322,7 +321,6 @@ BAD = {  # flags, and the message
     "a scene": ("--scene farm", "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out"),
     "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
-    "two scans": ("--scan recorded --budget 0.5", "one uniform scan .*leave one of them out"),
     "a scan's exposure": ("--scan-step 1 --scan-exposure-ms 5", "--scan-exposure-ms is for a camera.* leave it out"),
     "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import reduce
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import RASTER, SignalChoice
 from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from flows.tasks.stages.capture import RIG_RECORD
-from flows.tasks.stages.placement import MOSAIC, MOSAIC_STEP, SIGNAL_RECORD
-from pipeline.errors import BudgetError, IncompleteStoreError, SceneError
+from flows.tasks.stages.placement import MOSAIC, SIGNAL_RECORD
+from pipeline.errors import IncompleteStoreError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import MOST_VALUE, readings_alone
 from pipeline.signal.calibrate import number_values
@@ -27,18 +26,15 @@ from pipeline.signal.condense import (
     CondensedSweep,
     Condenser,
     ResidualLaw,
-    calibrated_blocks,
     differing_lines,
     score_lines,
-    whole_steps,
 )
-from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field, with_shared
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import StageRef
 from storage.archive.manifests import check_files, read_table, write_table
 from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
-from storage.arrays.layout import SHARD_ROWS, numbers_in_memory
+from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from storage.arrays.spool import line_values
@@ -47,58 +43,12 @@ from storage.readers.scene_files import RasterPixels
 SIGNAL = Product("condense", version=5)
 SIGNAL_FINE = Product("condense_fine", version=6)
 SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
-COARSER = (1.5, 2.0, 3.0, 4.0, 6.0)  # quantisation steps for a limit of bytes [standard deviations of the noise]
-SAMPLED_BLOCKS = 8  # of lines, to estimate bytes
 MOST_COMPARED = 65_536  # rare spectra, in which shared directions are searched for
 MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
-@dataclass(frozen=True)
-class KeptBytes:
-    """Limit of bytes for the scores of lines and mosaic."""
-
-    most: int
-    mosaic_px: int
-
-    def step(self, cubes: Sequence[RawCube], components: Components, camera: LineCamera, finest: float) -> float:
-        """Return the finest quantisation step that fits, estimated from samples of all sweeps.
-
-        Raises BudgetError: the coarsest step does not fit; names its bytes.
-        """
-        blocks = [(cube, block) for cube in cubes for block in range(-(-cube.shape[0] // BLOCK_LINES))]
-        scores = [
-            score_lines(values, valid, components).scores
-            for cube, block in blocks[:: max(1, len(blocks) // SAMPLED_BLOCKS)]
-            for _, values, valid in calibrated_blocks(cube, camera, [block])
-        ]
-        spectra = sum(cube.shape[0] * cube.shape[1] for cube in cubes)
-
-        def take(step: float, count: int) -> float:
-            whole = (whole_steps(one, step).transpose(2, 0, 1) for one in scores)
-            packed = sum(numbers_in_memory(np.ascontiguousarray(one, np.int32))[0] for one in whole)
-            return count * packed / max(sum(one[..., 0].size for one in scores), 1)
-
-        least = 0.0
-        for step in (finest, *(step for step in COARSER if step > finest)):
-            least = take(step, spectra) + take(MOSAIC_STEP * step, self.mosaic_px)
-            if least <= self.most:
-                return step
-        raise BudgetError(
-            f"--kept-bytes {self.most} is too small for the scores of lines and mosaic, which take at least "
-            f"{math.ceil(least)}; give more"
-        )
-
-
-def condense(
-    *passes: StageRef,
-    camera: LineCamera,
-    signal: SignalChoice,
-    kept_bytes: int | None,
-    frame: FieldFrame,
-    report: Report,
-) -> Wanted:
-    """Compress the sweeps of all passes with common components; scores and mosaic take at most ``kept_bytes``."""
-    limit = None if kept_bytes is None else KeptBytes(kept_bytes, frame.grid.height * frame.grid.width)
+def condense(*passes: StageRef, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
+    """Compress the sweeps of all passes with common components."""
 
     def build(path: Path) -> None:
         """Compute the components, and write the scores of every sweep; again if rare spectra share components."""
@@ -111,9 +61,8 @@ def condense(
                 "capture with a shorter exposure, or look at the dark and white frames. The raw lines stay"
             )
         components = components_of(found, cubes, signal)
-        step = signal.step if limit is None else limit.step(cubes, components, camera, signal.step)
         law = ResidualLaw.learned(found.spectra, components)
-        condenser = Condenser(components, law, camera, signal.rare_spectra, step)
+        condenser = Condenser(components, law, camera, signal.rare_spectra, signal.step)
 
         def written(condenser: Condenser) -> list[CondensedSweep]:
             """Write every sweep with the noise model of its own pass, since exposures differ."""
@@ -144,7 +93,7 @@ def condense(
             shutil.copyfile(rig_record, path / RIG_RECORD)
 
     key = {"camera": {"bits": camera.bits}, **asdict(signal)}  # scores depend on the saturation of the camera
-    return Wanted(build, key if limit is None else {**key, "kept": asdict(limit)}, list(passes))
+    return Wanted(build, key, list(passes))
 
 
 condense_coarse = stage("condense_coarse", "signal", SIGNAL, named="signal_coarse")(condense)

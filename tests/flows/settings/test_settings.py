@@ -7,7 +7,6 @@ import tomllib
 from dataclasses import MISSING, asdict, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -134,7 +133,7 @@ def test_budget_out_of_range_is_refused(budget):
 
 def test_amounts_have_units():
     """50% of a scan is 0.5, and 1 is all of it; binary and decimal units of bytes differ."""
-    found = parse_settings({"budget": "50%", "memory": "1.5gib", "kept_bytes": None})
+    found = parse_settings({"budget": "50%", "memory": "1.5gib", "workers": None})
     assert (found.budget, found.memory) == (0.5, 3 * 2**29)
     found = parse_settings({"budget": 1, "memory": "500 MB"})
     assert (found.budget, found.memory) == (1.0, 500_000_000)
@@ -176,7 +175,6 @@ def test_amounts_have_units():
             {"scene": "farm@3"},
             "no scene farm@3: give one of farm, farm@2, scouting, .*, or a file; --seed has the seed",
         ),
-        ({"scene": "a.png", "kept_bytes": "8MB"}, "'kept_bytes' is for a uniform scan, .* a.png is a raster: leave"),
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
         ({"detector": {"full_well_e": 5000}}, "full pixels would count as valid"),
@@ -301,13 +299,12 @@ def test_a_prior_map_and_seconds_select_a_partial_scan(more: dict[str, str], ext
     assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent
 
 
-@pytest.mark.parametrize("asked", [{"seconds": 12}, {"goal": "90"}, {"seconds": 12, "kept_bytes": "50MB"}])
-def test_planned_settings_are_parameters_of_another_machine(asked: dict[str, Any], weights: Path) -> None:
-    """The chosen scan replaces the time or goal that selected it."""
-    given = load_settings(None, {"scene": "farm", "size": "640x512", **asked})
+def test_planned_settings_are_parameters_of_another_machine(weights: Path) -> None:
+    """The chosen scan replaces the time that selected it."""
+    given = load_settings(None, {"scene": "farm", "size": "640x512", "seconds": 12, "macs": "50%"})
     planned = replace(given, scan_step=2, scan_exposure_ms=6.0)
     there = SurveySettings(**SurveySettings.planned(planned).model_dump(exclude_none=True)).settings()
-    assert (there.scan_step, there.scan_exposure_ms, there.kept_bytes) == (2, 6.0, planned.kept_bytes)
+    assert (there.seconds, there.scan_step, there.scan_exposure_ms, there.macs) == (None, 2, 6.0, "50%")
 
 
 def test_an_explicit_default_changes_nothing() -> None:

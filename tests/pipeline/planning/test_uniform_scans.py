@@ -105,7 +105,7 @@ def test_the_longest_exposure_in_time_may_be_the_shortest_allowed() -> None:
 def test_the_shortest_of_equally_good_exposures_is_chosen() -> None:
     """Beyond 25 ms the recorded score grows by 0.05 points only, so the scan uses 25 ms."""
     flat = replace(RECORD, scores={MIOU: np.array([[0.9, 0.94, 0.9405], [0.8, 0.8, 0.8], [0.7, 0.7, 0.7]])})
-    chosen = choose_scan(uniform_scans(flat, SWEEPS, CAMERA, COST, 270))
+    chosen = choose_scan(uniform_scans(flat, SWEEPS, CAMERA, COST, 270), 1e3)
     assert (chosen.step, chosen.exposure_ms) == (1, 25.0)
 
 
@@ -117,29 +117,6 @@ def test_camera_limits_exposures_and_frame_rate() -> None:
     slow = replace(CAMERA, max_rate_hz=20.0)  # frames of 50 ms at least
     scans = uniform_scans(RECORD, SWEEPS, slow, COST, 270)
     assert choose_scan(scans, min(scan.seconds for scan in scans if scan.step == 1)).exposure_ms > 45
-
-
-@pytest.mark.parametrize("goals", [{MIOU: 0.85}, {"weed": 0.55}, {MIOU: 0.9, "weed": 0.7}])
-def test_a_goal_is_reached_by_the_cheapest_scan(goals: dict[str, float]) -> None:
-    """The chosen scan reaches the goal, and no cheaper one does."""
-    chosen = choose_scan(SCANS, goals=goals)
-    assert all(chosen.expected[name] >= least for name, least in goals.items())
-    cheaper = [scan for scan in SCANS if scan.seconds < chosen.seconds]
-    assert all(any(scan.expected[name] < least for name, least in goals.items()) for scan in cheaper)
-
-
-def test_unreachable_goals_name_the_best_scan() -> None:
-    """Goals beyond the record, alone or together, name the best scores. Goals beyond the time name its duration."""
-    with pytest.raises(BudgetError, match=r"reaches --goal 95, where the best scan has 94\.0; ask for less"):
-        choose_scan(SCANS, goals={MIOU: 0.95})
-    with pytest.raises(BudgetError, match=r"--goal takes \d+\.\d+ s .*, --seconds is") as refused:
-        choose_scan(SCANS, CHEAPEST, {MIOU: 0.93})
-    named = float(re.findall(r"takes (\S+) s", str(refused.value))[0])
-    assert choose_scan(SCANS, named, {MIOU: 0.93}).seconds <= named
-    scores = {MIOU: RECORD.scores[MIOU], "weed": RECORD.scores[MIOU][::-1]}
-    torn = uniform_scans(replace(RECORD, scores=scores), SWEEPS, CAMERA, COST, 270)
-    with pytest.raises(BudgetError, match=r"no scan of these weights reaches --goal 93, .* and weed=93, where"):
-        choose_scan(torn, goals={MIOU: 0.93, "weed": 0.93})
 
 
 def test_reference_is_the_cheapest_scan_near_the_best() -> None:
