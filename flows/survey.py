@@ -17,7 +17,7 @@ from prefect import flow
 
 from flows.publish.publishing import add_accuracy, clear_raw, publish
 from flows.settings.parameters import SurveySettings
-from flows.tasks.captures import capture_pass, captured_signal, first_mosaic, plan_capture
+from flows.tasks.captures import captured_signal, first_mosaic, plan_capture
 from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
@@ -26,12 +26,12 @@ from flows.tasks.stages.condense import condense_raster
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
-from pipeline.errors import SettingsError
+from pipeline.errors import SurveyStopped
 from storage.archive.keys import StageRef
 
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
-def survey(settings: SurveySettings, capture_deployment: str | None = None) -> RunRef:
+def survey(settings: SurveySettings) -> RunRef:
     """Survey a field: capture, rectify, score, capture again, segment and publish.
 
     Parameters
@@ -39,13 +39,11 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
     settings
         Settings of the survey; all have defaults. A run of a deployment is a visit named by its due time, with the
         newest prior map of the field.
-    capture_deployment
-        Deployment of the flow `capture` on the rig's machine, such as ``capture/rig``, which captures into the archive
-        of the settings. By default, this machine captures.
 
     Returns
     -------
-    The address of the published run; of an earlier one where nothing had to be captured.
+    The address of the published run; of an earlier one where nothing had to be captured. Of the last store, where
+    ``until`` of the settings stops the survey.
 
     Raises
     ------
@@ -54,9 +52,11 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
     opened = plan_capture(settings)
     if isinstance(opened, RunRef):  # nothing has to be captured
         return opened
-    opened.capture_deployment = capture_deployment
     with opened.at_work():
-        draw_class_map(opened)
+        try:
+            draw_class_map(opened)
+        except SurveyStopped as stopped:
+            return RunRef(stopped.uri, opened.run.archive.root / stopped.uri, stopped=stopped)
         return clear_raw(opened, judge(opened, publish(opened)))
 
 
@@ -64,6 +64,7 @@ def draw_class_map(opened: OpenSurvey) -> None:
     """Run the stages from the first pass to the class map, and store their products in it."""
     if opened.is_map:  # no capture
         mosaic = condense_raster(opened)
+        opened.stop_after(mosaic, "capture", "mosaic")
         class_map = segment(opened, mosaic, score(opened, mosaic))
     else:
         mosaic, class_map = _draw_captured(opened)
@@ -75,13 +76,19 @@ def _draw_captured(opened: OpenSurvey) -> tuple[StageRef, StageRef]:
     """Capture the field in one or two passes, and segment it; return mosaic and class map."""
     effects = choose_effects(opened)
     signal = captured_signal(opened, "coarse", effects)
+    if opened.run.plan.plain:
+        opened.stop_after(signal, "capture")
     seams = register_coarse(opened, signal) if opened.registers else None
     mosaic = first_mosaic(opened, signal, locate(opened, signal, seams), seams)
+    if opened.run.plan.plain:  # no network has to choose a second pass
+        opened.stop_after(mosaic, "mosaic")
     request = score(opened, mosaic)
     if opened.goes_back(request):  # second pass
         signal = captured_signal(opened, "fine", request, effects)
+        opened.stop_after(signal, "capture")
         seams = register_fine(opened, signal, mosaic) if opened.registers else None
         mosaic = rectify_fine(opened, signal, seams)
+    opened.stop_after(mosaic, "capture", "mosaic")
     return mosaic, segment(opened, mosaic, request)
 
 
@@ -90,39 +97,3 @@ def judge(opened: OpenSurvey, run: RunRef) -> RunRef:
     if not run.pending:
         return run
     return as_task(add_accuracy, "add_accuracy")(opened, run, evaluate(opened, *opened.products.judged))
-
-
-@flow(name="capture", flow_run_name="capture-{settings.name_of_run}", validate_parameters=True, persist_result=False)
-def capture(
-    settings: SurveySettings, sweeps: str = "coarse", inputs: list[str] | None = None, rig_file: str | None = None
-) -> str:
-    """Capture the sweeps of one pass into the archive of the settings, on the rig's machine.
-
-    Parameters
-    ----------
-    settings
-        Settings of the survey.
-    sweeps
-        ``coarse`` (the first pass or a uniform scan) or ``fine`` (the second pass).
-    inputs
-        Addresses of the input stores of the pass; those of a first pass are computed here.
-    rig_file
-        Settings file on the rig's machine whose table [rig] has the addresses of its devices. It is a parameter of the
-        deployment, so that the survey needs neither ports nor passwords.
-
-    Returns
-    -------
-    The address of the stored sweeps.
-    """
-    opened = plan_capture(settings if rig_file is None else settings.with_rig_of(rig_file))
-    if isinstance(opened, RunRef):
-        return opened.uri
-    with opened.at_work():
-        parts = [address.split("/") for address in inputs or []]
-        if any(len(part) != 3 for part in parts) or (sweeps == "fine" and len(parts) != 2):
-            raise SettingsError(
-                f"inputs = {inputs}: expected addresses stages/STAGE/KEY of stores; a fine pass needs those of its "
-                "scores and of its effects"
-            )
-        known = [opened.run.archive.ref(*part[1:]) for part in parts]
-        return capture_pass(opened, sweeps, *(known or [choose_effects(opened)])).uri

@@ -42,7 +42,8 @@ else:
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
     """Survey, publish the run and print its ``summary`` on ``console``; with ``verbose`` also its stages and effects.
 
-    Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough.
+    Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough;
+    SurveyStopped: the settings stop the survey before its class map.
     """
     gc.collect()
     give_back_freed_memory()  # of a survey before
@@ -55,6 +56,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
 
         with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
+    if run.stopped is not None:
+        raise run.stopped
     published = Published(load_receipt(run.folder), run.folder, run.captured_again)
     if summary:
         show_published(published, settings.out, console, verbose=verbose)

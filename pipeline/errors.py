@@ -134,3 +134,17 @@ class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends wit
     def __init__(self, run: str, why: str) -> None:
         super().__init__(why)
         self.run = run
+
+
+class SurveyStopped(Exception):  # noqa: N818 - no error: the settings stop a survey before its class map
+    """A survey stored the last product of the stage ``until`` of its settings, at ``uri`` of its archive."""
+
+    def __init__(self, until: str, uri: str, archive: str) -> None:
+        super().__init__(
+            f"stopped after {until}: stored in {archive}/{uri}; the same command without --until goes on, here or on "
+            "another machine with this archive"
+        )
+        self.until, self.uri, self.archive = until, uri, archive
+
+    def __reduce__(self) -> tuple[type[SurveyStopped], tuple[str, str, str]]:
+        return type(self), (self.until, self.uri, self.archive)

@@ -11,7 +11,7 @@ from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.terminal.processes import format_failure
 from flows.terminal.progress import print_json, say, stderr
-from pipeline.errors import NothingToMend
+from pipeline.errors import NothingToMend, SurveyStopped
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
             except NothingToMend as skipped:
                 printed.append({"captured": False, "run": skipped.run, "why": str(skipped)})
                 stderr.print(f"{skipped}", markup=False, soft_wrap=True)
+            except SurveyStopped as stopped:
+                printed.append({"until": stopped.until, "stored": stopped.uri, "archive": stopped.archive})
+                stderr.print(f"{stopped}", markup=False, soft_wrap=True)
             except Exception as error:
                 if len(every) == 1 or isinstance(error, BrokenPipeError):
                     raise

@@ -11,9 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from flows.settings.documents import about, toml_value
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
-from flows.settings.survey_settings import ALWAYS, AUTO, BUILT_IN_SCENES, Settings
+from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
 from pipeline.errors import PipelineError, SettingsError
-from pipeline.rig.device_settings import OF_THE_LINES
 
 OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
 SECRET = "password"  # only from a settings file, since a server stores parameters
@@ -96,28 +95,6 @@ class SurveySettings(BaseModel):
         made: SurveySettings = cls.model_construct(**changed)
         made._settings = settings
         return made
-
-    @classmethod
-    def planned(cls, settings: Settings) -> SurveySettings:
-        """Return planned settings as parameters: a chosen scan stands for the time that it was chosen by."""
-        if settings.scan_step is not None and settings.zoom != ALWAYS:
-            settings = replace(settings, seconds=None, max_age=None, skip_below_error=None)
-        return cls.of(settings)
-
-    def with_rig_of(self, file: str) -> SurveySettings:
-        """Return the settings with the table [rig] of another file.
-
-        Raises SettingsError: the file is not valid, or has another white reference or mounting.
-        """
-        requested = self.settings()
-        there = load_settings(file).rig
-        for name in OF_THE_LINES:
-            if (own := getattr(requested.rig, name)) != (other := getattr(there, name)):
-                raise SettingsError(
-                    f"rig.{name} is {other!r} in {file} and {own!r} in the settings of the survey, and lines mean the "
-                    "same by one value only: state it in both"
-                )
-        return SurveySettings.of(replace(requested, rig=there))
 
     @property
     def name_of_run(self) -> str:

@@ -207,6 +207,12 @@ class Settings:
         "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), raw, or raw for"
         " a limited time: raw 7d",
     )
+    until: Literal["capture", "mosaic"] | None = stated(
+        None,
+        "Stop when this stage is stored: capture (all lines) or mosaic; the same survey without it goes on, also on"
+        " another machine with the same archive",
+        example="capture",
+    )
     budget: Budget | None = stated(
         None,
         "Time budget of a two-pass survey, as a fraction of the full scan's time: every 4th line first, then lines"

@@ -1,4 +1,4 @@
-"""Define the first tasks of a survey: open and plan it, and capture a pass, here or on the rig's machine.
+"""Define the first tasks of a survey: open and plan it, and capture a pass.
 
 No ``from __future__ import annotations`` here: Prefect reads signatures.
 """
@@ -8,28 +8,19 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
-from uuid import uuid4
 
 from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
 from flows.settings.values import KEEP_RAW
 from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_tasks import (
-    as_task,
-    current_observer,
-    inside_flow,
-    prefect_context,
-    prefect_deployments,
-    prefect_exceptions,
-)
+from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow, prefect_context
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
 from flows.tasks.stages.attention import score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
 from flows.tasks.stages.placement import rectify
-from pipeline.errors import ArchiveError, IncompleteStoreError, NothingToMend, RigError, SettingsError
+from pipeline.errors import IncompleteStoreError, NothingToMend
 from storage.archive.keys import StageRef
 from storage.remote.opening import open_archive
 
@@ -99,13 +90,8 @@ def _due_time() -> datetime | None:
 def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
     """Return the stored sweeps of a pass, ``coarse`` or ``fine``; capture them if the archive lacks them.
 
-    The deployment that the survey names captures them, else this machine. Raises SettingsError: there is no such pass;
-    RigError, ArchiveError: the deployment failed.
+    Raises RigError: another survey uses the rig.
     """
-    if sweeps not in PASSES:
-        raise SettingsError(f"there is no pass {sweeps!r}: expected {' or '.join(PASSES)}")
-    if survey.capture_deployment is not None:
-        as_task(_captured_elsewhere, "capture_elsewhere")(survey, sweeps, *inputs)
     survey.hold_rig(PASSES[sweeps], *inputs)
     return PASSES[sweeps](survey, *inputs)
 
@@ -141,35 +127,3 @@ def first_mosaic(survey: OpenSurvey, *inputs: StageRef | None) -> StageRef:
             survey.take_as_found(rectify.name, mosaic, *given)
             return mosaic
     return rectify(survey, *given)
-
-
-def _captured_elsewhere(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:
-    """Run the deployment for captures, and return the address of the stored sweeps."""
-    assert survey.capture_deployment is not None
-    parameters: dict[str, Any] = {
-        "settings": SurveySettings.planned(survey.run.settings).model_dump(exclude_none=True),
-        "sweeps": sweeps,
-        "inputs": [ref.uri for ref in inputs],
-    }
-    once = uuid4().hex  # the client repeats a request that got no answer: it starts no second capture
-    try:
-        run: Any = prefect_deployments.run_deployment(
-            survey.capture_deployment, parameters=parameters, idempotency_key=once
-        )
-    except (prefect_exceptions.ObjectNotFound, ValueError):  # ValueError: no FLOW/NAME
-        raise RigError(
-            f"there is no deployment {survey.capture_deployment!r} on the Prefect server; expected FLOW/NAME of one: "
-            "deploy it, or correct capture_deployment"
-        ) from None
-    if run.state is None or not run.state.is_completed():
-        why = "it did not end" if run.state is None else run.state.message or run.state.name
-        raise RigError(f"the deployment {survey.capture_deployment} did not capture the {sweeps} pass: {why}")
-    stage = PASSES[sweeps]
-    wanted = stage.wants(survey.run, *inputs)
-    ref = survey.run.archive.ref(stage.product.name, stage.key(wanted))
-    if stage.find(survey.run.archive, wanted) is None:
-        raise ArchiveError(
-            f"the deployment {survey.capture_deployment} captured the {sweeps} pass, but {ref.uri} is not in "
-            f"{survey.run.archive.name}: both machines need the same archive and settings"
-        )
-    return ref.uri

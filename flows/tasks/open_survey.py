@@ -20,6 +20,7 @@ from flows.tasks.stages.condense import condense_coarse, condense_fine, condense
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
+from pipeline.errors import SurveyStopped
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.manifests import manifest_sha256
@@ -55,6 +56,7 @@ class RunRef:
     folder: Path
     captured_again: float | None = None  # fraction of the patches; None after a uniform scan
     pending: bool = False  # whether its accuracy is computed next
+    stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
 
     @property
     def name(self) -> str:
@@ -92,7 +94,6 @@ class OpenSurvey:
         self.run = run
         self.started = now()
         self.observer = current_observer() if observer is None else observer
-        self.capture_deployment: str | None = None  # that captures on the rig's machine
         self.products = Products()
         self.records: dict[str, StageRecord] = {}
         self._written = 0
@@ -138,8 +139,7 @@ class OpenSurvey:
         Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
         is one. Raises RigError: another survey uses the rig.
         """
-        here = self.run.settings.source == "rig" and self.capture_deployment is None
-        if self._held is None or self._holds_rig or not here:
+        if self._held is None or self._holds_rig or self.run.settings.source != "rig":
             return
         if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
             return
@@ -153,6 +153,11 @@ class OpenSurvey:
                 self.observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
         self._held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
         self._holds_rig = True
+
+    def stop_after(self, ref: StageRef, *stages: str) -> None:
+        """Raise SurveyStopped if one of ``stages``, whose last store is ``ref``, is ``until`` of the settings."""
+        if self.run.settings.until in stages:
+            raise SurveyStopped(str(self.run.settings.until), ref.uri, self.run.archive.name)
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
         """Return the store of a stage, from the archive or built."""

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     import prefect.client.schemas.filters as prefect_filters
     import prefect.concurrency.sync as prefect_concurrency
     import prefect.context as prefect_context
-    import prefect.deployments as prefect_deployments
-    import prefect.exceptions as prefect_exceptions
     import prefect.logging.handlers as prefect_handlers
     import prefect.runtime.task_run as prefect_task_run
     import prefect.server.api.server as prefect_server
@@ -36,8 +34,6 @@ else:
     prefect_client = deferred("prefect.client.orchestration")
     prefect_concurrency = deferred("prefect.concurrency.sync")
     prefect_context = deferred("prefect.context")
-    prefect_deployments = deferred("prefect.deployments")
-    prefect_exceptions = deferred("prefect.exceptions")
     prefect_filters = deferred("prefect.client.schemas.filters")
     prefect_handlers = deferred("prefect.logging.handlers")
     prefect_server = deferred("prefect.server.api.server")

@@ -31,7 +31,7 @@ from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
 from flows.tasks.open_survey import LEASE_S, RIG_LIMIT, OpenSurvey
 from flows.tasks.prefect_tasks import Observer
-from pipeline.errors import RigError, SettingsError
+from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.pool import THREADS
@@ -216,32 +216,6 @@ def wait_for(name: str) -> None:
     pytest.fail(f"{name} is not served")
 
 
-def test_rig_and_reader_are_two_deployments(field_file: Callable[..., Path], tmp_path: Path, scheduling: str) -> None:
-    """One process captures the sweeps, another reads them from the archive; the stores equal those of one survey."""
-    from flows.settings.parameters import SurveySettings
-    from flows.survey import survey
-
-    file = field_file("north", effects="none")
-    given = {"settings_file": str(file), "name": "north", "visit": "2026-06-01T04:00:00Z", "prior": "none"}
-    with serving(scheduling, "capture/rig"):
-        apart = survey(SurveySettings(**given), capture_deployment="capture/rig")
-    for name in ("capture/nobody", "rig"):
-        with pytest.raises(
-            RigError, match=f"there is no deployment '{name}' on the Prefect server; expected FLOW/NAME"
-        ):
-            survey(SurveySettings(**given, out=str(tmp_path / "elsewhere")), capture_deployment=name)
-    with client() as asked:
-        sweeps = [run.parameters["sweeps"] for run in asked.read_flow_runs() if run.name == "capture-north"]
-    assert sorted(sweeps) == ["coarse", "fine"]
-    plain = survey.fn(SurveySettings(**given, out=str(tmp_path / "plain")))
-    stores, others = (
-        {name: address for name, address in read_run(one.folder).products.items() if address.startswith("stages/")}
-        for one in (apart, plain)
-    )
-    assert "class_map" in stores
-    assert stores == others
-
-
 def prefect_cli(folder: Path, *words: str) -> str:
     """Run Prefect's command line in a folder and return its output."""
     command = [sys.executable, "-m", "prefect", *words]
@@ -251,21 +225,20 @@ def prefect_cli(folder: Path, *words: str) -> str:
 
 
 def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
-    """`prefect deploy --all --no-prompt` makes three deployments, with schedule, pools, limits and valid parameters."""
+    """`prefect deploy --all --no-prompt` makes two deployments, with schedule, pools, limits and valid parameters."""
     from prefect.client.schemas.actions import WorkPoolCreate
 
     from flows.archive.reprocess_flow import reprocess
     from flows.survey import survey
 
     with client() as asked:
-        for pool in ("reading", "rig"):
-            asked.create_work_pool(WorkPoolCreate(name=pool, type="process"))
+        asked.create_work_pool(WorkPoolCreate(name="reading", type="process"))
     prefect_cli(ROOT, "deploy", "--all", "--no-prompt")
     with client() as asked:
-        north, rig, archive = map(asked.read_deployment_by_name, ("survey/north", "capture/rig", "reprocess/archive"))
-    pools = [(one.work_pool_name, one.global_concurrency_limit.limit) for one in (north, rig, archive)]
-    assert pools == [("reading", 1), ("rig", 1), ("reading", 1)]
-    assert [one.concurrency_options.collision_strategy.value for one in (north, rig)] == ["CANCEL_NEW", "ENQUEUE"]
+        north, archive = map(asked.read_deployment_by_name, ("survey/north", "reprocess/archive"))
+    pools = [(one.work_pool_name, one.global_concurrency_limit.limit) for one in (north, archive)]
+    assert pools == [("reading", 1), ("reading", 1)]
+    assert north.concurrency_options.collision_strategy.value == "CANCEL_NEW"
     schedules = [(one.schedule.cron, one.schedule.timezone) for one in north.schedules]
     assert schedules == [("0 6-20 * * *", "Europe/Berlin")]
     known = survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"]

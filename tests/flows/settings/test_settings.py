@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from flows.settings.documents import example_toml, settings_table
 from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
-from flows.settings.parameters import SurveySettings
 from flows.settings.renamed import RENAMED
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.settings.values import Tolerance
@@ -297,14 +296,6 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
 def test_a_prior_map_and_seconds_select_a_partial_scan(more: dict[str, str], extent: str) -> None:
     """Without prior map, or with another choice of lines, the whole field is captured."""
     assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent
-
-
-def test_planned_settings_are_parameters_of_another_machine(weights: Path) -> None:
-    """The chosen scan replaces the time that selected it."""
-    given = load_settings(None, {"scene": "farm", "size": "640x512", "seconds": 12, "macs": "50%"})
-    planned = replace(given, scan_step=2, scan_exposure_ms=6.0)
-    there = SurveySettings(**SurveySettings.planned(planned).model_dump(exclude_none=True)).settings()
-    assert (there.seconds, there.scan_step, there.scan_exposure_ms, there.macs) == (None, 2, 6.0, "50%")
 
 
 def test_an_explicit_default_changes_nothing() -> None:

@@ -6,7 +6,6 @@ import gc
 import json
 import os
 import signal
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,11 +18,11 @@ from flows import survey as survey_flow
 from flows import survey_command
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
-from flows.survey import capture, draw_class_map
+from flows.survey import draw_class_map
 from flows.tasks.local_server import ServerUnavailable
 from flows.tasks.open_survey import Products
 from flows.tasks.run import SurveyRun
-from pipeline.errors import IncompleteStoreError, SettingsError
+from pipeline.errors import IncompleteStoreError
 from storage.archive.keys import StageRef
 from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
@@ -47,8 +46,6 @@ class UnmadeRef(StageRef):
 class Noted:
     """Open survey of an empty archive that records the inputs of each requested stage."""
 
-    capture_deployment = None
-    run = SimpleNamespace(archive=SimpleNamespace(ref=UnmadeRef, is_there=lambda uri: True))
     hold_rig = staticmethod(lambda *capture: None)
 
     def __init__(self, **facts: bool) -> None:
@@ -56,6 +53,11 @@ class Noted:
         self.__dict__ |= facts
         self.steps: dict[str, list[str]] = {}
         self.products = Products()
+        archive = SimpleNamespace(ref=UnmadeRef, is_there=lambda uri: True)
+        self.run = SimpleNamespace(archive=archive, plan=SimpleNamespace(plain=self.uniform))
+
+    def stop_after(self, ref: StageRef, *stages: str) -> None:
+        """Do not stop."""
 
     def goes_back(self, request: StageRef) -> bool:
         """Return whether the plan asks for more lines."""
@@ -146,31 +148,12 @@ def test_a_password_is_no_parameter() -> None:
         SurveySettings(rig={"password": "secret-4711"})
 
 
-def test_a_capture_uses_the_rig_of_its_own_machine(tmp_path: Path) -> None:
-    """Ports and passwords come from a file there, all else from the survey; a contradiction is refused."""
-    (tmp_path / "rig.toml").write_text('[rig]\nport = "/dev/ttyRIG"\npassword = "secret-4711"\n')
-    asked = SurveySettings(source="rig", scene="field", size="64x64", wavelengths="500,600", seconds=5)
-    here = asked.with_rig_of(str(tmp_path / "rig.toml")).settings()
-    assert (here.rig.port, here.rig.password) == ("/dev/ttyRIG", "secret-4711")
-    assert replace(here, rig=asked.settings().rig) == asked.settings()
-    (tmp_path / "rig.toml").write_text("[rig]\nwhite_reference = 0.99\n")  # else the survey expects other lines
-    with pytest.raises(SettingsError, match=r"rig.white_reference is 0.99 in .*rig.toml and 1.0 in the .* survey"):
-        asked.with_rig_of(str(tmp_path / "rig.toml"))
-
-
 def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:
     """The error comes before a run begins."""
     with pytest.raises(ValidationError, match="fraction of the full scan's seconds, above 0 and at most 1, got 3"):
         SurveySettings(budget=3)
     with pytest.raises(ValidationError, match=r"unknown setting .*did you mean 'budget'"):
         SurveySettings(bugdet=0.5)
-
-
-@pytest.mark.parametrize(("sweeps", "inputs"), [("fine", None), ("coarse", ["rectify/0123"])])
-def test_wrong_inputs_of_a_pass_are_refused(field_file: Any, sweeps: str, inputs: list[str] | None) -> None:
-    """The capture runs on its own, as a deployment does."""
-    with pytest.raises(SettingsError, match=r"inputs = .*: expected addresses stages/STAGE/KEY of stores"):
-        capture.fn(SurveySettings(settings_file=str(field_file())), sweeps=sweeps, inputs=inputs)
 
 
 def test_every_setting_is_a_described_field_of_the_form() -> None:
