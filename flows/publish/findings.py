@@ -46,7 +46,7 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
     seconds = run.plan.coarse_s + fine_s
     kept = scale
     if run.zones.kept is not None and scale.area_m2 is not None:
-        kept = replace(scale, area_m2=_ground_m2(run, run.zones.kept.kept))  # the area within the zones
+        kept = replace(scale, area_m2=_ground_m2(run, run.zones.kept))  # the area within the zones
     footprint = scale.footprint
     captured = run.raster is None
     camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
@@ -64,7 +64,7 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
         "hectares": kept.hectares,
-        "kept_fraction": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
+        "kept_fraction": None if run.zones.kept is None else float(run.zones.kept.mean()),
         "camera_s": camera_s if captured else None,
         "fine_planned": fine is not None or run.plan.plain,
         "lines": lines if captured else None,
@@ -143,11 +143,10 @@ def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
     """Return ``zones``, the size of the mapped part, and ``plots``, a row each; empty without either."""
     found: dict[str, Any] = {}
     if run.zones.kept is not None:
-        kept = run.zones.kept.kept
+        kept = run.zones.kept
         found["zones"] = {
             "kept_px": int(np.count_nonzero(kept)),
             "field_px": kept.size,
-            "no_go_px": 0 if run.zones.kept.no_go is None else int(np.count_nonzero(run.zones.kept.no_go)),
             "kept_m2": _ground_m2(run, kept),
         }
     if run.zones.plots is not None:

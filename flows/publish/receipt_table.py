@@ -344,7 +344,7 @@ _SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
     "expected mIoU": ("expected", ("miou", "error", "not_predicted")),
     "uniform scans": ("scans", ("taken", "best_in_time", "reference")),
     "classes": ("areas", ("ha",)),
-    "zones": ("zones", ("kept_px", "kept_m2", "no_go_px")),
+    "zones": ("zones", ("kept_px", "kept_m2")),
     "on the ground": ("ground", ("crs", "resolution_m", "changes_ha", "older_ha")),
 }
 _OF_POINTING = ("sweeps", "residual_rms_px", "not_found", "too_narrow", "partly_seen")

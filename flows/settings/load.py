@@ -34,7 +34,6 @@ from flows.settings.survey_settings import (
     RIG_FIELD,
     UNIFORM,
     USUAL_BUDGET,
-    MapChoice,
     Settings,
     source_of,
 )
@@ -128,14 +127,14 @@ TABLES = {
 
 OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, "macs", "scan_exposure_ms", "extent")
 OF_THE_RUN = (
-    *("camera", "cost", "rig", "pose", "map", "zones", "resampling", "pointing_px", "seed", "sky", "weights"),
+    *("camera", "cost", "rig", "pose", "zones", "resampling", "pointing_px", "seed", "sky", "weights"),
     *("unknown", "expected_loss", "signal"),
 )
 OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
 FLAGS = {  # of settings in tables; other keys of tables have none
     **{"camera.exposure_ms": "exposure_ms", "sky.light": "sky", "sky.light_fraction": "light_fraction"},
-    **{f"zones.{name}": name for name in ("area", "no_go", "plots", "plots_name")},
+    **{f"zones.{name}": name for name in ("area", "plots", "plots_name")},
 }
 
 
@@ -379,8 +378,6 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
             yield f"{at(name)} = {value:g} is for built-in scenes, whose crops grow; {scene} has fixed ones"
     if settings.interest is not None and scene not in SCOUTING_NAMES:
         yield (f"{at('interest')} = {settings.interest:g} is for the scene scouting, and the scene is {scene}")
-    if settings.pose is None and settings.map != MapChoice():
-        yield "[map] needs to know where the rig stands: give [pose]"
     if settings.zones.plots_name is not None and settings.zones.plots is None:
         yield f"{at('zones.plots_name')} = {settings.zones.plots_name!r} names plots: give --plots FILE too"
     camera = settings.camera

@@ -59,7 +59,7 @@ OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "mask")  # each of th
 OF_CHOOSING = ("policy", "mask")  # also valid for a uniform scan with --macs
 PATHS = (
     *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "weights"),
-    *("zones.area", "zones.no_go", "zones.plots"),
+    *("zones.area", "zones.plots"),
 )
 ALWAYS: Literal["always"] = "always"  # values of the setting `zoom`
 NEVER: Literal["never"] = "never"
@@ -71,16 +71,6 @@ OF_A_CAMERA = (
     *("coarse_exposure_ms", "budget", "zoom", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # these give the IFOV, which a [pose] needs
-
-
-@dataclass(frozen=True)
-class MapChoice:
-    """Grid of the map on the ground; None derives a value from the pose."""
-
-    epsg: int | None = stated(
-        None, "EPSG number of a projected CRS in metres; default: UTM zone of the rig", "", 1024, 32_767, example=32632
-    )
-    resolution_m: float | None = stated(None, "Pixel size; default: median GSD", "m", 1e-4, 1000, example=0.12)
 
 
 @dataclass(frozen=True)
@@ -97,16 +87,13 @@ class SignalChoice:
 
 @dataclass(frozen=True)
 class ZoneChoice:
-    """Polygon files: area of interest, no-go zones and plots."""
+    """Polygon files: area of interest and plots."""
 
     area: str | None = stated(
         None,
         "Area of interest: polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile; limits capture, map and"
-        " accuracy",
+        " accuracy; a hole is a no-go zone",
         example="area.geojson",
-    )
-    no_go: str | None = stated(
-        None, "No-go zones, same formats; never captured again and not mapped", example="no_go.geojson"
     )
     plots: str | None = stated(
         None, "Plots, same formats; the receipt has area, classes and confidence of each", example="plots.gpkg:plots"
@@ -335,9 +322,8 @@ class Settings:
         SurveyRig,
     )
     pose: RigPose | None = table("Pose of the rig; adds a map on the ground with the area of each class.", None)
-    map: MapChoice = table("Grid of the map on the ground; needs [pose].", MapChoice)
     zones: ZoneChoice = table(
-        "Polygons on the field: in any CRS with a [pose] or a georeferenced scene, else in pixels.", ZoneChoice
+        "Polygons on the field, in any CRS; they need a [pose] or a georeferenced scene.", ZoneChoice
     )
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, RIG, MapChoice, Settings
+from flows.settings.survey_settings import RECORDED, RIG, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from flows.tasks.capture_plan import CapturePlan, PassLayout, ScanChoice, choose_uniform_scan, lay_out_passes
 from flows.tasks.drawing import UnknownRule
@@ -309,11 +309,6 @@ class SurveyRun(CaptureRun):
         assert isinstance(self.zones.place, PosedField)
         return self.zones.place.grid
 
-    @property
-    def map_choice(self) -> MapChoice:
-        """Return the settings of the map on the ground."""
-        return self.settings.map
-
     def work_done(self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None) -> MultiplyAdds:
         """Count multiply-adds of the map with these patches at full resolution, and of the scores if used.
 
@@ -518,7 +513,7 @@ def _plan_capture(
     if is_part and prior is None:
         settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
         extent_notes = ("there is no prior map: the whole field is captured",)
-    shown = None if zones.kept is None else zones.kept.shown_patches(zones.grid)
+    shown = None if zones.kept is None else zones.shown_patches
     layout = PassLayout.of(settings, zones.grid, shown, passes)
     if is_part and prior is not None:
         limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}

@@ -1,7 +1,4 @@
-"""Place fields on the ground: map coordinates to pixels of the scene, and the size and scale of a field.
-
-Polygons in pixels count from the scene's upper left corner, x to the right and y down; the first pixel is 0 to 1.
-"""
+"""Place fields on the ground: map coordinates to pixels of the scene, and the size and scale of a field."""
 
 from __future__ import annotations
 
@@ -116,20 +113,10 @@ def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int)
 
 @dataclass(frozen=True)
 class NoPlace:
-    """A field without a place: polygons are in pixels. The size of a pixel may be known."""
+    """A field without a place on the earth. The size of a pixel may be known."""
 
     shape: tuple[int, int]
     pixel_m: float | None = None
-    crs = None
-
-    @property
-    def outline(self) -> BaseGeometry:
-        """Return the outline of the field, in the coordinates of polygons."""
-        return shapely.box(0, 0, self.shape[1], self.shape[0])
-
-    def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
-        """Convert a polygon from these coordinates to the scene's pixels."""
-        return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
         """Return the ground area of some pixels (row, column) [m2]; None if it is unknown.
@@ -161,10 +148,12 @@ class PlacedPicture:
 
     @property
     def outline(self) -> BaseGeometry:
+        """Return the outline of the field on the map."""
         edges = shapely.segmentize(shapely.box(0, 0, self.shape[1], self.shape[0]), max(self.shape) / EDGE_PARTS)
         return shapely.affinity.affine_transform(edges, self.geobox.affine.to_shapely())
 
     def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
+        """Convert a polygon from the map to the scene's pixels, x right and y down from the upper left corner."""
         return shapely.affinity.affine_transform(shape, (~self.geobox.affine).to_shapely())
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
@@ -227,4 +216,5 @@ class PosedField:
         return scale_of_view(self.view, self.shape)
 
 
-FieldPlace = NoPlace | PlacedPicture | PosedField  # where a field lies
+GroundPlace = PlacedPicture | PosedField  # of a field with a place on the earth
+FieldPlace = NoPlace | GroundPlace  # where a field lies

@@ -25,10 +25,8 @@ Pixel = TypeVar("Pixel", bound=np.generic)
 
 UTM_LATITUDES = (-80.0, 84.0)
 POLAR = {False: 5042, True: 5041}  # universal polar stereographic, south and north, axes east and north
-AREA_SLACK_DEG = 1.0  # a field may lie this far outside the area that a CRS is made for
 FAR_PIXELS = 8.0  # pixels of the scene with a footprint of more than so many times the median's side are left out
-MOST_GROWTH = 64  # most pixels of a map, times the scene's,
-USUAL_GROWTH = 8  # and without a given resolution
+MOST_GROWTH = 8  # most pixels of a map, times the scene's
 TIE = 32  # map pixels between exact places
 ROUND_STEPS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 SAMPLES = 129  # places a side for the median footprint
@@ -41,31 +39,6 @@ def default_epsg(pose: RigPose) -> int:
     if not south <= pose.lat_deg <= north:
         return POLAR[pose.lat_deg > 0]
     return (32600 if pose.lat_deg >= 0 else 32700) + int((pose.lon_deg + 180) % 360 // 6) + 1
-
-
-def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
-    """Return the projected CRS of a map around the rig: the given one, or that of ``default_epsg``.
-
-    Raises PoseError: no such code, not a projected CRS in metres, or the rig is outside its area of use.
-    """
-    code = default_epsg(pose) if epsg is None else epsg
-    hint = f"leave epsg out for EPSG:{default_epsg(pose)}"
-    try:
-        crs = pyproj.CRS.from_epsg(code)
-    except pyproj.exceptions.CRSError:
-        raise PoseError(f"there is no EPSG:{code}; give the code of a projected CRS in metres, or {hint}") from None
-    if not crs.is_projected or any(axis.unit_conversion_factor != 1 for axis in crs.axis_info[:2]):
-        raise PoseError(f"EPSG:{code} ({crs.name}) is no projected CRS in metres; {hint}")
-    if crs.area_of_use is not None:
-        west, south, east, north = crs.area_of_use.bounds
-        width = (east - west) % 360 or 360.0  # the area may cross the date line
-        within = (pose.lon_deg - west + AREA_SLACK_DEG) % 360 <= width + 2 * AREA_SLACK_DEG
-        if not within or not south - AREA_SLACK_DEG <= pose.lat_deg <= north + AREA_SLACK_DEG:
-            raise PoseError(
-                f"EPSG:{code} ({crs.name}) is made for longitudes {west:g} to {east:g}, latitudes {south:g} to "
-                f"{north:g}; the rig stands at lon_deg {pose.lon_deg:g}, lat_deg {pose.lat_deg:g}; {hint}"
-            )
-    return crs
 
 
 @dataclass(frozen=True)
@@ -168,19 +141,15 @@ class GroundGrid:
         return {"mapped_px": near, "beyond_reach_px": ground - near, "no_ground_px": total - ground}
 
 
-def ground_grid(
-    view: GroundView, scene_shape: tuple[int, int], *, epsg: int | None = None, resolution_m: float | None = None
-) -> GroundGrid:
-    """Lay a map's grid over the footprint of a field of (y, x) px. Its pixels start at multiples of their side.
+def ground_grid(view: GroundView, scene_shape: tuple[int, int]) -> GroundGrid:
+    """Lay a map's grid over the footprint of a field of (y, x) px, in the UTM zone of the rig.
 
-    ``epsg`` is the code of a projected CRS in metres, None for the rig's UTM zone. ``resolution_m`` is the side of the
-    map's pixels. None takes the rounded median side of a scene pixel's footprint. A long and narrow footprint gets
-    larger pixels, so that the map is not far larger than the scene.
+    Its pixels start at multiples of their side, the rounded median side of a scene pixel's footprint. A long and narrow
+    footprint gets larger pixels, so that the map is not far larger than the scene.
 
-    Raises PoseError: no ray of the field meets the ground, the CRS does not suit the place, or the grid would have far
-    more pixels than the scene.
+    Raises PoseError: no ray of the field meets the ground, or its footprint does not fit on the map.
     """
-    frame = MapFrame(view, map_crs(view.pose, epsg))
+    frame = MapFrame(view, pyproj.CRS.from_epsg(default_epsg(view.pose)))
     if not view.count_ground(scene_shape):
         raise PoseError(
             f"no ray of the field meets the ground from the pose {view.pose}; tilt it further down, or check roll_deg "
@@ -194,15 +163,8 @@ def ground_grid(
         raise PoseError(f"the field's footprint does not fit on the map {frame.crs.name} (pose {view.pose})")
     left, bottom = places.min(axis=0).tolist()
     right, top = places.max(axis=0).tolist()
-    growth = USUAL_GROWTH if resolution_m is None else MOST_GROWTH
-    finest = float(np.sqrt((right - left) * (top - bottom) / (growth * scene_shape[0] * scene_shape[1])))
-    median = median_footprint_m(view, scene_shape)
-    step = round_step(max(median, finest)) if resolution_m is None else resolution_m
-    if resolution_m is not None and step < finest:
-        raise PoseError(
-            f"at resolution_m = {step:g} the map would have more than {MOST_GROWTH} times the scene's {scene_shape} "
-            f"pixels; use {1.1 * finest:.2g} or more (the median pixel of the scene sees {median:.2g} m)"
-        )
+    finest = float(np.sqrt((right - left) * (top - bottom) / (MOST_GROWTH * scene_shape[0] * scene_shape[1])))
+    step = round_step(max(median_footprint_m(view, scene_shape), finest))
     geobox = odc_geobox.GeoBox.from_bbox((left, bottom, right, top), crs=frame.crs, resolution=step)
     return GroundGrid(frame, scene_shape, geobox, least)
 

@@ -1,4 +1,4 @@
-"""Convert polygons from any coordinates to a field: their pixels, the zones of a survey, and figures of plots."""
+"""Convert polygons from any coordinates to a field: their pixels, parts of patches, and figures of plots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.ground.field_places import BORDER_PX, FieldPlace
+from pipeline.ground.field_places import FieldPlace, GroundPlace
 from pipeline.ground.georeference import WGS84, Floats
 from pipeline.lazy import BaseGeometry, pyproj, rasterio, rasterio_features, shapely
 
@@ -19,13 +19,11 @@ EDGE_PARTS = 256  # of that: a straight edge of one map is curved on another
 FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons count from it and not from Greenwich
 
 
-def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> BaseGeometry:
+def on_field(shape: BaseGeometry, crs: pyproj.CRS, place: GroundPlace) -> BaseGeometry:
     """Convert a polygon to the pixels of a field, as far as it lies there or near; empty if it does not.
 
-    ``crs`` is that of the polygon, x before y, or None if it is in pixels. Edges are straight in ``crs``.
+    ``crs`` is that of the polygon, x before y, and its edges are straight there.
     """
-    if crs is None or place.crs is None:
-        return shapely.intersection(shape, _grown(shapely.box(*place.outline.bounds), BORDER_PX))
     to_place = pyproj.Transformer.from_crs(crs, place.crs, always_xy=True)
     middle = _middle_deg(place) if crs.is_geographic else None
     back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
@@ -47,9 +45,8 @@ def extent_deg(shape: BaseGeometry, crs: pyproj.CRS) -> tuple[float, float, floa
     return float(np.min(lon)), float(np.min(lat)), float(np.max(lon)), float(np.max(lat))
 
 
-def _middle_deg(place: FieldPlace) -> float | None:
+def _middle_deg(place: GroundPlace) -> float | None:
     """Return the longitude of a field so near 180 degrees that polygons may cross it; None for all others."""
-    assert place.crs is not None
     west, _, east, _ = extent_deg(place.outline, place.crs)
     middle = east if east - west > 180 else (west + east) / 2
     return middle if abs(middle) > FAR_EAST_DEG else None
@@ -71,56 +68,17 @@ def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
     return shapely.box(west - by, south - by, east + by, north + by)
 
 
-def pixels_inside(
-    shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0), touched: bool = False
-) -> Mask:
-    """Return which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
-
-    A pixel belongs to a polygon by its centre; with ``touched`` all pixels that a polygon touches do.
-    """
+def pixels_inside(shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0)) -> Mask:
+    """Return which of (y, x) ``size`` pixels from row and column ``origin`` on have their centres in polygons."""
     given = [one for one in shapes if not one.is_empty]
     if not given:
         return np.zeros(size, bool)
     place = rasterio.Affine.translation(origin[1], origin[0])
-    found = rasterio_features.rasterize(given, out_shape=size, transform=place, all_touched=touched, dtype="uint8")
+    found = rasterio_features.rasterize(given, out_shape=size, transform=place, dtype="uint8")
     return np.asarray(found, np.bool_)
 
 
-@dataclass(frozen=True)
-class FieldZones:
-    """Pixels that a survey maps: those inside the area, if one is given, and in no no-go zone."""
-
-    kept: Mask  # (y, x)
-    no_go: Mask | None = None  # (y, x), every pixel touched
-
-    @property
-    def left_out(self) -> Mask:
-        """Return the (y, x) pixels without a map."""
-        return ~self.kept
-
-    def patch_fractions(self, grid: SceneGrid) -> Floats:
-        """Return the fraction of each patch's pixels that are kept, (patch,) 0..1.
-
-        It is 0 for every patch that a no-go zone touches.
-        """
-        fractions = _patch_means(self.kept, grid)
-        return fractions if self.no_go is None else np.where(_patch_means(self.no_go, grid) > 0, 0.0, fractions)
-
-    def shown_patches(self, grid: SceneGrid) -> Mask:
-        """Return the patches (patch,) that hold a pixel to map: lines have to show them."""
-        return _patch_means(self.kept, grid) > 0
-
-
-def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
-    """Combine an area and no-go zones; None if they leave nothing out, so that nothing changes."""
-    kept = np.ones_like(no_go) if area is None and no_go is not None else area
-    if kept is None:
-        return None
-    kept = kept if no_go is None else kept & ~no_go
-    return None if kept.all() else FieldZones(kept, no_go if no_go is not None and no_go.any() else None)
-
-
-def _patch_means(mask: Mask, grid: SceneGrid) -> Floats:
+def patch_means(mask: Mask, grid: SceneGrid) -> Floats:
     """Return the mean over the pixels of each patch that lie on the scene, (patch,)."""
     return np.asarray(patch_pixels(grid, mask).mean(axis=(1, 2)) / grid.valid_fraction().ravel())
 

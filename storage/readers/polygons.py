@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError, SceneError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture
+from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture
 from pipeline.ground.georeference import WGS84
 from pipeline.ground.zones import on_field
 from pipeline.lazy import BaseGeometry, GeoBox, pyogrio, pyproj, rasterio_features, shapely
@@ -185,7 +185,6 @@ def load_polygon_labels(
         *layer.notes,
         *([f"{lacking} polygons without a value of {attribute} are left out"] if lacking else []),
         *([f"{shared} px lie in polygons of several classes: the later polygon counts"] if shared else []),
-        *(["polygons are taken in pixels of the scene, x to the right and y down"] if geobox is None else []),
     )
     return Labels(index, tuple(classes), tuple(classes.values()), class_colours(classes, settings.colours), notes)
 
@@ -243,41 +242,41 @@ def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue 
     return values.index(int(word)) if word.isdecimal() and int(word) in values else None
 
 
-def crs_on(
+def placed_on(
     place: FieldPlace, crs: pyproj.CRS | None, address: str | Path, error: type[PipelineError]
-) -> pyproj.CRS | None:
-    """Return the CRS of polygons on a field: WGS 84 for GeoJSON without one; None: they are in pixels of the scene.
+) -> tuple[GroundPlace, pyproj.CRS]:
+    """Return the place of a field, and the CRS of polygons on it: WGS 84 for GeoJSON without one.
 
-    Raises ``error``: the field has no georeference and the polygons have one, or the other way round.
+    Raises ``error``: the field has no place on the earth, or another format than GeoJSON has no CRS.
     """
-    if place.crs is None and crs is not None:
+    if isinstance(place, NoPlace):
         raise error(
-            f"{address} is in {crs.name}, and this field has no georeference: give the rig's [pose], a scene with a CRS"
-            " and a transform, or polygons in pixels of the scene as GeoJSON without a CRS"
+            f"{address} has polygons, and this field has no georeference: give the rig's [pose], or a scene with a CRS"
+            " and a transform (gdal_translate -a_srs -a_ullr)"
         )
-    if place.crs is None or crs is not None:
-        return crs
+    if crs is not None:
+        return place, crs
     if split_layer(address)[0].suffix.lower() not in GEOJSON:
         raise error(f"{address} has no CRS; save it with one (a shapefile needs a .prj file)")
-    return pyproj.CRS.from_epsg(WGS84)
+    return place, pyproj.CRS.from_epsg(WGS84)
 
 
 def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
     """Return the polygons in pixels of the scene, clipped to it.
 
-    Raises SceneError: none lies on the scene, or their CRS does not fit.
+    Raises SceneError: none lies on the scene, or the scene or the polygons have no georeference.
     """
-    crs = crs_on(place, layer.crs, address, SceneError)
-    moved = [polygons_of(on_field(shape, crs, place)) for shape in layer.shapes]
-    if all(one.is_empty or not one.intersects(NoPlace(place.shape).outline) for one in moved):
+    on, crs = placed_on(place, layer.crs, address, SceneError)
+    moved = [polygons_of(on_field(shape, crs, on)) for shape in layer.shapes]
+    height, width = on.shape
+    if all(one.is_empty or not one.intersects(shapely.box(0, 0, width, height)) for one in moved):
         given = np.array([shape.bounds for shape in layer.shapes])
         west, south = given[:, :2].min(axis=0)
         east, north = given[:, 2:].max(axis=0)
-        there = f"in {crs.name}" if crs is not None else "in pixels"
         raise SceneError(
             f"labels {address} do not lie on the scene: all polygons are within x {west:g} to {east:g}, y {south:g} to"
-            f" {north:g} {there}, off its {place.shape[0]} x {place.shape[1]} px (y x x); are they of this scene, and"
-            " is their CRS right?"
+            f" {north:g} in {crs.name}, off its {height} x {width} px (y x x); are they of this scene, and is their CRS"
+            " right?"
         )
     return moved
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
+import shapely
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -47,6 +48,8 @@ from tests.storage.readers.test_recordings import write_envi_cube
 from tests.storage.small_archive import flip
 
 __all__ = ["command_line"]
+from tests.users.zone_sketches import sketch
+
 pytestmark = pytest.mark.usefixtures("no_effects")
 FullScan = tuple[Path, Published, Path]  # archive, run, sweeps as files
 Pushbroom = tuple[Path, NDArray[np.uint16]]  # files of a straight scan, and its numbers
@@ -197,9 +200,10 @@ def test_a_budget_is_a_fraction_of_the_recorded_seconds(tmp_path: Path, survey_p
 
 def test_a_recorded_scan_is_compared_with_all_of_its_lines(tmp_path: Path, full_scan: FullScan, weights: Path) -> None:
     """An area of interest limits only the map: all lines are read and count in the reference, so savings are 1."""
-    corner = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [30, 30], [0, 30], [0, 0]]]}
-    (tmp_path / "area.json").write_text(json.dumps(corner))
-    asked = {"weights": str(weights), "zones.area": str(tmp_path / "area.json")}
+    at = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(7.6, 51.96)
+    corner = sketch(tmp_path / "area.gpkg", {"corner": shapely.box(*at, at[0] + 5, at[1] + 5)}, 32632)
+    pose = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 100, "heading_deg": 0, "tilt_deg": 90}
+    asked = {"weights": str(weights), "zones.area": corner, "pose": pose}
     savings = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt["savings"]
     assert [savings[name]["ratio"] for name in ("lines", "samples", "capture_s")] == [1, 1, 1]
 

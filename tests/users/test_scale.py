@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 from dataclasses import fields
@@ -77,11 +76,9 @@ def test_hectares_are_those_of_the_area(flags_png: Flags, tmp_path: Path) -> Non
     """Half of the field as area of interest halves the hectares and gives a kept fraction of 0.5."""
     asked = flags_png(tmp_path, budget="0.8") | DOWN
     whole = plan_content(load_settings(None, asked))["field"]
-    place = {"type": "name", "properties": {"name": "EPSG:32632"}}
     at = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(7.6, 51.96)
-    path = Path(sketch(tmp_path / "half.geojson", {"half": shapely.box(at[0] - 5, at[1], at[0] + 5, at[1] + 5)}))
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": place}))
+    path = sketch(tmp_path / "half.geojson", {"half": shapely.box(at[0] - 5, at[1], at[0] + 5, at[1] + 5)}, 32632)
     assert whole["hectares"] == pytest.approx(128 * 96 * (100 * 7.4e-3 / 70) ** 2 / 1e4, rel=1e-6)
-    half = plan_content(load_settings(None, asked | {"zones.area": str(path)}))["field"]
+    half = plan_content(load_settings(None, asked | {"zones.area": path}))["field"]
     assert half["hectares"] == pytest.approx(whole["hectares"] / 2, rel=0.05)
     assert half["kept_fraction"] == pytest.approx(0.5, abs=0.03)

@@ -1,7 +1,8 @@
-"""Area of interest, no-go zones and plots limit a survey from its lines to its areas, and the receipt lists them."""
+"""Area of interest and plots limit a survey from its lines to its areas, and the receipt lists them."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ import geopandas
 import numpy as np
 import pandas
 import pytest
+import rasterio
 import shapely
+from affine import Affine
 
 from flows.publish.run_folder import Published
 from flows.settings.load import load_settings, parse_settings
@@ -25,8 +28,9 @@ from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-AREA = shapely.Polygon([(20, 8), (118, 10), (110, 62), (24, 60)])
-NO_GO = shapely.box(50, 24, 58, 33)
+NO_GO = shapely.box(50, 24, 58, 33)  # a hole of the area
+AREA = shapely.Polygon([(20, 8), (118, 10), (110, 62), (24, 60)]).difference(NO_GO)  # in pixels
+PLACE = Affine(1, 0, 400_000, 0, -1, 5_700_000)  # a pixel is a square metre
 SHAPES = {"north": (24, 12, 100, 36), "south": (24, 36, 100, 60), "away": (400, 0, 410, 9)}
 PLOTS = {name: shapely.box(*corners) for name, corners in SHAPES.items()}
 POSE = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
@@ -41,12 +45,28 @@ def drawn(out: Path, published: Published) -> ClassMap:
 Opened = Callable[..., SurveyRun]
 
 
+def on_map(shape: shapely.Geometry) -> shapely.Geometry:
+    """Return a polygon of the scene's pixels in metres of UTM zone 32."""
+    return shapely.affinity.affine_transform(shape, PLACE.to_shapely())
+
+
+@pytest.fixture(scope="module")
+def scene(scene_files: Path) -> str:
+    """Return the small picture as a GeoTIFF with a place on the earth."""
+    path = scene_files / "placed.tif"
+    with rasterio.open(scene_files / "scene.png") as picture:
+        about = picture.profile | {"driver": "GTiff", "crs": "EPSG:32632", "transform": PLACE, "photometric": "RGB"}
+        with rasterio.open(path, "w", **about) as file:
+            file.write(picture.read())
+    return str(path)
+
+
 @pytest.fixture
-def opened(scene_files: Path, weights: Path, tmp_path: Path) -> Opened:
+def opened(scene: str, weights: Path, tmp_path: Path) -> Opened:
     """Return a function that opens a survey of the small picture with given settings, without running it."""
 
     def open_with(**given: Any) -> SurveyRun:
-        basic = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(weights), "engine": "plain"}
+        basic = {"scene": scene, "source": "sim", "weights": str(weights), "engine": "plain"}
         settings = parse_settings(basic | {name: value for name, value in given.items() if value is not None})
         return open_run(settings, planning=True, archive=Archive(tmp_path, writes=False))
 
@@ -55,23 +75,30 @@ def opened(scene_files: Path, weights: Path, tmp_path: Path) -> Opened:
 
 @pytest.fixture(scope="module")
 def zones(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return files of an area, a no-go zone and plots, in pixels."""
+    """Return files of an area with a hole, and of plots."""
     folder = tmp_path_factory.mktemp("zones")
     return {
-        "zones.area": sketch(folder / "area.geojson", {"field": AREA}),
-        "zones.no_go": sketch(folder / "no_go.geojson", {"pond": NO_GO}),
-        "zones.plots": sketch(folder / "plots.geojson", PLOTS),
+        "zones.area": sketch(folder / "area.geojson", {"field": on_map(AREA)}, 32632),
+        "zones.plots": sketch(folder / "plots.gpkg", {name: on_map(shape) for name, shape in PLOTS.items()}, 32632),
     }
 
 
 @pytest.fixture(scope="module")
 def kept_to(
-    survey_png: Survey, zones: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+    survey_png: Survey, scene: str, zones: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Published]:
-    """Return the archive and the run of a survey with the area, the no-go zone and the plots."""
+    """Return the archive and the run of a survey with the area and the plots."""
     out = tmp_path_factory.mktemp("kept") / "archive"
     with without_effects():
-        return out, survey_png(out, **NARROW, **zones)
+        return out, survey_png(out, scene=scene, **NARROW, **zones)
+
+
+@pytest.fixture(scope="module")
+def whole(survey_png: Survey, scene: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]:
+    """Return the archive and the run of a survey of the whole field."""
+    out = tmp_path_factory.mktemp("whole") / "archive"
+    with without_effects():
+        return out, survey_png(out, scene=scene)
 
 
 def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -80,26 +107,23 @@ def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
     return np.asarray(shapely.contains_xy(shape, x, y))
 
 
-def test_the_class_map_covers_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
+def test_the_class_map_covers_the_area_without_its_hole(kept_to: tuple[Path, Published]) -> None:
     """Pixels there have a class and a confidence; all other pixels have neither."""
     found = drawn(*kept_to)
-    wanted = inside(AREA) & ~inside(NO_GO)
     classed = found.classes != UNLABELLED
-    assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border only, if at all
+    assert (classed != inside(AREA)).sum() <= 2 * AREA.length / 100  # on the border only, if at all
     assert np.array_equal(classed, np.isfinite(found.confidence))
     assert not classed[inside(NO_GO)].any()
 
 
-def test_patches_outside_or_in_a_no_go_zone_are_never_chosen(kept_to: tuple[Path, Published]) -> None:
-    """Their score is 0 and they have no rank; a patch that touches a no-go zone is excluded as a whole."""
+def test_patches_outside_or_in_a_hole_are_never_chosen(kept_to: tuple[Path, Published]) -> None:
+    """Their score is 0 and they have no rank."""
     out, published = kept_to
     products = published.receipt["products"]
     attention = load_attention(out / products["attention"])
     rows, columns = attention.score.shape
     patch_index = [shapely.box(8 * x, 8 * y, 8 * x + 8, 8 * y + 8) for y in range(rows) for x in range(columns)]
-    barred = np.array(
-        [not patch_number.intersects(AREA) or patch_number.intersection(NO_GO).area > 0 for patch_number in patch_index]
-    )
+    barred = np.array([not patch_number.intersects(AREA) for patch_number in patch_index])
     cut = chosen_patches(out / products["attention"])
     assert len(cut) > 10
     assert not barred[cut].any()
@@ -153,11 +177,12 @@ def test_excluded_pixels_have_no_class_probabilities(kept_to: tuple[Path, Publis
 
 
 def test_a_visit_with_zones_keeps_the_prior_map_outside_of_them(
-    survey_png: Survey, surveyed_png: Survey, zones: dict[str, str], tmp_path: Path
+    survey_png: Survey, scene: str, whole: tuple[Path, Published], zones: dict[str, str], tmp_path: Path
 ) -> None:
     """Outside of the area the classes stay those of the prior map, and no pass is counted."""
-    first = surveyed_png(tmp_path)
-    second = survey_png(tmp_path, visit="second", prior="latest", accuracy=False, **zones)
+    first = whole[1]
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+    second = survey_png(tmp_path, scene=scene, visit="second", prior="latest", accuracy=False, **zones)
     before, after = (
         ProbabilityStore(tmp_path / one.receipt["products"]["class_probabilities"]).read() for one in (first, second)
     )
@@ -168,11 +193,13 @@ def test_a_visit_with_zones_keeps_the_prior_map_outside_of_them(
     assert (after[2][away] <= before[2][away] + 1e-6).all()
 
 
-def test_an_area_of_the_whole_field_changes_no_key(survey_png: Survey, surveyed_png: Survey, tmp_path: Path) -> None:
+def test_an_area_of_the_whole_field_changes_no_key(
+    survey_png: Survey, scene: str, whole: tuple[Path, Published], tmp_path: Path
+) -> None:
     """Every store has its key without zones, so the survey makes no new store."""
-    surveyed_png(tmp_path / "archive")
-    area = sketch(tmp_path / "all.geojson", {"all": shapely.box(-5, -5, 200, 200)})
-    published = survey_png(tmp_path / "archive", **{"zones.area": area})
+    shutil.copytree(whole[0], tmp_path / "archive")
+    area = sketch(tmp_path / "all.geojson", {"all": on_map(shapely.box(-5, -5, 200, 200))}, 32632)
+    published = survey_png(tmp_path / "archive", scene=scene, **{"zones.area": area})
     assert {stage["state"] for stage in published.receipt["stages"]} <= {"cached", "skipped"}
     assert "zones" not in published.receipt
 
@@ -186,38 +213,36 @@ def test_polygons_in_any_crs_give_the_same_mask(opened: Opened, tmp_path: Path) 
     masks = []
     for name, crs in (("utm.gpkg", 32632), ("globe.geojson", 4326), ("web.shp", 3857), ("laea.gpkg", 3035)):
         path = sketch(tmp_path / name, {"half": fine.to_crs(crs).iloc[0]}, crs)
-        masks.append(opened(pose=POSE, zones={"area": path}).zones.kept.kept)
+        masks.append(opened(pose=POSE, zones={"area": path}).zones.kept)
     assert 0.2 < masks[0].mean() < 0.8
     differ = [(mask != masks[0]).sum() for mask in masks]
     assert max(differ) <= 16  # of 12 288: datums differ by half a millimetre after a round trip, a pixel has 7
 
 
 @pytest.mark.parametrize(
-    ("kind", "box", "crs", "pose", "words"),
+    ("kind", "shape", "crs", "pose", "words"),
     [
-        ("area", (300, 0, 400, 50), None, None, "expected some in x 0 to 128.*got x 300 to 400"),
-        ("plots", (-3.5, 0, -0.5, 50), None, None, "do not lie on the field"),
-        ("area", (10.1, 10.1, 10.3, 10.3), None, None, "smaller than a pixel"),
-        ("area", (7.5, 51.9, 7.7, 52), 4326, None, r"WGS 84.*give the rig's \[pose\]"),
-        ("area", (8.5, 51.9, 8.7, 52), 4326, POSE, "x 7.6.*got x 8.5 to 8.7"),
-        ("no_go", (0, 0, 200, 200), None, None, "nothing is left to survey"),
+        ("area", on_map(shapely.box(300, 0, 400, 50)), 32632, None, "expected some in x 7.5.*got x 7.5"),
+        ("plots", on_map(shapely.box(-3.5, 0, -0.5, 50)), 32632, None, "do not lie on the field"),
+        ("area", on_map(shapely.box(10.1, 10.1, 10.3, 10.3)), 32632, None, "smaller than a pixel"),
+        ("area", shapely.box(8.5, 51.9, 8.7, 52), 4326, POSE, "x 7.6.*got x 8.5 to 8.7"),
     ],
-    ids=["beside", "at the border", "tiny", "no place", "another farm", "all of it"],
+    ids=["beside", "at the border", "tiny", "another farm"],
 )
-def test_a_zone_off_the_field_or_over_all_of_it_is_refused(
-    opened: Opened, tmp_path: Path, kind: str, box: Any, crs: int | None, pose: Any, words: str
+def test_a_zone_off_the_field_is_refused(
+    opened: Opened, tmp_path: Path, kind: str, shape: Any, crs: int, pose: Any, words: str
 ) -> None:
-    """The message gives both extents or what is missing; a no-go zone over the whole field gives no empty map."""
-    path = sketch(tmp_path / ("zone.gpkg" if crs else "zone.geojson"), {"a": shapely.box(*box)}, crs)
+    """The message gives both extents."""
+    path = sketch(tmp_path / "zone.gpkg", {"a": shape}, crs)
     with pytest.raises(ZoneError, match=words):
         opened(zones={kind: path}, pose=pose)
 
 
-def test_a_no_go_zone_off_the_field_is_noted(opened: Opened, tmp_path: Path) -> None:
-    """It may belong to another field of the farm, so the survey runs, with a note of both extents."""
-    run = opened(zones={"no_go": sketch(tmp_path / "n.geojson", {"n": shapely.box(200, 0, 210, 9)})})
-    assert run.zones.kept is None
-    assert any("do not lie on the field" in note for note in run.notes)
+def test_zones_of_a_field_without_a_place_are_refused(opened: Opened, scene_files: Path, tmp_path: Path) -> None:
+    """The message names both ways to give the field a place."""
+    path = sketch(tmp_path / "zone.geojson", {"a": shapely.box(0, 0, 50, 50)}, 4326)
+    with pytest.raises(ZoneError, match=r"no georeference: give the rig's \[pose\], or a scene with a CRS"):
+        opened(scene=str(scene_files / "scene.png"), zones={"area": path})
 
 
 def test_plots_name_without_plots_is_refused() -> None:
@@ -231,4 +256,3 @@ def test_paths_of_zones_are_relative_to_the_settings_file(tmp_path: Path) -> Non
     (tmp_path / "s.toml").write_text('[zones]\narea = "area.geojson"\nplots = "plots.gpkg:trial"\n')
     zones = load_settings(tmp_path / "s.toml").zones
     assert (zones.area, zones.plots) == (str(tmp_path / "area.geojson"), str(tmp_path / "plots.gpkg:trial"))
-    assert zones.no_go is None

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import MapChoice
 from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, UnknownRule, draw_field
 from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
 from flows.tasks.field_work import region_params
@@ -182,9 +181,7 @@ GROUND = Product("ground", version=5, files=(STORE,))
 
 
 @stage("ground", "map in a projected CRS", GROUND)
-def ground(
-    class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, map_choice: MapChoice, report: Report
-) -> Wanted:
+def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, report: Report) -> Wanted:
     """Project class map, ages, changes and picture to the ground, by the pose of the rig."""
 
     def build(path: Path) -> None:
@@ -230,7 +227,6 @@ def ground(
 
     params = {
         "pose": asdict(ground_grid.frame.view.pose),
-        "map": asdict(map_choice),
         "ifov_rad": ground_grid.frame.view.ifov_rad,
         "scene_shape": ground_grid.scene_shape,
     }

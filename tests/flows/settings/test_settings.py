@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from flows.settings.documents import example_toml, settings_table
 from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
 from flows.settings.renamed import RENAMED
-from flows.settings.survey_settings import MapChoice, Settings
+from flows.settings.survey_settings import Settings
 from flows.settings.values import Tolerance
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -182,7 +182,6 @@ def test_amounts_have_units():
         ({"out": "a\0b"}, "text without a null character"),
         ({"pose": {"lat_deg": 52.1, "tilt_deg": 40}}, r"\[pose\] lacks lon_deg, heading_deg; give every one"),
         ({"pose": POSE | {"range_m": 20}}, r"\[pose\]: .* height_m or range_m, one of the two; got height_m = 12"),
-        ({"map": {"epsg": 32632}}, r"\[map\] .* where the rig stands: give \[pose\]"),
     ],
 )
 def test_wrong_values_are_refused(table, words):
@@ -191,20 +190,18 @@ def test_wrong_values_are_refused(table, words):
         parse_settings(table)
 
 
-def test_a_pose_and_its_map_are_read(toml):
-    """Without the tables there is no pose; those of the example file are valid once uncommented."""
+def test_a_pose_is_read(toml):
+    """Without the table there is no pose; that of the example file is valid once uncommented."""
     found = load_settings(toml("[pose]\nlon_deg = -3.25\nlat_deg = 57\nheading_deg = 350\ntilt_deg = 20\nrange_m = 40"))
     assert found.pose == RigPose(lon_deg=-3.25, lat_deg=57.0, heading_deg=350.0, tilt_deg=20.0, range_m=40.0)
-    assert (found.map, Settings().pose) == (MapChoice(), None)
-    found = parse_settings({"pose": POSE, "map": {"epsg": 25832, "resolution_m": 0.05}})
-    assert found.map == MapChoice(25832, 0.05)
+    assert Settings().pose is None
     text = EXAMPLE.read_text(encoding="utf-8")
     lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
     table = tomllib.loads(
         "\n".join(line for line in lines if line.startswith("[") or (" = " in line and not line.startswith("range_m")))
     )
     found = parse_settings(table)
-    assert (found.pose.height_m, found.map.epsg) == (493.0, 32632)
+    assert found.pose.height_m == 493.0
     assert set(table["pose"]) | {"range_m"} == {item.name for item in fields(RigPose)}
 
 
@@ -272,7 +269,6 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         camera=LineCamera(exposure_ms=exposure),
         cost=CostModel(slew_s=slew),
         pose=RigPose(**POSE) if posed else None,
-        map=MapChoice(resolution_m=0.1 if posed else None),
         pointing_px=slew,
         tol=tolerance,
         sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_fraction=budget),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.settings.survey_settings import MapChoice, Settings
+from flows.settings.survey_settings import Settings
 from flows.tasks.stages.maps import STORE, colours_of, ground
 from flows.tasks.zones import place_of_field
 from pipeline.geometry.grid import UNLABELLED
@@ -49,11 +49,6 @@ class Run:
         place = place_of_field(self.settings, FIELD)
         assert isinstance(place, PosedField)
         return place.grid
-
-    @property
-    def map_choice(self) -> MapChoice:
-        """Return the map settings."""
-        return self.settings.map
 
 
 def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
@@ -188,28 +183,21 @@ def test_a_first_visit_has_ages_and_no_changes(run: Run, stores: Stores) -> None
 
 
 def test_the_store_has_areas_pose_and_crs(run: Run, stores: Stores) -> None:
-    """Areas are sums of footprints at any resolution; plain xarray reads pose, pixel counts and CRS."""
-    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
+    """Areas are sums of footprints; plain xarray reads pose, pixel counts and CRS."""
+    ref = draw(run, stores)
     areas = load_ground_map(ref.path / STORE).areas
     exact = run.ground_grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
     assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
-    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
     with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
-        assert content.attrs["proj:code"] == "EPSG:25832"
+        assert content.attrs["proj:code"] == "EPSG:32632"
         assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
         assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
 
 
-def test_the_key_follows_pose_and_map(run: Run, stores: Stores) -> None:
-    """The same pose finds its store; another tilt or resolution makes a new one."""
-    changed = [
-        run.settings,
-        replace(run.settings, pose=replace(POSE, tilt_deg=51.0)),
-        replace(run.settings, map=MapChoice(resolution_m=0.01)),
-        run.settings,
-    ]
+def test_the_key_follows_the_pose(run: Run, stores: Stores) -> None:
+    """The same pose finds its store; another tilt makes a new one."""
+    changed = [run.settings, replace(run.settings, pose=replace(POSE, tilt_deg=51.0)), run.settings]
     keys = [draw(replace(run, settings=settings), stores).key for settings in changed]
-    assert keys[0] == keys[3]
-    assert len(set(keys)) == 3
+    assert keys[0] == keys[2] != keys[1]

@@ -1,4 +1,4 @@
-"""Polygons on pixels: masks, areas compared with shapely's, CRS round trips, and zones as parts of patches."""
+"""Polygons on pixels: masks, areas compared with shapely's, CRS round trips, and parts of patches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.ground.zones import field_zones, figures_of_plot, on_field, pixels_inside
+from pipeline.ground.zones import figures_of_plot, on_field, patch_means, pixels_inside
 
 SHAPE = (60, 80)
 corners = st.lists(st.tuples(st.floats(-20, 100), st.floats(-20, 80)), min_size=3, max_size=8)
@@ -40,11 +40,9 @@ def test_masks_of_a_polygon_and_its_complement_partition_the_pixels(area: Any) -
 
 @given(polygons)
 def test_mask_size_is_the_polygon_area(area: Any) -> None:
-    """Mask and area differ by at most the border's length plus one pixel. The touched pixels contain the mask."""
+    """Mask and area differ by at most the border's length plus one pixel."""
     there = area.intersection(shapely.box(0, 0, SHAPE[1], SHAPE[0]))
-    inside, touched = (pixels_inside([area], SHAPE, touched=one) for one in (False, True))
-    assert abs(inside.sum() - there.area) <= there.length + 1
-    assert (touched | ~inside).all()
+    assert abs(pixels_inside([area], SHAPE).sum() - there.area) <= there.length + 1
 
 
 @given(polygons, st.integers(0, 40), st.integers(0, 50))
@@ -63,13 +61,6 @@ def test_holes_and_separate_parts_are_kept() -> None:
     found = pixels_inside([shapely.union(ring, shapely.box(50, 40, 60, 45))], SHAPE)
     assert found.sum() == 400 - 100 + 50
     assert not found[15:25, 15:25].any()
-
-
-def test_a_polygon_below_a_pixel_is_touched_but_not_inside() -> None:
-    """A tiny polygon next to a pixel's centre touches that one pixel."""
-    tiny = shapely.box(10.1, 20.1, 10.2, 20.2)
-    assert not pixels_inside([tiny], SHAPE).any()
-    assert np.argwhere(pixels_inside([tiny], SHAPE, touched=True)).tolist() == [[20, 10]]
 
 
 @pytest.mark.parametrize("crs", [32632, 4326, 3857, 3035, 31466])
@@ -132,30 +123,14 @@ def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
     assert areas.ravel() == pytest.approx(np.full(2, 0.30903 * 0.19068), rel=1e-3)
 
 
-@given(polygons, polygons)
-def test_patches_in_a_no_go_zone_count_nothing(area: Any, no_go: Any) -> None:
-    """A touched patch counts 0, any other by its pixels inside of the area."""
+@given(polygons)
+def test_a_patch_counts_by_its_pixels_inside(area: Any) -> None:
+    """The fraction of a patch is the mean of the mask over its pixels on the scene."""
     grid = SceneGrid(*SHAPE, 8)
-    barred = pixels_inside([no_go], SHAPE, touched=True)
-    found = field_zones(pixels_inside([area], SHAPE), barred)
-    if found is None:
-        return
-    fractions = found.patch_fractions(grid)
-    shown = found.shown_patches(grid)
-    for patch_number in grid.every_patch():
+    kept = pixels_inside([area], SHAPE)
+    for patch_number, fraction in zip(grid.every_patch(), patch_means(kept, grid), strict=True):
         y, x = grid.patch_origin(patch_number)
-        kept, stopped = (mask[y : y + 8, x : x + 8] for mask in (found.kept, barred))
-        assert fractions[patch_number] == pytest.approx(0 if stopped.any() else kept.mean())
-        assert shown[patch_number] or not kept.any()
-    assert not found.kept[barred].any()
-
-
-def test_zones_that_exclude_nothing_are_none() -> None:
-    """An area that covers the whole field equals no zones. A no-go zone alone gives zones."""
-    everything = np.ones(SHAPE, bool)
-    assert field_zones(everything, ~everything) is None
-    assert field_zones(None, None) is None
-    assert field_zones(None, everything) is not None
+        assert fraction == pytest.approx(kept[y : y + 8, x : x + 8].mean())
 
 
 def test_plot_confidence_is_the_mean_of_known_pixels() -> None:
@@ -167,10 +142,3 @@ def test_plot_confidence_is_the_mean_of_known_pixels() -> None:
     unknown = figures_of_plot("unknown", shapely.box(1, 1, 2, 2), *values)
     assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
     assert (whole.fractions["unknown"], unknown.fractions["unknown"], unknown.confidence) == (0.25, 1.0, None)
-
-
-def test_polygons_without_a_georeference_are_in_pixels() -> None:
-    """Coordinates count from the upper left corner, and no pixel has an area."""
-    found = on_field(shapely.box(-5, -5, 3, 2), None, NoPlace(SHAPE))
-    assert np.argwhere(pixels_inside([found], SHAPE)).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2]]
-    assert NoPlace(SHAPE).pixel_areas_m2(slice(0, 1), slice(0, 1)) is None

@@ -1,8 +1,7 @@
-"""Polygon labels: on a map and in pixels, in every format, found by name; one error for each mistake."""
+"""Polygon labels: on a map, in every format, found by name; one error for each mistake."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:'crs' was not provided")
 PLACE = Affine(2, 0, 400_000, 0, -2, 5_700_000)
 SHAPE = 10, 12  # (y, x)
 WEST, EAST = shapely.box(400_000, 5_699_980, 400_008, 5_700_000), shapely.box(400_012, 5_699_990, 400_024, 5_700_000)
-PIXELS = shapely.box(0, 0, 4, 10), shapely.box(6, 0, 12, 5)  # the same in pixels
+ELSEWHERE = shapely.box(0, 0, 4, 10), shapely.box(6, 0, 12, 5)
 NONE = 255
 TRUTH = np.full(SHAPE, NONE)
 TRUTH[:, :4], TRUTH[:5, 6:] = 1, 0
@@ -69,18 +68,6 @@ def test_polygon_labels_equal_rasterios(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.labels, other)
     assert found.class_names == ("class_4", "class_7")
     assert found.class_values == (4, 7)
-
-
-def test_polygons_without_a_crs_are_in_pixels(tmp_path: Path) -> None:
-    """A scene without a georeference takes them in its pixels, with a note."""
-    shapes = [
-        {"type": "Feature", "properties": {"label": name}, "geometry": shapely.geometry.mapping(shape)}
-        for name, shape in zip(("wheat", "maize"), PIXELS, strict=True)
-    ]
-    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": shapes}))
-    found = load_scene_file(scene(tmp_path, place=None), labels=tmp_path / "a.geojson")
-    np.testing.assert_array_equal(found.labels, TRUTH)
-    assert "polygons are taken in pixels of the scene, x to the right and y down" in found.provenance
 
 
 def test_a_layer_is_selected_by_name(tmp_path: Path) -> None:
@@ -169,9 +156,15 @@ def test_init_uses_the_class_attribute_of_scene_toml(tmp_path: Path) -> None:
         ([shapely.Point(1, 1)] * 2, 32632, {}, PLACE, "expected polygons, got 2 Point"),
         ((WEST, EAST), 32632, {"owner": ["a", "b"]}, PLACE, r"lack an attribute that says the class; they have owner;"),
         ((WEST, EAST), 32632, {"crop": [None, None]}, PLACE, "have no class for any polygon"),
-        ((WEST, EAST), 32632, {}, None, r"is in WGS 84 / UTM zone 32N, and this field has no georeference"),
+        ((WEST, EAST), 32632, {}, None, r"has polygons, and this field has no georeference"),
         ((WEST, EAST), None, {}, PLACE, "has no CRS; save it with one"),
-        (PIXELS, 32632, {}, PLACE, "do not lie on the scene: all polygons are within x 0 to 12, y 0 to 10 in WGS 84"),
+        (
+            ELSEWHERE,
+            32632,
+            {},
+            PLACE,
+            "do not lie on the scene: all polygons are within x 0 to 12, y 0 to 10 in WGS 84",
+        ),
         ([WEST.centroid.buffer(0.1)] * 2, 32632, {}, PLACE, "no pixel's centre lies in a polygon that has a class"),
     ],
 )
