@@ -179,7 +179,7 @@ def survey_png(scene_files: Path, flags_png: Flags) -> Survey:
 
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
         labels = str(scene_files / "labels.png")
-        given = flags_png(out, labels=labels, engine="plain", budget="0.8", controls=False)
+        given = flags_png(out, labels=labels, engine="plain", budget="0.8")
         return survey_command.run_survey(load_settings(None, given | flags), console or QUIET)
 
     return survey

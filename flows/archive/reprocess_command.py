@@ -193,7 +193,7 @@ def run_judge(
         settings = replace(settings, labels=labels)
     there = "accuracy" in receipt and labels is None
     placed = not settings.plain or settings.is_map  # patches, which are compared with other placements
-    if there and (receipt["accuracy"]["controls"] or not (placed and settings.controls)):
+    if there and ("all" in receipt["accuracy"] or not (placed and settings.controls)):
         show_text(f"{found.uri} has its accuracy already", console)
         return receipt
     use_one_thread()

@@ -19,7 +19,6 @@ from flows.terminal.progress import print_json, stderr
 from flows.training.train import asked_command, check_counts, run_train
 from flows.training.train_scenes import TrainRequest
 from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
-from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR, Device
 from models.training.temporal import TemporalTraining
 from models.training.train import TrainingSettings
@@ -184,13 +183,11 @@ class EvaluateFlags(SceneFlags):
     fractions
         Fractions of the patches to read at full resolution, with commas; none and all are always included.
     policies
-        Policies that choose the patches, with commas; an oracle that uses the labels is always included.
+        Policies that choose the patches, with commas.
     frames
         Names of the frames, with commas. Default: all.
-    draws
-        Bootstrap samples for the intervals.
     controls
-        For a run: also judge the small network, the full one and other placements. Default: as in its survey.
+        For a run: also judge the small network and the full one. Default: as in its survey.
     """
 
     weights: Annotated[tuple[Path, ...], Parameter(negative="")] = ()
@@ -198,7 +195,6 @@ class EvaluateFlags(SceneFlags):
     fractions: str = ",".join(map(str, FRACTIONS))
     policies: str = ",".join(USUAL)
     frames: str | None = None
-    draws: int = DRAWS
     controls: bool | None = None
 
     def request(self, dataset: str) -> EvaluateRequest:
@@ -212,7 +208,6 @@ class EvaluateFlags(SceneFlags):
             split_list(self.frames),
             self.scenes,
             self.seed,
-            self.draws,
             self.choices(),
             self.device,
         )
@@ -266,7 +261,7 @@ def check_default(flags: SceneFlags, but: Sequence[str], why: str) -> None:
 def evaluate(
     dataset: str, run: str | None = None, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json: AsJson = False
 ) -> int:
-    """Evaluate WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, policies, costs.
+    """Evaluate WEIGHTS on the frames of DATASET that they were not trained on: accuracy and costs.
 
     `evaluate ARCHIVE RUN`, without weights, adds the accuracy to a published run; it takes only --labels, --controls
     and --json.

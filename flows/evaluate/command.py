@@ -1,4 +1,4 @@
-"""Run `spectralzoom evaluate`: judge weights on frames that they were not trained on, with intervals and costs."""
+"""Run `spectralzoom evaluate`: judge weights on frames that they were not trained on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from flows.terminal.figures import DASH, counted, format_count, format_percent, 
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, put_out, show_text, table
 from flows.training.data import Report, TrainingData
-from models.evaluation.metrics import LEVEL
 from models.network.machine import choose_device, keep_freed_memory
 from models.weights.files import Weights, load_weights
 from storage.archive.whole_files import to_json, write_whole
@@ -33,9 +32,8 @@ from storage.archive.whole_files import to_json, write_whole
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
 CAPTION = (
     "K: fraction of the valid patches. mIoU: of the counts of all frames, mean over the classes of the labels. "
-    "overall: fraction of right pixels. ±: standard deviation over seeds, else over random draws. [ ]: 95 % of "
-    "{draws} draws, paired bootstrap over frames, and over seeds if there are several. * uses labels. captured: gain "
-    "of the chosen patches over that of the oracle's. MACs: multiply-adds a frame."
+    "overall: fraction of right pixels. ±: standard deviation over seeds, else over random draws. "
+    "MACs: multiply-adds a frame."
 )
 
 
@@ -66,7 +64,7 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
             request.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(request, data, candidates, show)
     runs = _judge_frames(request, data, candidates, jobs.frames, show)
-    asked = {name: getattr(request, name) for name in ("fractions", "policies", "seed", "draws")}
+    asked = {name: getattr(request, name) for name in ("fractions", "policies", "seed")}
     content = {
         "dataset": data.law,
         "weights": [
@@ -81,7 +79,7 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
         ],
         "frames": list(jobs.frames),
         "left_out": jobs.left_out,
-        "settings": {**asked, "level": LEVEL, "camera": asdict(candidates[0].camera)},
+        "settings": {**asked, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, request),
         "data_notes": [*data.notes, *jobs.notes],
@@ -130,27 +128,24 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
         show_text(line, console)
     console.print(_accuracy(content))
     console.print(_classes(content))
-    console.print(escape(CAPTION.format(draws=content["settings"]["draws"])), soft_wrap=True, style="dim")
+    console.print(escape(CAPTION), soft_wrap=True, style="dim")
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    columns = ("placement", "K", "mIoU", "overall", "average", "kappa", "to all", "to random", "captured", "MACs")
+    columns = ("placement", "K", "mIoU", "overall", "average", "kappa", "MACs")
     rows = []
     for row in content["rows"]:
-        spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
+        spread = row["spread"]
         cells = (
-            f"{row['policy']}{'*' if row['uses_labels'] else ''}",
+            row["policy"],
             format_percent(row["fraction"]),
             format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}"),
             format_points(row["pixel_accuracy"]),
             format_points(row["average_accuracy"]),
             DASH if math.isnan(row["kappa"]) else f"{row['kappa']:.2f}",
-            format_difference(row["against_all"]),
-            format_difference(row["against_random"]),
-            format_percent(row["captured_gain"]),
             format_count(row["cost"]["multiply_adds"]["done"]),
         )
-        rows.append([f"[dim]{cell}" if row["uses_labels"] else cell for cell in cells])
+        rows.append(cells)
     return table(columns, rows, whole=columns[1:])
 
 
@@ -168,12 +163,3 @@ def _classes(content: dict[str, Any]) -> Table:
             cells += [format_points(row["per_class_iou"][name]) if false is None else f"{format_count(false)} px false"]
         rows.append([escape(name), format_count(support), *cells])
     return table(columns, rows, title="IoU by class", whole=columns[1:])
-
-
-def format_difference(interval: dict[str, float | None] | None) -> str:
-    """Format a difference in points of mIoU, with the bounds of its interval if there are any."""
-    if interval is None or interval["difference"] is None:
-        return ""
-    text = f"{100 * interval['difference']:+.1f}"
-    low, high = interval["low"], interval["high"]
-    return text if low is None or high is None else f"{text} [{100 * low:+.1f}, {100 * high:+.1f}]"

@@ -26,7 +26,6 @@ from flows.training.data import (
     scene_notes,
 )
 from flows.training.observed_scenes import observe_scene
-from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
 from models.network.spectral import patches_of
 from models.policies.policies import POLICIES
@@ -42,7 +41,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 
 FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
 JUDGED = tuple(name for name in POLICIES if name != "mask")  # needs a file
-USUAL = ("gain", "entropy", "sobel", "random")
+USUAL = ("gain", "random")
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,6 @@ class EvaluateRequest:
     frames: tuple[str, ...] = ()  # empty: all
     scenes: int | None = None  # of the built-in farm
     seed: int = 0
-    draws: int = DRAWS
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
     device: str = PROCESSOR  # or auto
 
@@ -68,17 +66,16 @@ def checked_request(request: EvaluateRequest) -> EvaluateRequest:
         if not 0 <= fraction <= 1:
             raise SettingsError(f"--fractions are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
     for policy in request.policies:
-        if policy not in JUDGED and policy != "oracle":
+        if policy not in JUDGED:
             raise SettingsError(
                 f"--policies: {policy!r} cannot be judged on a data set; choose from {', '.join(JUDGED)}"
             )
-    for flag, value, least in (("--seed", request.seed, 0), ("--draws", request.draws, 1)):
-        if value < least:
-            raise SettingsError(f"{flag} must be at least {least}, got {value}")
+    if request.seed < 0:
+        raise SettingsError(f"--seed must be at least 0, got {request.seed}")
     return replace(
         request,
         fractions=tuple(sorted({fraction for fraction in request.fractions if 0 < fraction < 1})),
-        policies=tuple(dict.fromkeys(name for name in request.policies if name != "oracle")),
+        policies=tuple(dict.fromkeys(request.policies)),
     )
 
 

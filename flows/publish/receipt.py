@@ -93,20 +93,11 @@ class Score(_Part):
     false_classes: dict[str, int] | None = None
 
 
-class Control(_Part):
-    """mIoU of another choice of patches, and its spread over repeats (null for a deterministic one)."""
-
-    miou: float | None
-    spread: float | None
-
-
 class Accuracy(Score):
-    """Accuracy against labels: of this map, without fine patches, with all of them, and with other choices."""
+    """Accuracy against labels: of this map; with controls also by the overview alone, and with all patches in full."""
 
-    none: Score
-    all: Score
-    gap_closed: float | None
-    controls: dict[str, Control]
+    none: Score | None = None
+    all: Score | None = None
 
 
 class ReceiptFields(_Part):

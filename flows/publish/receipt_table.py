@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
 from flows.tasks.scene import TRAINING_SCENE
-from flows.tasks.scores import NOT_JUDGED, format_prediction, format_worst_class
+from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
     counted,
     format_area,
@@ -111,7 +111,7 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         right = format_points(accuracy.get("overall_accuracy"))
         score = f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)"
         plan = receipt.get("plan", {})
-        alone = accuracy["none"]["miou"] is None or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
+        alone = accuracy.get("none") is None or (plan.get("kind") in ("scan", "raster") and "kept" not in receipt)
         full = "" if alone else f"; the full network on every patch gives {format_points(accuracy['all']['miou'])}"
         return f"{score}{full}. {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
@@ -131,7 +131,7 @@ def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     prior = receipt.get("prior_map")
     if accuracy is None or prior is None or prior["put_aside"] is not None:
         return accuracy
-    return {**accuracy, "none": NOT_JUDGED, "all": NOT_JUDGED, "controls": {}, "gap_closed": None}
+    return {name: value for name, value in accuracy.items() if name not in ("none", "all")}
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:

@@ -272,7 +272,7 @@ class Settings:
         example=Tolerance().value,
     )
     accuracy: bool = stated(True, "Compute the accuracy if there are labels; later with `evaluate ARCHIVE RUN`")
-    controls: bool = stated(True, "With the accuracy, also judge the small network, the full one and other placements")
+    controls: bool = stated(False, "With the accuracy, also judge the small network alone and the full one everywhere")
     engine: Literal["prefect", "plain"] = stated("prefect", "Workflow engine; plain runs without a server")
     memory: Memory = stated(4 * 1024**3, "Memory limit for tiles and regions", example="4GiB")
     scheduler: Scheduler = stated(

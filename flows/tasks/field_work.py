@@ -20,7 +20,7 @@ from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR, give_back_freed_memory
 from models.network.ood import OodDetector
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
-from models.policies.placement import COMPARED, classes_by
+from models.policies.placement import classes_by
 from models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
 from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.inference import (
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 NO_PATCHES = np.empty(0, np.int64)
 GAIN = "gain"
-OTHERS = [policy for policy in COMPARED if policy != GAIN]
 
 
 @dataclass(frozen=True)
@@ -155,17 +154,12 @@ class ExpectedErrors(MosaicReader):
 class Readings(MosaicReader):
     """Worker that segments a region by the overview alone, and by the full network everywhere."""
 
-    def __call__(self, region: Region) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
-        """Return (reading, y, x) classes of the kept part, and scores and errors of its patches.
-
-        Scores are (patch_y, patch_x, policy) by the policies other than ``gain``, errors those of `class_errors`.
-        """
+    def __call__(self, region: Region) -> NDArray[np.uint8]:
+        """Return (reading, y, x) classes of the kept part."""
         weights = self.weights.load()
         seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
         kept = region.numbers_here(region.field.every_patch())
-        maps = [region.crop(classes_by(weights, seen, patches)) for patches in (kept[:0], kept[kept >= 0])]
-        scores = np.stack([score_patches(policy, seen) for policy in OTHERS], axis=-1)
-        return np.stack(maps), region.crop_patches(scores), region.crop_patches(class_errors(seen))
+        return np.stack([region.crop(classes_by(weights, seen, some)) for some in (kept[:0], kept[kept >= 0])])
 
 
 def coarse_region(weights: Weights, mosaic: StageRef, region: Region, capture: LineSpec) -> CoarsePass:
@@ -240,20 +234,14 @@ class FieldWork:
         pixels = pixels.reshape(-1, *parts[0].wrong.shape)
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
-    def readings(
-        self, mosaic: StageRef, capture: LineSpec, report: Report
-    ) -> tuple[NDArray[np.uint8], dict[str, NDArray[np.float64]]]:
-        """Return the class maps (2, y, x) by the overview, and by the full network everywhere.
-
-        Also returns the (patch_y, patch_x) scores by the policies that are compared. Raises as `score`.
-        """
+    def readings(self, mosaic: StageRef, capture: LineSpec, report: Report) -> NDArray[np.uint8]:
+        """Return the class maps (2, y, x) by the overview, and by the full network everywhere. Raises as `score`."""
         grid = self.regions[0].field
         parts = self._of_regions(Readings(self.weights, mosaic, capture), mosaic, grid.every_patch(), report)
         maps = np.empty((2, grid.height, grid.width), np.uint8)
-        for region, (part, _, _) in zip(self.regions, parts, strict=True):
+        for region, part in zip(self.regions, parts, strict=True):
             maps[:, region.kept.rows, region.kept.columns] = part
-        scores, errors = (self._joined([part[which] for part in parts]) for which in (1, 2))
-        return maps, {GAIN: _field_gain(errors), **dict(zip(OTHERS, np.moveaxis(scores, -1, 0), strict=True))}
+        return maps
 
     def _of_regions(
         self, worker: Callable[[Region], Any], mosaic: StageRef, patch_index: NDArray[np.integer], report: Report

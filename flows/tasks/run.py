@@ -221,7 +221,7 @@ class SurveyRun(CaptureRun):
 
     @property
     def controls(self) -> bool:
-        """Return whether the evaluation compares other placements of patches."""
+        """Return whether the evaluation also judges the small network alone and the full one everywhere."""
         return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, SIM, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM, Settings
 from models.weights.files import Description
 from pipeline.errors import NoSceneYet, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -345,9 +345,7 @@ class SimulatedField(FieldSource):
 
 
 def for_rig(settings: Settings) -> Settings:
-    """Return settings without simulated controls for a rig or a recording; a visit of a rig has a name."""
-    if settings.source == RECORDED:
-        return replace(settings, controls=False)
-    if settings.source != RIG:
+    """Return settings in which a visit of a rig has a name."""
+    if settings.source != RIG or settings.visit is not None:
         return settings
-    return replace(settings, visit=settings.visit or f"{datetime.now(UTC):%Y-%m-%d}", controls=False)
+    return replace(settings, visit=f"{datetime.now(UTC):%Y-%m-%d}")

@@ -9,7 +9,6 @@ from flows.terminal.figures import format_count, format_points, known_number, sp
 from storage.arrays.class_maps import unknown_name
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
-NOT_JUDGED: Mapping[str, Any] = {"miou": None, "per_class_iou": {}}  # of a map that was not drawn
 MAPS = {"this survey": None, "small network": "none", "full network": "all"}  # name: key in a receipt's accuracy
 
 

@@ -209,7 +209,7 @@ def _learned(
     twice = read_twice(weights, frames)
     if twice:
         found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
-    found["validation"] = validate(twice, config.classes, settings.seed)
+    found["validation"] = validate(twice, config.classes)
     return weights, {"training": summary, **found}
 
 
@@ -285,7 +285,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
     rows = [
         [name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy"))]
-        for name in ("none", "random", "sobel", "entropy", "gain", "all")
+        for name in ("none", "gain", "all")
     ]
-    console.print(table(("placement", "mIoU", "overall"), rows, title=title))
-    console.print(f"none: overview alone; all: every patch in full; others: {figures['share_of_seats']:.0%}")
+    console.print(table(("patches", "mIoU", "overall"), rows, title=title))
+    console.print(f"none: overview alone; all: every patch in full; gain: {figures['fraction']:.0%} of the patches")

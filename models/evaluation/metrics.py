@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, cuts
 
-DRAWS = 2000  # of the bootstrap
-LEVEL = 0.95
 CONFIDENCE_BINS = 20
 BAD_ERROR = 0.02  # expected calibration error above which a temperature is fitted
 COOLEST, HOTTEST = 0.2, 5.0
@@ -72,14 +70,8 @@ def _divided(total: NDArray[np.number], number: NDArray[np.number], where: NDArr
 
 def mean_iou(counts: Numbers) -> float:
     """Return the mean IoU over the classes of the labels; NaN when nothing is labelled."""
-    return float(mean_iou_of_each(counts))
-
-
-def mean_iou_of_each(counts: Numbers) -> Floats:
-    """Return `mean_iou` of many confusion counts at once, (..., class, class) -> (...)."""
     held = labelled_classes(counts)
-    number = held.sum(axis=-1)
-    return _divided(np.where(held, iou_per_class(counts), 0).sum(axis=-1), number, where=number > 0)
+    return float(iou_per_class(counts)[held].mean()) if held.any() else float("nan")
 
 
 def agreement(counts: Counts) -> dict[str, float]:
@@ -106,69 +98,6 @@ def kappa(counts: Counts) -> float:
         return float("nan")
     agreed, chance = np.trace(counts) / total, float((counts.sum(axis=0) / total) @ (counts.sum(axis=1) / total))
     return float((agreed - chance) / (1 - chance)) if chance < 1 else float("nan")
-
-
-def gap_closed(reached: float, none: float, all_patches: float) -> float | None:
-    """Return the fraction of the gain of all patches over none that is reached; None for a gain below one point."""
-    way = all_patches - none
-    return (reached - none) / way if way >= 0.01 else None  # NaN is None too
-
-
-# intervals of a difference
-
-
-@dataclass(frozen=True)
-class Interval:
-    """Difference of mIoU (first minus second) with the bounds of its ``LEVEL`` interval."""
-
-    difference: float
-    low: float | None  # None with fewer than two frames, or where no draw has a difference
-    high: float | None
-
-
-def paired_interval(
-    first: Counts, second: Counts, *, seeds: tuple[Numbers, Numbers] | None = None, draws: int = DRAWS, seed: int = 0
-) -> Interval:
-    """Bootstrap the difference of two rows over frames, and over the seeds of trainings where there are several.
-
-    ``first`` and ``second`` are (run, frame, class, class) confusion counts of the same frames. The figure of a row is
-    the mean over its runs of the mIoU of all frames together. A frame that a run did not judge is all zeros. ``seeds``
-    number the training of each run, (run,) from 0. Frames and trainings are drawn with replacement, the same for both
-    rows; without ``seeds`` all runs count alike.
-    """
-    of_runs = (np.zeros(len(first), np.intp), np.zeros(len(second), np.intp)) if seeds is None else seeds
-    frames = first.shape[1]
-    once = np.ones((1, frames), np.int64)
-    difference = float((_means(first, once) - _means(second, once))[0])
-    if frames < 2:
-        return Interval(difference, None, None)
-    times = _drawn(frames, draws, [seed, 0xB007])
-    changes = []
-    for counts, of in zip((first, second), of_runs, strict=True):
-        trainings = int(of.max()) + 1
-        changes.append(_means(counts, times, _drawn(trainings, draws, [seed, 0x5EED, trainings])[:, of]))
-    moved = changes[0] - changes[1]
-    moved = moved[~np.isnan(moved)]
-    if not moved.size:
-        return Interval(difference, None, None)
-    low, high = np.quantile(moved, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Interval(difference, float(low), float(high))
-
-
-def _drawn(count: int, draws: int, seed: list[int]) -> Counts:
-    """Return how often each of ``count`` is drawn in as many draws with replacement, (draw, count)."""
-    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
-
-
-def _means(counts: Counts, times: Numbers, often: Numbers | int = 1) -> Floats:
-    """Return the mean over runs of the mIoU of frames taken ``times`` (draw, frame) each; NaN without a frame.
-
-    A run counts ``often`` (draw, run).
-    """
-    each = mean_iou_of_each(np.einsum("df,rfij->drij", times, counts))
-    weight = (~np.isnan(each)) * often
-    number = weight.sum(axis=1)
-    return _divided((np.nan_to_num(each) * weight).sum(axis=1), number, where=number > 0)
 
 
 # calibration: confidence against the fraction of right pixels

@@ -38,11 +38,11 @@ def score_patches(
     """
     grid = seen.grid
     if policy == "random":
-        return random_scores(grid, seed)
-    if policy == "gain":
+        scores = np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape)
+    elif policy == "gain":
         found = class_errors(seen)
         return gain_of(found[:, 0], found[:, 1].sum(axis=0))
-    if policy == "mask":
+    elif policy == "mask":
         image = np.zeros(grid.padded_shape)
         values = np.asarray(mask, np.float64).reshape(grid.height, grid.width, -1).mean(axis=-1)
         image[: grid.height, : grid.width] = np.nan_to_num(values)
@@ -52,11 +52,6 @@ def score_patches(
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
     return (scores * grid.valid_fraction()).ravel()
-
-
-def random_scores(grid: SceneGrid, seed: int) -> Scores:
-    """Return random scores of every patch of the padded grid, (patches,), weighted by its fraction on the scene."""
-    return (np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape) * grid.valid_fraction()).ravel()
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:

@@ -52,7 +52,7 @@ def measure(px: int) -> Moments:
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         told = {
             **{"size": f"{px}x{px}", "source": "rig", "visit": "first", "out": name, "engine": "plain"},
-            **{"controls": False, "rig.white_reference": 0.99, "rig.pulses": "position"},
+            **{"rig.white_reference": 0.99, "rig.pulses": "position"},
         }
         moments = Moments()
         stack.enter_context(_watched(moments))

@@ -26,7 +26,6 @@ from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
 from models.network.machine import keep_freed_memory, one_thread
 from models.network.sizes import multiply_adds
 from models.network.spectral import LineSpec, patches_of
-from models.policies.placement import CONTROL_FRACTION, RANDOM_DRAWS
 from models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
 from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from models.training.examples import normalised, observe
@@ -39,6 +38,7 @@ COUNTS = (100, 200, 300, 400, 500)
 NAMES = {4: "256", 2: "512", 1: "1024"}  # of inputs, by fine pixels a side of a coarse one
 HELD_OUT = ("002", "007", "012", "017", "020", "025", "033", "037", "041", "045", "050", "053", "057")  # of CWFID
 STEPS = 300
+RANDOM_DRAWS = 5
 POLICIES = {  # the paper's name, the policy, and the pooling of a patch
     "ED, maximum": ("sobel", "maximum"),
     "ED, mean": ("sobel", "mean"),
@@ -148,7 +148,7 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
         for factor in (*INPUTS, 1):
             read = read_scene(data.weights, columns, scene.labels, grid, factor)
             coarse = 0 if factor == 1 else int(np.prod([-(-n // (grid.patch * factor)) for n in scene.shape]))
-            part = max(round(CONTROL_FRACTION * every) - coarse, 0)
+            part = max(round(0.35 * every) - coarse, 0)
             rows = {f"{k}": k for k in counts if k <= every and factor > 1} | {"35 %": part, "0": 0, "all": every}
             for label, (policy, pooling) in POLICIES.items():
                 draws = range(1000, 1000 * (RANDOM_DRAWS if policy == "random" else 1) + 1, 1000)

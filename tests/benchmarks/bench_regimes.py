@@ -144,7 +144,7 @@ def asked(seed: int, light: float, swaths: int, seconds: float, zoom: str, out: 
     """Return the settings of a survey."""
     flags = {"scene": "farm", "seed": seed, "size": SIZE, "seconds": f"{seconds:.1f}", "engine": "plain", "zoom": zoom}
     flags |= {"sky.light_fraction": light, "camera.samples": int(SIZE.split("x")[0]) // swaths, "unknown": "off"}
-    return load_settings(None, {name: str(one) for name, one in flags.items()} | {"controls": False, "out": out})
+    return load_settings(None, {name: str(one) for name, one in flags.items()} | {"out": out})
 
 
 def score(seed: int, share: float, light: float, swaths: int, seconds: float, way: str) -> float:

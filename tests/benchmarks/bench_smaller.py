@@ -32,13 +32,14 @@ from models.network.machine import choose_device
 from models.network.segmenter import Segmenter
 from models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths, multiply_adds
 from models.network.spectral import Normalisation
-from models.policies.placement import ReadTwice, run_controls
+from models.policies.placement import ReadTwice
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
 from models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import frame_patches
 from pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 
@@ -81,7 +82,12 @@ def trained(asked: TrainRequest, scenes: Scenes, normalisation: Normalisation) -
 
 def score(judged: list[ReadTwice], classes: int, policy: str, fraction: float = 1.0) -> list[float]:
     """Return the mIoU [%] of all farms together, and of each, with a fraction of the patches by a policy."""
-    counts = [run_controls(one, classes, fraction=fraction, seed=0)[policy][0] for one in judged]
+    counts = []
+    for one in judged:
+        chosen = np.full(one.gain.shape, policy == "all")
+        if policy == "gain":
+            chosen[frame_patches(one.gain, fraction)] = True
+        counts.append(one.counts(chosen, classes))
     return [100 * mean_iou(one) for one in (np.sum(counts, axis=0), *counts)]
 
 

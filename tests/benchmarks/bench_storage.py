@@ -108,7 +108,7 @@ def _warm(folder: Path) -> Row:
     from flows.tasks.open_survey import OpenSurvey
     from flows.tasks.run import open_run
 
-    flags = {"scene": "farm", "budget": 0.5, "out": str(folder / "archive"), "engine": "plain", "controls": False}
+    flags = {"scene": "farm", "budget": 0.5, "out": str(folder / "archive"), "engine": "plain"}
     settings = load_settings(None, flags)
     first = {stage["name"]: stage for stage in run_survey(settings, Console(quiet=True)).receipt["stages"]}
     again = OpenSurvey(open_run(settings))

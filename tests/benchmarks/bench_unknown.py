@@ -78,7 +78,7 @@ def _farm(seed: int, day: int, scan_pass: dict[str, Any]) -> Judged:
 
 def _survey(given: dict[str, Any], unknown: str) -> Judged:
     with tempfile.TemporaryDirectory() as out:
-        plain = {"engine": "plain", "controls": False, "unknown": unknown, "out": out, **given}
+        plain = {"engine": "plain", "unknown": unknown, "out": out, **given}
         receipt = run_survey(load_settings(None, plain), Console(quiet=True)).receipt
     miou = receipt.get("accuracy", {}).get("miou")
     return {

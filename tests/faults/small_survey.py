@@ -19,7 +19,7 @@ from tests.faults.nursery import Ended, Nursery
 SETTINGS = "[camera]\nsamples = 128\n"  # most time of a small survey goes into samples outside of the field
 SURVEY = (
     "survey camera.toml --source sim --scene scene.png --labels labels.png --weights weights.safetensors "
-    "--engine plain --no-controls --budget 0.95 --effects shot --keep raw"
+    "--engine plain --budget 0.95 --effects shot --keep raw"
 )
 UNDISTURBED = "undisturbed"
 Stored = dict[str, dict[str, str]]  # address of a store -> SHA-256 of each of its files

@@ -27,7 +27,7 @@ from tests.receipts import comparable, receipts
 GOING_ON = "terminated; run the same command to resume"
 SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
-    "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGTERM),
+    "in the controls": ("flows.tasks.stages.accuracy:mixed", 1, signal.SIGTERM),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
@@ -61,7 +61,7 @@ def mapped(subject: Subject) -> Path:
 
 def asked(out: Path) -> list[str]:
     """Return the command of the survey with controls."""
-    return [word for word in words(out) if word != "--no-controls"]
+    return [*words(out), "--controls"]
 
 
 def stopped(subject: Subject, out: Path, place: str, call: int, number: int) -> Ended:

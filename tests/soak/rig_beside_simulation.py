@@ -25,7 +25,7 @@ from tests.faults.nursery import ROOT
 
 SIZE, QUICK_SIZE = "256x256", "128x128"
 QUICK_BANDS = ",".join(map(str, range(8, 264, 16)))
-SURVEY = ("survey", "--budget", "0.8", "--keep", "raw", "--no-controls", "--engine", "plain", "--json")
+SURVEY = ("survey", "--budget", "0.8", "--keep", "raw", "--engine", "plain", "--json")
 PRODUCTS = ("raw_coarse", "raw_fine", "mosaic", "class_map")
 
 

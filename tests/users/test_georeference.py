@@ -79,7 +79,7 @@ KINDS: dict[str, Callable[[Path], tuple[Path, Affine]]] = {
 def survey(scene: Path, weights: Path, out: Path, **flags: Any) -> Published:
     """Survey the scene without effects, accuracy or controls."""
     files = {"scene": str(scene), "weights": str(weights), "out": str(out)}
-    given = {"source": "sim", "engine": "plain", "budget": 0.8, "accuracy": False, "controls": False}
+    given = {"source": "sim", "engine": "plain", "budget": 0.8, "accuracy": False}
     with without_effects():
         return run_survey(load_settings(None, {**files, **given, **flags}), QUIET)
 

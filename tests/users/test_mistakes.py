@@ -19,7 +19,7 @@ from tests.users.mistaken_files import NM, write_files
 
 __all__ = ["command_line"]
 
-SURVEY = "survey --engine plain --no-controls --no-accuracy --out never --weights w.safetensors --source sim --scene "
+SURVEY = "survey --engine plain --no-accuracy --out never --weights w.safetensors --source sim --scene "
 TRAIN = "train --steps 1 --dim 16 --layers 1 --heads 2 -o new.safetensors "
 BANDS = f" --wavelengths {NM}"
 

@@ -56,7 +56,7 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     archive, out = tmp_path_factory.mktemp("products") / "field", tmp_path_factory.mktemp("maps").resolve()
     given = {"size": "192x128", "bands": BANDS, "budget": "0.9", "engine": "plain", "seed": "1"}
     given["unknown"] = "off"  # with these bands the 270-band weights call many pixels unknown
-    settings = load_settings(None, {**given, "out": str(archive), "controls": False})
+    settings = load_settings(None, {**given, "out": str(archive)})
     with without_effects():
         published = run_survey(replace(settings, pose=POSE), QUIET)
     return exported(archive, out, published.receipt, **FLAGS, cell=3.0)

@@ -30,7 +30,7 @@ Heard = dict[str, list[float]]
 def asked(scene_files: Path, weights: Path) -> dict[str, object]:
     """Return the settings of a small survey with a pose, as a table."""
     files = {"scene": scene_files / "scene.png", "labels": str(scene_files / "labels.png"), "weights": weights}
-    quick = {"camera": {"samples": 320}, "budget": 0.8, "accuracy": False, "controls": False}
+    quick = {"camera": {"samples": 320}, "budget": 0.8, "accuracy": False}
     return {**files, "source": "sim", "pose": POSE, **quick}
 
 

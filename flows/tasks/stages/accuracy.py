@@ -1,7 +1,6 @@
-"""Define the stage that evaluates a map by labels: its accuracy, and that of no, all and other fine patches.
+"""Define the stage that evaluates a map by labels; with controls also maps of the small and of the full network alone.
 
-It needs labels and does not count as cost of the survey. Other placements are mixed from two maps of the field: by the
-overview alone, and with every patch read in full.
+It needs labels and does not count as cost of the survey.
 """
 
 from __future__ import annotations
@@ -14,20 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.capture_plan import CapturePlan
-from flows.tasks.scores import NOT_JUDGED
 from flows.tasks.stage import Product, Report, Wanted, stage
-from flows.tasks.stages.attention import PatchGains, read_in_full
+from flows.tasks.stages.attention import PatchGains
 from flows.tasks.stages.placement import load_registration
-from models.evaluation.metrics import (
-    agreement,
-    average_accuracy,
-    confusion,
-    false_pixels,
-    gap_closed,
-    iou_per_class,
-    kappa,
-)
-from models.policies.placement import CONTROL_FRACTION, ReadTwice, placement_figures, run_controls
+from models.evaluation.metrics import agreement, average_accuracy, confusion, false_pixels, iou_per_class, kappa
+from models.policies.placement import mixed
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
 from pipeline.simulator.effects.pointing import PointingErrors
@@ -38,7 +28,7 @@ from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=17, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=18, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy, after publication", ACCURACY)
@@ -49,51 +39,33 @@ def evaluate(
     *sources: StageRef,
     gains: PatchGains,
     plan: CapturePlan,
-    chooses: bool,
     simulated: SimulatedSource,
     source_key: Mapping[str, Any],
     labels: NDArray[np.uint8],
     model_key: Mapping[str, Any],
     controls: bool,
-    seed: int,
     report: Report,
 ) -> Wanted:
-    """Evaluate the map by the labels, and with controls other readings and placements of fine patches.
+    """Evaluate the map by the labels, and with controls readings by the overview and by the full network.
 
     ``sources`` are the effects and the registration of the capture; a raster has neither.
     """
     labels = moved_labels(labels, map_offset(simulated, sources[1:]), plan.along)
 
     def build(path: Path) -> None:
-        """Write the figures of the map and, with controls, of the overview, a full reading and other placements."""
+        """Write the figures of the map and, with controls, of the overview and of a full reading."""
         drawn = load_class_map(class_map.path / "class_map.zarr")
         names = gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
         counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
-        result: dict[str, Any] = map_figures(names, counts) | {
-            "confusion": counts.tolist(),
-            "none": NOT_JUDGED,
-            "all": NOT_JUDGED,
-            "gap_closed": None,
-            "controls": {},
-        }
+        result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
         if controls:
-            readings, scores = gains.work.readings(mosaic, gains.capture, report)
-            readings = np.where(drawn.classes == len(names), drawn.classes, readings)  # unknown in all
-            patches = read_in_full(attention, class_map) if chooses else None
-            scene = ReadTwice(readings[0], readings[1], scores, judged, gains.frame.grid)
-            zoned = gains.zones.fractions
-            among = np.ones(len(scene.grid.every_patch()), np.bool_) if zoned is None else zoned > 0
-            fraction = CONTROL_FRACTION if patches is None else len(patches) / max(int(among.sum()), 1)
-            found = run_controls(scene, len(drawn.names), fraction=fraction, seed=seed, among=among)
-            none, every = (map_figures(names, found[which][0]) for which in ("none", "all"))
-            result |= {
-                "none": none,
-                "all": every,
-                "gap_closed": gap_closed(result["miou"], none["miou"], every["miou"]),
-                "controls": placement_figures(found),
-                "controls_fraction": fraction,
-            }
+            overview, full = gains.work.readings(mosaic, gains.capture, report)
+            fractions, grid = gains.zones.fractions, gains.frame.grid
+            kept = np.ones(len(grid.every_patch()), np.bool_) if fractions is None else fractions > 0
+            for name, reading in {"none": overview, "all": mixed(overview, full, kept, grid)}.items():
+                classes = np.where(drawn.classes == len(names), drawn.classes, reading)  # unknown in all
+                result[name] = map_figures(names, confusion(judged, classes, len(drawn.names)))
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}

@@ -39,7 +39,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
     """Return exports of one farm, without a pose and with one, from one archive into one folder."""
     archive, out = tmp_path_factory.mktemp("surveys") / "field #ä", tmp_path_factory.mktemp("exports").resolve()
     flags = {"size": "128x96", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain", "keep": "raw"}
-    settings = load_settings(None, {**flags, "out": str(archive), "controls": False, "seed": "1"})
+    settings = load_settings(None, {**flags, "out": str(archive), "seed": "1"})
     with without_effects():
         published = [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
     return [

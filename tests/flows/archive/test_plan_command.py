@@ -34,7 +34,7 @@ WAITS = {"locate": "condense_coarse", "rectify": "locate", "score": "rectify", "
 def settings(scene_files: Path, flags_png: Flags) -> Settings:
     """Return settings of the small picture with labels; each plan names its own archive."""
     labels = str(scene_files / "labels.png")
-    flags = flags_png("archive", labels=labels, engine="plain", budget="0.8", controls=False)
+    flags = flags_png("archive", labels=labels, engine="plain", budget="0.8")
     return load_settings(None, flags)
 
 

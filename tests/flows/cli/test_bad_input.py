@@ -88,7 +88,7 @@ REFUSED = {
 def survey_words(more: str, out: str = "archive") -> list[str]:
     """Return a working survey command with flags added or replaced."""
     words = ["--scene", "scene.png", "--source", "sim", "--weights", "w.safetensors", "--engine", "plain"]
-    words += ["--out", out, "--no-controls"]
+    words += ["--out", out]
     given = more.split()
     for flag in given[::2]:
         if flag in words:

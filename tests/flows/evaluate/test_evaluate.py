@@ -14,7 +14,7 @@ from rich.console import Console
 from flows.cli.main import main
 from flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
 from flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
-from flows.evaluate.judge import ORACLE, collect_row, difference, judge_frame, seeds_of, summarise
+from flows.evaluate.judge import collect_row, judge_frame, seeds_of, summarise
 from flows.tasks.scene import pack_mask
 from flows.training.data import farm_test_data
 from flows.training.train import train_weights
@@ -35,14 +35,14 @@ def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any
     return next(row for row in content["rows"] if (row["policy"], row["fraction"]) == (policy, fraction))
 
 
-TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=(), draws=10)
+TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=("entropy",))
 
 
 def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
     """Rows hold the mean over the seeds and its spread; the folder holds evaluation.json alone."""
     request, content = judged
     keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
-    policies = [(policy, fraction) for policy in ("entropy", "random", ORACLE) for fraction in (0.25, 0.5)]
+    policies = [(policy, fraction) for policy in ("entropy", "random") for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
@@ -52,19 +52,15 @@ def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
     assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
     assert len(row["by_seed"]) == 2
-    assert row["against_all"]["low"] <= row["against_all"]["difference"] <= row["against_all"]["high"]
 
 
-def test_costs_are_relative_to_all_patches_and_the_oracle_captures_all_gain(judged: Judged):
-    """More patches cost more; the oracle's row is marked as one that uses labels."""
+def test_costs_are_relative_to_all_patches(judged: Judged):
+    """More patches cost more."""
     _, content = judged
     cost = {fraction: _row(content, "entropy", fraction)["cost"] for fraction in (0.25, 0.5)}
     for column in ("patches", "multiply_adds"):
         assert cost[0.25][column]["done"] < cost[0.5][column]["done"]
     assert _row(content, "all", 1.0)["cost"]["patches"]["ratio"] == 1.0
-    row = _row(content, ORACLE, 0.5)
-    assert row["uses_labels"]
-    assert row["captured_gain"] in (None, pytest.approx(1))
 
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
@@ -179,9 +175,8 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     assert row["pixel_accuracy"] == overall_accuracy(counts)
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
-    assert row["against_all"]["low"] is None  # one frame alone has no interval
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("overall", "average", "kappa", "captured"))
+    assert all(word in shown for word in ("overall", "average", "kappa", "MACs"))
 
 
 def test_miou_of_frames_comes_from_their_summed_counts():
@@ -211,10 +206,10 @@ def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, caps
 
 
 def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
-    given = {"draw": 0, "patches": 2, "multiply_adds": 3, "gain": 1.0, "best_gain": 2.0}
+    given = {"draw": 0, "patches": 2, "multiply_adds": 3}
     rows = [
         {"policy": policy, "fraction": fraction, "counts": rng.integers(1, 9, (2, 2)).tolist(), **given}
-        for policy, fraction in (("none", 0.0), ("oracle", 0.5), ("all", 1.0))
+        for policy, fraction in (("none", 0.0), ("entropy", 0.5), ("all", 1.0))
     ]
     return {"frame": name, "rows": rows}
 
@@ -228,9 +223,7 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
     row, less = collect_row([joined], "none", 0.0), collect_row([joined, part], "none", 0.0)
     assert less.counts.shape == (2, 3, 2, 2)
     assert not less.counts[1, 2].any()
-    found = difference(row, less, TRIAL)
-    wanted = row.over_runs(mean_iou).mean() - less.over_runs(mean_iou).mean()
-    assert (found["difference"], found["frames"]) == (pytest.approx(wanted), 3)
+    assert (row.counts.sum(axis=0) == less.counts[0]).all()
 
 
 def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -250,7 +243,6 @@ def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.Mo
     [
         ({"fractions": (10.0,)}, "--fractions are fractions of the patches from 0 to 1"),
         ({"policies": ("mask",)}, "'mask' cannot be judged"),
-        ({"draws": 0}, "--draws must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),
         ({"scenes": 2}, "--scenes is for built-in scenes"),
         ({"frames": ("099",)}, "has no frame 099; it has 001, 002, 003"),
@@ -267,12 +259,12 @@ def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureF
     """Rows, classes and notes are printed from the stored evaluation; --json prints one object on stdout."""
     run_evaluate(judged[0], Console(stderr=True))
     shown = capsys.readouterr()
-    for words in ("oracle*", "MACs", "crop", "uses labels", "paired bootstrap"):
+    for words in ("entropy", "MACs", "crop", "standard deviation over seeds"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
     weights = write_weights(tmp_path / "w.safetensors")
     words = ["evaluate", str(data), "--weights", str(weights), "--fractions", "0.5", "--policies", "entropy", "--json"]
     with pytest.raises(SystemExit) as left:
-        main([*words, "--frames", "001", "--draws", "5"])
+        main([*words, "--frames", "001"])
     assert left.value.code == 0
     assert json.loads(capsys.readouterr().out)["frames"] == ["001"]

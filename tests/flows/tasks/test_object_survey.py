@@ -34,7 +34,7 @@ from tests.storage.small_bucket import rot
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
+SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--engine", "plain")
 CACHED = {"cached"}
 SCANNED: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "keep": "raw 7d"}
 OF_THIS = set(STAGES) - {"register_coarse", "register_fine", "ground", "condense_raster"}

@@ -138,8 +138,7 @@ def test_the_best_patches_are_read_within_the_budget(survey_png: Survey, tmp_pat
     assert kept["multiply_adds"] == {"done": costs["done"], "everything": costs["full"]}
     assert kept["asked"]["macs"] == "80%"
     accuracy = published.receipt["accuracy"]
-    assert accuracy["controls_fraction"] == len(patch_index) / 192
-    assert accuracy["controls"]["sobel"]["miou"] == pytest.approx(accuracy["miou"], abs=0.02)
+    assert accuracy["none"]["miou"] != accuracy["all"]["miou"]
     page = (published.folder / "report.html").read_text(encoding="utf-8")
     assert "the full network on the chosen patches" in page
     assert f"{len(patch_index)} patches read in full; multiply-adds" in page

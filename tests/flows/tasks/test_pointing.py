@@ -42,6 +42,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
         "effects": "rotation,slit,smear,vignetting,shot,read-noise",  # without blur: lines far apart are not alike
         "seed": str(SEED),
         "budget": "0.7",
+        "controls": True,
         "pointing_px": str(OFF_PX),
         "out": str(archive),
         "engine": "plain",

@@ -97,7 +97,7 @@ def walk(
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, Counter(), {})
     files = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]
-    flags = ["--source", "sim", "--engine", "plain", "--budget", "0.8", "--no-controls"]
+    flags = ["--source", "sim", "--engine", "plain", "--budget", "0.8"]
     words = ["survey", *files, *flags, "--out", found.out]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))

@@ -82,7 +82,7 @@ def test_stores_of_another_run_are_not_cleared(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("no_effects")
 def test_raw_lines_are_stored_once_and_as_uint16(tmp_path: Path) -> None:
     """Every captured line is in one array, under one name; the spool is empty; derived arrays are smaller."""
-    flags = {"scene": "farm", "size": "192x160", "engine": "plain", "controls": False, "budget": "0.95", "keep": "raw"}
+    flags = {"scene": "farm", "size": "192x160", "engine": "plain", "budget": "0.95", "keep": "raw"}
     bands = ",".join(map(str, range(5, 265, 10)))  # as many as a spectrum of light needs
     root = tmp_path / "archive"
     published = run_survey(load_settings(None, {**flags, "bands": bands, "out": str(root)}), QUIET)

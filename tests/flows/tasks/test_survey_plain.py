@@ -73,7 +73,14 @@ class Done:
 def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
     """Return a survey of a small built-in farm with the shipped weights and controls."""
     out = tmp_path_factory.mktemp("farm")
-    flags = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS, "budget": "0.9", "seed": "1", "engine": "plain"}
+    flags = {
+        "size": f"{FARM[1]}x{FARM[0]}",
+        "bands": FEW_BANDS,
+        "budget": "0.9",
+        "seed": "1",
+        "engine": "plain",
+        "controls": True,
+    }
     return Done(run_survey(load_settings(None, {**flags, "out": str(out)}), QUIET), out)
 
 
@@ -87,8 +94,9 @@ def test_receipt_has_every_field(farm: Done) -> None:
         (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
         if stage["name"] not in ("capture_coarse", "capture_fine", "rectify"):  # these are cleared by now
             assert stage["manifest_sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
-    assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
-    assert 0 <= receipt["accuracy"]["miou"] <= 1
+    assert all(
+        0 <= one["miou"] <= 1 for one in (receipt["accuracy"], *(receipt["accuracy"][name] for name in ("none", "all")))
+    )
     assert {row["name"] for row in receipt["effects"]} == set(BY_NAME)
     assert receipt["effects_total"]["bound"] <= receipt["effects_total"]["tolerance"] == 0.1
     assert 0 < farm.published.captured_again < 1
@@ -183,9 +191,7 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
 def test_uncomputed_scores_are_left_out(surveyed_png: Any, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
     """Without controls the map alone is judged; without labels there is no accuracy."""
     accuracy = surveyed_png(tmp_path / "picture").receipt["accuracy"]
-    assert accuracy["controls"] == {}
-    assert accuracy["none"]["miou"] is accuracy["all"]["miou"] is None
-    assert accuracy["gap_closed"] is None
+    assert not {"none", "all"} & {*accuracy}
     assert accuracy["miou"] is not None
     nm = "640,460,500,550,620,600"
     found = survey_png(tmp_path, scene=str(scene_files / "cube.npy"), labels=None, wavelengths=nm, budget="1").receipt

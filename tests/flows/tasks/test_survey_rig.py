@@ -44,7 +44,6 @@ SMALL: dict[str, Any] = {
     "size": "128x128",
     "bands": "40,90,150,200",
     "engine": "plain",
-    "controls": False,
     "budget": 0.8,
     "rig.white_reference": 0.99,  # of the farm's white reference
     "rig.pulses": "position",

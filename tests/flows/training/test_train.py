@@ -135,11 +135,11 @@ def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: boo
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
-    """The table has a row per policy, the baselines and the readings with their mIoU."""
+    """The table has rows of no, some and all patches, the baselines and the readings with their mIoU."""
     shown = io.StringIO()
-    rows = {"none", "random", "sobel", "entropy", "gain", "all"}
+    rows = {"none", "gain", "all"}
     judged = run_train(_request(folder, out, validation=1), Console(file=shown, width=100))["validation"]
-    assert set(judged) - {"scenes", "share_of_seats"} == rows
+    assert set(judged) - {"scenes", "fraction"} == rows
     for name in rows:
         assert all(0 <= judged[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
@@ -161,20 +161,16 @@ def test_few_labels_give_the_mean_of_network_and_linear_classifier(
     assert readings["kept"] == (kept or max(scores, key=lambda name: scores[name]))
 
 
-def test_counts_of_validation_scenes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A row's score uses the summed counts of all scenes; the i-th random draws of all scenes are summed together."""
-    counts = [np.diag([number, 9]) + np.array([[0, 1], [number, 0]]) for number in range(1, 5)]
-    scenes = iter(
-        {"none": counts[:1], "all": counts[1:2], "gain": counts[2:3], "random": [counts[at], counts[3]]}
-        for at in (0, 2)
-    )
-    monkeypatch.setattr(figures, "run_controls", lambda *given, **named: next(scenes))
-    one = ReadTwice(*np.zeros((2, 1, 1), np.uint8), {}, np.zeros((1, 1), np.uint8), SceneGrid(1, 1, 1))
-    found = figures.validate([one, one], 2, 0)
-    assert found["gain"]["miou"] == mean_iou(2 * counts[2])
-    draws = [mean_iou(counts[0] + counts[2]), mean_iou(2 * counts[3])]
-    assert found["random"]["miou"] == pytest.approx(np.mean(draws))
-    assert found["random"]["spread"] == pytest.approx(np.std(draws, ddof=1))
+def test_counts_of_validation_scenes_add_up() -> None:
+    """A row's score uses the summed counts of all scenes."""
+    labels = np.array([[0, 0, 1, 1]], np.uint8)
+    maps = np.array([[[0, 1, 1, 0]], [[0, 0, 1, 0]]], np.uint8)  # by the overview, and in full
+    scenes = [ReadTwice(*maps, gain, labels, SceneGrid(1, 4, 1)) for gain in (np.eye(4)[1], np.eye(4)[2])]
+    found = figures.validate(scenes, 2)
+    assert found is not None
+    assert found["none"]["miou"] == mean_iou(np.array([[2, 2], [2, 2]]))
+    assert found["gain"]["miou"] == mean_iou(np.array([[3, 1], [2, 2]]))  # one patch of four, by the highest gain
+    assert found["all"]["miou"] == mean_iou(np.array([[4, 0], [2, 2]]))
 
 
 @pytest.mark.parametrize("validation", [True, False])

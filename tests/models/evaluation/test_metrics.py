@@ -122,15 +122,6 @@ def test_a_map_of_another_size_is_refused():
         metrics.confusion(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
 
 
-def test_gap_closed_needs_a_gap_of_one_point():
-    """The fraction is given only if reading every patch is better than reading none by one point of mIoU or more."""
-    assert metrics.gap_closed(0.6, 0.5, 0.7) == pytest.approx(0.5)
-    assert metrics.gap_closed(0.4, 0.5, 0.3) is None
-    assert metrics.gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
-    assert metrics.gap_closed(0.505, 0.5, 0.509) is None
-    assert metrics.gap_closed(0.5, float("nan"), 0.7) is None
-
-
 def test_calibration_error_compares_confidence_with_accuracy():
     """An error of 0.8 in 10 of 40 pixels gives 0.2; counts of two maps add up; without a pixel the error is NaN."""
     nine = np.full(10, 0.9)
