@@ -9,15 +9,16 @@ import os
 import secrets
 import socket
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from contextvars import copy_context
 from http.client import HTTPException
-from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,7 +33,7 @@ from flows.tasks.prefect_tasks import (
     prefect_settings,
     uvicorn,
 )
-from flows.terminal.processes import place_pages
+from flows.terminal.processes import cache_folder, place_pages
 from pipeline.errors import SettingsError
 
 HOST = "127.0.0.1"
@@ -142,21 +143,41 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
 
 
 def create_database(path: Path) -> None:
-    """Create the database of the server with the tables of the pinned version, unless it exists.
+    """Create the database of the server with Prefect's tables, unless it exists.
 
-    Prefect would run 90 migrations, in 9 s. Newer versions of Prefect migrate the database.
+    Prefect's 90 migrations take 6 s of processor time. They run once for a version, in the user's cache folder, and
+    each archive gets a copy. A user without such a folder waits for them in each new archive.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    schema = resources.files("flows.tasks").joinpath("prefect_schema.sql").read_text(encoding="utf-8")
-    if path.exists() or f"Prefect {prefect.__version__}\n" not in schema:
+    cache = cache_folder(os.environ)
+    if path.exists() or cache is None:
         return
+    migrated = cache / "spectralzoom" / f"prefect-{prefect.__version__}.db"
+    if not migrated.exists():
+        _put_in_place(migrated, _migrate)
+    with closing(sqlite3.connect(migrated)) as kept:
+        kept.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
+        _put_in_place(path, lambda part: kept.execute("VACUUM INTO ?", (str(part),)))
+
+
+def _put_in_place(path: Path, make: Callable[[Path], object]) -> None:
+    """Make a file beside its place, and rename it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f"{path.name}-", dir=path.parent) as folder:
-        part = Path(folder) / path.name
-        with closing(sqlite3.connect(part)) as made:
-            made.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
-            made.execute("PRAGMA journal_mode = WAL")
-            made.executescript(schema)
-        part.replace(path)
+        make(Path(folder) / path.name)
+        (Path(folder) / path.name).replace(path)
+
+
+def _migrate(path: Path) -> None:
+    """Create an empty database with the tables of the installed Prefect, in a process with settings of its own."""
+    own = {"PREFECT_HOME": str(path.parent), "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{path}"}
+    upgrade = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "-y"]
+    try:
+        subprocess.run(upgrade, env={**os.environ, **QUIET, **own}, check=True, capture_output=True, text=True)
+    except subprocess.CalledProcessError as error:
+        raise ServerUnavailable(f"Prefect cannot create its database ({error.stderr.strip()[-300:]})") from error
+    with closing(sqlite3.connect(path)) as made:
+        made.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # all is in the one file
 
 
 @contextmanager

@@ -117,7 +117,7 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
         home = None
     if not home:
         environment["HOME"] = NO_HOME  # Prefect needs one at its import
-    usual = _usual_folder(environment)
+    usual = cache_folder(environment)
     with suppress(OSError):
         if usual is not None:
             usual.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -140,13 +140,13 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
 def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return variables that let Prefect's server unpack its pages in the cache folder, if its own is read-only."""
     found = importlib.util.find_spec("prefect")
-    folder = _usual_folder(os.environ if environment is None else environment)
+    folder = cache_folder(os.environ if environment is None else environment)
     if folder is None or os.access(Path(str(found and found.origin)).parent / "server", os.W_OK | os.X_OK):
         return {}
     return {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(folder / "spectralzoom" / "prefect-pages")}
 
 
-def _usual_folder(environment: Mapping[str, str]) -> Path | None:
+def cache_folder(environment: Mapping[str, str]) -> Path | None:
     """Return the usual cache folder; None without a home."""
     named = Path(environment.get("XDG_CACHE_HOME", ""))
     if named.is_absolute():

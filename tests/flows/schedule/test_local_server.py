@@ -1,39 +1,16 @@
-"""Prefect's server in this process: its access control and its initial database.
-
-`python tests/flows/schedule/test_local_server.py` writes the database's schema for another version of Prefect.
-"""
+"""Prefect's server in this process: its access control and its initial database."""
 
 from __future__ import annotations
 
-import hashlib
-import os
+import shutil
 import sqlite3
-import subprocess
-import sys
-import tempfile
-from importlib import metadata
+from contextlib import closing
 from pathlib import Path
 
 import httpx
 import pytest
 
-from flows.tasks.local_server import ServerUnavailable, local_server
-
-SCHEMA = Path(__file__).parents[3] / "flows" / "tasks" / "prefect_schema.sql"
-HEAD = """-- The empty database of Prefect {}
--- python tests/flows/schedule/test_local_server.py writes this file.
--- SHA-256 of the statements: {}
-"""
-MIGRATE = """
-import asyncio
-from prefect.server.database.dependencies import provide_database_interface
-asyncio.run(provide_database_interface().create_db())
-"""
-
-
-def sealed(statements: str) -> str:
-    """Return the content of the file: these statements after the installed version of Prefect and their hash."""
-    return HEAD.format(metadata.version("prefect"), hashlib.sha256(statements.encode()).hexdigest()) + statements
+from flows.tasks.local_server import ServerUnavailable, create_database, local_server
 
 
 def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path) -> None:
@@ -51,25 +28,36 @@ def test_a_question_mark_in_the_path_is_no_query(tmp_path: Path) -> None:
     assert ((tmp_path / "field").read_text(), len([*tmp_path.iterdir()])) == ("mine", 2)
 
 
-def test_the_schema_was_written_for_the_installed_prefect() -> None:
-    """Version and hash are those of the file; ten seconds of migrations write it, when another version is pinned."""
-    text = SCHEMA.read_text()
-    assert sealed(text.split("\n", HEAD.count("\n"))[-1]) == text
+def test_a_second_archive_copies_the_migrated_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Migrations run once for a version of Prefect: the copy has its tables, and no second process is started."""
+    create_database(tmp_path / "first.db")
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("migrates again"))
+    create_database(tmp_path / "second.db")
+    with closing(sqlite3.connect(tmp_path / "second.db")) as made:
+        tables = {name for (name,) in made.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        assert {"flow_run", "task_run", "deployment", "alembic_version"} <= tables
+        assert made.execute("SELECT count(*) FROM flow_run").fetchone() == (0,)
+
+
+def test_failed_migrations_leave_no_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server is then unavailable, and the next survey tries again."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("sys.executable", shutil.which("false"))
+    with pytest.raises(ServerUnavailable, match="Prefect cannot create its database"):
+        create_database(tmp_path / "home" / "prefect.db")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_user_without_a_cache_folder_waits_for_the_migrations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server creates its own tables then."""
+    monkeypatch.setattr("flows.tasks.local_server.cache_folder", lambda _: None)
+    create_database(tmp_path / "home" / "prefect.db")
+    assert [*tmp_path.rglob("*")] == [tmp_path / "home"]
 
 
 def test_the_server_needs_a_password(server: str) -> None:
     """A request without one is refused; only the health address needs none."""
     assert httpx.get(f"{server}/admin/version").status_code == 401
     assert httpx.get(f"{server}/health").status_code == 200
-
-
-if __name__ == "__main__":
-    os.environ["DO_NOT_SCAN_PATH"] = "1"
-    with tempfile.TemporaryDirectory() as folder:  # Prefect's own migrations run in a process with its own settings
-        file = Path(folder) / "migrated.db"
-        settings = {"PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{file}", "PREFECT_HOME": folder}
-        subprocess.run([sys.executable, "-c", MIGRATE], env={**os.environ, **settings}, check=True)
-        with sqlite3.connect(file) as made:
-            text = "\n".join(made.iterdump())
-        made.close()
-        SCHEMA.write_text(sealed(text + "\n"))
