@@ -48,10 +48,13 @@ def run(words: Sequence[str | Path], cwd: Path, environment: Mapping[str, str] |
 
 
 def may_be_nobody(python: Path) -> bool:
-    """Return whether this process may switch to another user who can run this interpreter."""
+    """Return whether this process may switch to another user who can run this interpreter with its packages.
+
+    That user cannot enter a checkout below a folder of mode 0700, where the environment of the tests usually lies.
+    """
     if os.geteuid() != 0 or shutil.which("setpriv") is None:
         return False
-    words = [*AS_NOBODY, str(python), "-c", "import ctypes, decimal, lzma, ssl"]
+    words = [*AS_NOBODY, str(python), "-c", "import ctypes, decimal, lzma, ssl, numpy"]
     return subprocess.run(words, env={}, capture_output=True, check=False).returncode == 0
 
 
@@ -108,7 +111,10 @@ def test_the_wheel_contains_exactly_the_files_of_the_packages(tree: Path, wheel:
 
 
 def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Path, make_weights: WeightsMaker) -> None:
-    """Command and package run without HOME, and only the archive and the folder of temporary files are writable."""
+    """Command and package run without HOME, as a user who may write to the archive and temporary files alone.
+
+    Where no other user can read the packages, it is the user of the tests.
+    """
     place, archive, temporary = (ground / name for name in ("place", "archive", "tmp"))
     for folder in (place, archive, temporary):
         folder.mkdir()
