@@ -3,8 +3,7 @@
 All methods read the spectra of the file, and those of the simulated camera with blur and noise, as in surveys and
 `spectralzoom train`. The peers read every band, as single pixels and as means of 5 x 5 px. Their settings are chosen
 on the training pixels alone, one half of each field against the other, like the test halves.
-`bench_pines.py --weights FILE` evaluates given weights instead of training some. `--halves` trains on one half of the
-training fields and evaluates on the other, to choose settings. Set OMP_NUM_THREADS=1.
+`bench_pines.py --weights FILE` evaluates given weights instead of training some. Set OMP_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -95,18 +94,6 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
     seen = replace(split, values=exposed(_scene(folder), 0))
     table = _compared(found, _peers(seen, "camera"))
     return table + _compared([] if weights else _of_the_file(folder, split), _peers(split, "file"))
-
-
-def rows_of_halves() -> list[Row]:
-    """Train on one half of each training field and evaluate on the other, in both directions."""
-    folder = data_folder("indian_pines")
-    split = _open(folder)
-    found: list[Row] = []
-    half = halves(split.train)
-    for one in (0, 1):
-        train, test = (np.where(half == part, split.train, UNLABELLED).astype(np.uint8) for part in (one, 1 - one))
-        found += map(_row, _of_the_file(folder, replace(split, train=train, test=test)))
-    return found
 
 
 def _compared(ours: Sequence[Result], peers: Sequence[Result]) -> list[Row]:
@@ -252,9 +239,8 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
 def main() -> int:
     parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
     parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
-    parser.add_argument("--halves", action="store_true", help="train and judge on halves of the training fields")
     flags = parser.parse_args()
-    for row in rows_of_halves() if flags.halves else rows(flags.weights):
+    for row in rows(flags.weights):
         met = {True: "met", False: "NOT met", None: ""}[row.met]
         print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
     return 0

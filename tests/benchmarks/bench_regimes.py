@@ -7,8 +7,7 @@ Three surveys use the same seconds. The first is the best uniform scan; the seco
 then the lines of highest expected gain. The third (ideal) knows the rectangle's patches, in the exposure that shows all
 of them. The planner chooses the first or second before it sees the field.
 
-`python tests/benchmarks/bench_regimes.py PICTURE` also draws the map of regimes. `other` instead of PICTURE compares
-fields and seconds that were not used for any choice.
+`python tests/benchmarks/bench_regimes.py PICTURE` also draws the map of regimes.
 """
 
 from __future__ import annotations
@@ -52,28 +51,6 @@ LINES = 515  # of one swath of the full scan
 SETUP_S = 2.0  # of one swath
 WAYS = ("never", "always", "ideal")
 PLANNER = "auto"
-UNSEEN = (71, 72, 73)
-OTHER = (  # light, fraction of interest, swaths, seconds, farms
-    *((1.0, share, 8, 27.3, UNSEEN) for share in (1 / 16, 1.0)),
-    *((light, 1 / 16, 8, seconds, UNSEEN) for light, seconds in ((1.0, 22.1), (1.0, 37.6))),
-    *((0.25, 1 / 16, 8, seconds, UNSEEN) for seconds in (37.6, 58.2, 99.4)),
-    *((1.0, 1 / 8, 8, seconds, UNSEEN) for seconds in (22.1, 27.3, 37.6)),
-    *((0.25, 1 / 8, 8, seconds, UNSEEN) for seconds in (37.6, 58.2, 99.4)),
-    *((1 / 16, share, 8, 181.8, farms) for share in (1 / 16, 1 / 4, 1.0) for farms in (SEEDS, UNSEEN)),
-    *((1.0, 1 / 4, 8, seconds, (64, 65, 66)) for seconds in (21.0, 27.3)),
-    *((1.0, share, 8, 58.0, SEEDS) for share in (1 / 16, 1.0)),
-    *((light, share, 4, seconds, SEEDS) for light, seconds in ((1.0, 14.2), (1 / 16, 91.4)) for share in (1 / 16, 1.0)),
-    *(
-        (light, share, 4, seconds, UNSEEN)
-        for light, seconds in ((1.0, 14.2), (1 / 16, 91.4))
-        for share in (1 / 16, 0.25)
-    ),
-    *(
-        (light, share, 1, seconds, SEEDS)
-        for light, seconds in ((1.0, 4.3), (1 / 16, 23.6))
-        for share in (1, 1 / 4, 1 / 16)
-    ),
-)
 GOALS = {1.0: -0.3, 0.25: -0.3, 0.125: 1.5, 0.0625: 3.0}  # points over the uniform scan, mean over a fraction's cells
 
 
@@ -194,16 +171,6 @@ def rows(picture: Path | None = None) -> list[Row]:
     return found
 
 
-def print_other() -> None:
-    """Print a row of the table in docs/measurements/accuracy.md for each entry of `OTHER`."""
-    for light, share, swaths, seconds, farms in OTHER:
-        uniform, zoomed = ([score(one, share, light, swaths, seconds, way) for one in farms] for way in WAYS[:2])
-        words = [", ".join(f"{one:.1f}" for one in scores) for scores in (uniform, zoomed)]
-        gain = np.mean(zoomed) - np.mean(uniform)
-        where = f"{Fraction(light)}, {Fraction(share)}, {swaths}, {seconds:.0f} s"
-        print(f"| {where} | {farms} | {words[0]} | {words[1]} | {gain:+.1f} |", flush=True)
-
-
 def draw(measured: Sequence[Cell], picture: Path) -> None:
     """Draw the gain over the best uniform scan for each survey, light, seconds, and fraction of interest."""
     ways = {PLANNER: "planner", "always": "zoomed", "ideal": "known place"}
@@ -228,7 +195,4 @@ def draw(measured: Sequence[Cell], picture: Path) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["other"]:
-        print_other()
-    else:
-        rows(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    rows(Path(sys.argv[1]) if len(sys.argv) > 1 else None)

@@ -1,15 +1,14 @@
-"""Resampling: cost against a copy of the same rows, against other libraries, and against the order-3 spline."""
+"""Resampling: cost against a copy of the same rows, and against other libraries."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from beside.resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
+from beside.resample_peers import BANDS, Turned, cv2_parts, peers, turned_waves
 from measure import Row, ns_of, ratio, time_in_turn
 from numpy.typing import NDArray
 
@@ -35,8 +34,7 @@ def rows() -> list[Row]:
             warnings.simplefilter("ignore")  # warnings of the other libraries
             natural, flat = turned_waves(1), turned_waves(0)
             beside = [row for kernel in KERNELS for row in _beside_peers(kernel, natural, flat)]
-            beside += [*_over_linear(natural, flat), _beside_spline(natural)]
-        return [*_over_take(natural), *beside]
+            return [*_over_take(natural), *beside, *_over_linear(natural, flat)]
     finally:
         torch.set_num_threads(before)
 
@@ -60,7 +58,7 @@ def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
 
 
 def _over_take(scene: Turned) -> list[Row]:
-    """Compare each kernel with a copy of the same rows, on a sweep larger than the cache and on one that fits."""
+    """Compare each kernel with a copy of the same rows, on a sweep larger than the cache."""
     out = np.empty(scene.truth.shape, np.float32)
     calls = {"take": _take(scene, out)} | {kernel: _call(scene, kernel) for kernel in KERNELS}
     clocks = time_in_turn({name: _often(call, TILES) for name, call in calls.items()}, 7)
@@ -72,24 +70,7 @@ def _over_take(scene: Turned) -> list[Row]:
         judged = (f"<= {goal:g} x", times <= goal) if goal else ("", None)
         spent = f"{ns_of(clocks[kernel], TILES * out.size):.2f} ns/(px*band), np.take {take:.2f}"
         found.append(Row(f"{kernel}, {BANDS} bands, over np.take of the same rows", f"{times:.2f} x", *judged, spent))
-    return [*found, _over_take_cached(scene)]
-
-
-def _over_take_cached(scene: Turned) -> Row:
-    """Repeat a corner of the sweep: np.take then copies from cache to cache, and 16 taps are slower than that."""
-    middle = slice(100, 156)
-    near = (np.abs(scene.coordinates - 127.5) < 20).all(axis=1)
-    samples = np.ascontiguousarray(scene.samples[middle, middle])
-    small = replace(scene, samples=samples, coordinates=scene.coordinates[near] - middle.start, truth=scene.truth[near])
-    out = np.empty(small.truth.shape, np.float32)
-    once = {"take": _take(small, out), "ours": _call(small, "catmull-rom")}
-    clocks = time_in_turn({name: _often(call, 20) for name, call in once.items()}, 5)
-    ours, take = (ns_of(clocks[name], 20 * out.size) for name in ("ours", "take"))
-    return Row(
-        f"catmull-rom, {BANDS} bands, the same with rows and result in the cache",
-        f"{ratio(clocks, 'ours', 'take'):.2f} x",
-        peers=f"{ours:.2f} ns/(px*band), np.take {take:.2f}",
-    )
+    return found
 
 
 def _often(call: Callable[[], Any], times: int) -> Callable[[], None]:
@@ -108,8 +89,7 @@ def _beside_peers(kernel: Kernel, natural: Turned, flat: Turned) -> list[Row]:
     ours = ns_of(clocks["ours"], natural.truth.size)
     theirs = {peer.name: ns_of(clocks[peer.name], peer.bands * len(natural.truth)) for peer in others}
     met = all(ours < theirs[peer.name] for peer in others)
-    listed = _listed(theirs, "{:.3g}") + _prepared(others, natural)
-    found = [Row(f"{name}: ns/(px*band)", f"{ours:.2f}", "less than each", met, listed)]
+    found = [Row(f"{name}: ns/(px*band)", f"{ours:.2f}", "less than each", met, _listed(theirs, "{:.3g}"))]
     for what, scene, there in (("amplitude as period", natural, others), ("all waves alike", flat, peers(flat, order))):
         error = scene.error(_call(scene, kernel)()[0])
         errors = {peer.name: scene.error(peer.by_pixel(peer.call())) for peer in there}
@@ -137,27 +117,5 @@ def _over_linear(natural: Turned, flat: Turned) -> list[Row]:
     return [*found, Row("catmull-rom: time over cv2.remap linear", f"{times:.2f} x", "< 1 x", times < 1, listed)]
 
 
-def _beside_spline(natural: Turned) -> Row:
-    smooth = spline(natural)
-    clocks = time_in_turn({"ours": _call(natural, "catmull-rom"), "spline": smooth.call}, ROUNDS)
-    ours = ns_of(clocks["ours"], natural.truth.size)
-    theirs = ns_of(clocks["spline"], smooth.bands * len(natural.truth))
-    errors = natural.error(_call(natural, "catmull-rom")()[0]), natural.error(smooth.by_pixel(smooth.call()))
-    return Row(
-        "catmull-rom beside the order-3 spline",
-        f"{ours:.2f} ns, {errors[0]:.4f}",
-        peers=f"scipy spline {theirs:.0f} ns, {errors[1]:.4f}",
-    )
-
-
 def _listed(figures: Mapping[str, float], form: str) -> str:
     return ", ".join(f"{name} {form.format(figure)}" for name, figure in figures.items())
-
-
-def _prepared(others: Sequence[Peer], scene: Turned) -> str:
-    """Return the times that are not counted, for building an index, per output pixel."""
-    before = {f"{peer.name}'s index": peer.prepare for peer in others if peer.prepare}
-    if not before:
-        return ""
-    spent = {name: ns_of(clock, len(scene.truth)) for name, clock in time_in_turn(before, 1).items()}
-    return "; not counted: " + _listed(spent, "{:.0f} ns/px")

@@ -1,4 +1,4 @@
-"""Storage: our layout against plain zarr-python, the spool's fraction of a core, and a repeated survey."""
+"""Storage: our layout against plain zarr-python, and the spool's fraction of a core."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rows() -> list[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         raw = _raw()
-        return [*_against_zarr(folder, raw), _spool(folder, raw), _warm(folder)]
+        return [*_against_zarr(folder, raw), _spool(folder, raw)]
 
 
 def _raw() -> NDArray[np.uint16]:
@@ -95,32 +95,4 @@ def _spool(folder: Path, raw: NDArray[np.uint16]) -> Row:
         "<= 20 %",
         fraction <= 0.2,
         f"{wall / SPOOLED * 1e3:.2f} ms a line, the slowest {slowest * 1e3:.0f} ms",
-    )
-
-
-def _warm(folder: Path) -> Row:
-    """Repeat a finished survey, and compare the time of its stages with that of the first run."""
-    from rich.console import Console
-
-    from flows.settings.load import load_settings
-    from flows.survey import draw_class_map
-    from flows.survey_command import run_survey
-    from flows.tasks.open_survey import OpenSurvey
-    from flows.tasks.run import open_run
-
-    flags = {"scene": "farm", "budget": 0.5, "out": str(folder / "archive"), "engine": "plain"}
-    settings = load_settings(None, flags)
-    first = {stage["name"]: stage for stage in run_survey(settings, Console(quiet=True)).receipt["stages"]}
-    again = OpenSurvey(open_run(settings))
-    cpu = time.process_time()
-    draw_class_map(again)
-    cpu = time.process_time() - cpu
-    before = sum(stage["cpu_s"] for stage in first.values() if stage["cpu_s"])
-    cached = all(record.state == "cached" for record in again.records.values())
-    return Row(
-        "a finished survey's stages again, over their first run",
-        f"{cpu / before:.1%}",
-        "<= 1 %, nothing made",
-        cached and cpu <= 0.01 * before,
-        f"{cpu * 1e3:.0f} ms of {before:.1f} s of processor",
     )

@@ -75,3 +75,11 @@ def test_the_table_of_folders_matches_the_source_tree() -> None:
         first = {path.name for path in (ROOT / top).iterdir() if (path / "__init__.py").is_file()}
         assert named <= there
         assert first <= named | {"shipped"}
+
+
+def test_names_of_the_glossary_exist_in_the_code() -> None:
+    """Each name in its column "in code" is a word of the source."""
+    rows = re.findall(r"^\|.*\|(.*)\|$", (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8"), re.M)
+    folders = (ROOT / name for name in ("pipeline", "models", "storage", "flows"))
+    known = {word for top in folders for path in top.rglob("*.py") for word in re.findall(r"\w+", path.read_text())}
+    assert [name for row in rows[2:] for name in re.findall(r"`(\w+)`", row) if name not in known] == []

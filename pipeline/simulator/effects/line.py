@@ -82,7 +82,7 @@ class SlitBox(Effect):
     """
 
     name = "slit"
-    # measured at a strip of 320 px: `python tests/benchmarks costs`. One box is no dearer than none.
+    # measured at a strip of 320 px. One box is no dearer than none.
     cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, UPRIGHT: 0.0})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:

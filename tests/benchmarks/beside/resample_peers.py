@@ -29,7 +29,6 @@ class Peer:
     call: Callable[[], Any]
     by_pixel: Callable[[Any], NDArray[np.float32]]
     bands: int
-    prepare: Callable[[], object] | None = None  # builds its index first
 
 
 @dataclass(frozen=True)
@@ -78,19 +77,9 @@ def peers(scene: Turned, order: int, only: str | None = None) -> list[Peer]:
         "skimage warp": _skimage_warp,
         "rasterio reproject": _rasterio_reproject,
         "scipy map_coordinates": _map_coordinates,
-        "pyresample": _pyresample,
     }
-    without_cubic = {"scipy map_coordinates", "pyresample"}
-    return [
-        maker(scene, order)
-        for name, maker in makers.items()
-        if only in (None, name) and not (order == 3 and name in without_cubic)
-    ]
-
-
-def spline(scene: Turned) -> Peer:
-    """Return scipy's order-3 spline, with its prefilter in the time."""
-    return _map_coordinates(scene, 3)
+    made = {name: maker for name, maker in makers.items() if only in (None, name)}
+    return [maker(scene, order) for name, maker in made.items() if order < 3 or name != "scipy map_coordinates"]
 
 
 def _by_pixel(planes: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -140,7 +129,7 @@ def _map_coordinates(scene: Turned, order: int) -> Peer:
     planes = scene.planes[:FEW]
     at = scene.coordinates.T
     return Peer(
-        "scipy map_coordinates" if order < 3 else "scipy spline",
+        "scipy map_coordinates",
         lambda: [map_coordinates(plane, at, order=order, mode="mirror") for plane in planes],
         lambda out: np.stack(out, axis=1),
         FEW,
@@ -181,34 +170,3 @@ def _rasterio_reproject(scene: Turned, order: int) -> Peer:
         lambda _: _by_pixel(out),
         BANDS,
     )
-
-
-def _pyresample(scene: Turned, order: int) -> Peer:
-    """Return pyresample, nearest or bilinear: the grid is an area in metres, the sweep a swath in degrees."""
-    from pyresample import kd_tree
-    from pyresample.bilinear import NumpyBilinearResampler  # type: ignore[attr-defined]
-
-    swath, area = _swath_and_area(scene)
-    if order == 0:
-        index = lambda: kd_tree.get_neighbour_info(swath, area, 2.0, neighbours=1)  # noqa: E731
-        found = index()[:3]
-        call = lambda: kd_tree.get_sample_from_neighbour_info("nn", (EDGE, EDGE), scene.samples, *found)  # noqa: E731
-    else:
-        resampler = NumpyBilinearResampler(swath, area, 3.0, neighbours=8)
-        resampler.get_bil_info()
-        index = lambda: NumpyBilinearResampler(swath, area, 3.0, neighbours=8).get_bil_info()  # noqa: E731
-        call = lambda: resampler.get_sample_from_bil_info(scene.samples)  # noqa: E731
-    return Peer("pyresample", call, lambda out: np.asarray(out).reshape(-1, BANDS), BANDS, prepare=index)
-
-
-def _swath_and_area(scene: Turned) -> tuple[Any, Any]:
-    import pyproj
-    from pyresample.geometry import AreaDefinition, SwathDefinition
-
-    pixel = np.argwhere(np.ones((SIDE, SIDE), bool))
-    back = np.linalg.inv(scene.affine[:, :2])
-    y, x = (back @ (pixel - scene.affine[:, 2]).T).reshape(2, SIDE, SIDE)  # positions of the sweep's pixels on the grid
-    east, north = ORIGIN_M
-    lon, lat = pyproj.Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(east + x, north - y)
-    extent = (east - 0.5, north - EDGE + 0.5, east + EDGE - 0.5, north + 0.5)
-    return SwathDefinition(lon, lat), AreaDefinition("grid", "grid", "grid", pyproj.CRS(CRS), EDGE, EDGE, extent)

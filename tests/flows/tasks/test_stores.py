@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from functools import partial
 from pathlib import Path
@@ -16,16 +17,19 @@ import zarr
 from flows.publish.publishing import clear_raw, publish
 from flows.settings.load import load_settings
 from flows.settings.parameters import SurveySettings
+from flows.settings.survey_settings import Settings
 from flows.survey import draw_class_map, survey
 from flows.survey_command import run_survey
 from flows.tasks.captures import plan_capture
-from flows.tasks.open_survey import OpenSurvey
+from flows.tasks.open_survey import STAGES, OpenSurvey
+from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Stage, Wanted
 from flows.tasks.stages.condense import SignalChoice, components_of
 from pipeline.errors import ArchiveError
 from pipeline.signal.subspace import SignalStatistics
 from pipeline.source import References
 from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.records import read_run
 from storage.arrays.cubes import open_raw_cube
 from tests.conftest import QUIET, Survey
@@ -123,3 +127,20 @@ def test_processes_make_the_same_archive(
     (drawn,) = roots[1].glob("stages/segment/*/class_map.zarr")
     with xr.open_zarr(drawn, consolidated=False) as found:
         assert found["classes"].values.shape == (96, 128)
+
+
+@pytest.mark.parametrize("absent", [("condense_raster", "rectify"), ("rectify", "rectify_fine")])
+def test_store_names_in_receipts_are_unique(absent: tuple[str, ...]) -> None:
+    """The exception is the mosaic of the first pass and that of both passes, so each case leaves out one of them."""
+    named = [
+        one.addresses(StageRef(one.product.name, "abc", Path())) for name, one in STAGES.items() if name not in absent
+    ]
+    assert all(named)
+    assert len({name for one in named for name in one}) == sum(map(len, named))
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_survey_has_the_arguments_of_its_stages(name: str) -> None:
+    """Each keyword argument of a stage is an attribute of a run or a setting."""
+    run, settings = ({*dir(kind), *kind.__dataclass_fields__} for kind in (SurveyRun, Settings))
+    assert {*inspect.getfullargspec(inspect.unwrap(STAGES[name].wants)).kwonlyargs} <= run | settings

@@ -21,7 +21,6 @@ from tests.pipeline.simulator.small_scenes import leave_slit_unmeasured
 ROUNDING = 4e-6  # times the brightest light of the lines: float32 sums
 KERNELS = 4e-3  # times the light's range: difference of two sets of kernels that are fitted to the same blurs
 REACH_PX = 16  # along a line: numerical errors displace light at most this far
-DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may exceed their bounds
 IN_THE_LIGHT: tuple[Effect, ...] = tuple(effect for effect in EFFECTS if effect not in READOUT)
 BY_FOOTPRINT = frozenset({"slit", "rotation"})  # bounded by the changes between variants of the slit
 OTHERS = frozenset(effect.name for effect in IN_THE_LIGHT) - BY_FOOTPRINT
@@ -40,17 +39,11 @@ class Trial:
     bound: float
     measured: float
     unexplained: float
-    rounding: float
 
     @property
     def is_broken(self) -> bool:
         """Return whether the change exceeds the bound that the decision counts."""
         return not self.unexplained <= self.bound * SAFETY
-
-    @property
-    def looseness(self) -> float:
-        """Return bound over measured change; NaN where rounding hides the change."""
-        return self.bound / self.measured if self.measured > 10 * self.rounding else np.nan
 
 
 @dataclass(frozen=True)
@@ -61,7 +54,6 @@ class _Stored:
     menus: tuple[Menu, ...]
     noise: list[Radiance]  # of each block with everything on, of the sums (line, number, band) [e-]
     contrast: list[Radiance]  # range of light around each sample, summed (1, number, band) [e-]
-    rounding: float
 
     def change(self, light: list[Radiance], full: list[Radiance], fraction: float) -> tuple[float, float]:
         """Return the greatest change of a stored number in its own sigmas, and the greatest beyond numerical errors."""
@@ -100,15 +92,13 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: Collection[str] = (
                 own = next(each for each in one.menus if each.name == menu.name)
                 error = next(option.error for option in (own.off, *own.variants) if option.variant == variant)
                 changes = one.change(light, full, fraction)
-                yield Trial(menu.name, variant, one.binning, error / SAFETY, *changes, one.rounding)
+                yield Trial(menu.name, variant, one.binning, error / SAFETY, *changes)
 
 
 def _stored(full: list[Radiance], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:
     noise = [np.sqrt(_summed(np.square(noise_electrons(light, case.rig)), binning)) for light in full]
-    sums = [_summed(np.abs(light), binning) for light in full]
-    level = max(float((light / one).max()) for light, one in zip(sums, noise, strict=True))
     contrast = [_summed(_range_about(light), binning) for light in full]
-    return _Stored(binning, menus, noise, contrast, ROUNDING * level)
+    return _Stored(binning, menus, noise, contrast)
 
 
 def _range_about(light: Radiance) -> Radiance:

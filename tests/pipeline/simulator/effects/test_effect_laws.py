@@ -183,7 +183,6 @@ def test_no_change_exceeds_its_bound(number: int, effects: tuple[str, ...]):
     """A case's effects are left out, and their variants taken, with all others exact, as samples and sums of 2 to 8.
 
     The last case, in sums of 4, has a mirror that swings within its exposures: that is left out with the smear.
-    `python tests/benchmarks effects` checks 200 cases.
     """
     found = list(trials(random_case(number), (1, 2 + (number + 5) % 7), effects))
     assert set(effects or ["slit"]) <= {trial.effect for trial in found}
