@@ -21,7 +21,6 @@ VERBS = {  # verb: module of its function, loaded on demand
     "export": "flows.archive.export_command",
     "reprocess": "flows.archive.reprocess_command",
     "serve": "flows.cli.serve_command",
-    "report": "flows.archive.history",
     "init": "flows.training.init_command",
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",

@@ -1,4 +1,4 @@
-"""Draw parts of pictures: palettes, outlines of patches, the map on the ground, spectra of the classes."""
+"""Draw parts of pictures: palettes, outlines of patches, the map on the ground."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -19,9 +18,8 @@ from PIL import Image
 
 from flows.terminal.figures import format_area
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
-from storage.arrays.mosaics import Mosaic, stretch
+from storage.arrays.mosaics import stretch
 
 COLOURS = 256  # of a PNG
 MOST_PX = 2048  # of a picture's longer side; larger fields are subsampled
@@ -158,63 +156,3 @@ def draw_ground(found: GroundMap) -> bytes:
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     return png(figure, found.legend.colours)
-
-
-LEAST_BANDS = 5  # of a curve
-GAP = 1.9  # times the median distance of bands, from which on bands were removed between two
-CONTIGUOUS_NM = 20.0  # median distance of bands up to which they cover a spectrum; a satellite's few lie apart anyway
-DOTS: Any = {"marker": ".", "markersize": 2.4, "markeredgewidth": 0}  # they show a band between two gaps
-
-
-def draw_spectra(mosaic: Mosaic, found: ClassMap) -> bytes | None:
-    """Draw the mean spectrum of each mapped class as PNG; None with fewer than `LEAST_BANDS` bands or no value."""
-    spectra = class_spectra(mosaic, found.classes, len(found.names))
-    if len(mosaic.wavelength_nm) < LEAST_BANDS or not np.isfinite(spectra).any():
-        return None
-    with mpl.rc_context({**STYLE, "font.size": 9}):
-        figure = Figure(figsize=(9, 3.6), dpi=110, layout="constrained", facecolor=PAPER)
-        axes = figure.subplots()
-        axes.set_facecolor(PAPER)
-        for name, spectrum, colour in zip(found.names, spectra, class_palette(found.colours), strict=False):
-            if (known := np.isfinite(spectrum)).any():
-                nm, curve = curve_with_gaps(mosaic.wavelength_nm[known], spectrum[known])
-                axes.plot(nm, curve, color=colour, linewidth=1.2, label=name.replace("_", " "), **DOTS)
-        axes.set(xlabel="wavelength [nm]", ylabel="value of the scene")
-        axes.legend(loc="best", ncols=2, fontsize=7, frameon=False)
-        return png(figure, found.colours)
-
-
-def class_spectra(mosaic: Mosaic, classes: NDArray[np.integer], count: int) -> NDArray[np.float32]:
-    """Return the mean spectra (class, band) of ``count`` classes; NaN for one that no pixel of the mosaic shows.
-
-    ``classes`` (y, x) are of the same pixels.
-    """
-    sums, pixels = np.zeros((count, len(mosaic.components))), np.zeros(count)
-    top = 0
-    for scores in mosaic.row_blocks():
-        under = classes[top : top + len(scores)]
-        seen = np.isfinite(scores).all(axis=2)
-        for number in range(count):
-            here = scores[seen & (under == number)]
-            sums[number] += here.sum(axis=0, dtype=np.float64)
-            pixels[number] += len(here)
-        top += len(scores)
-    means = np.where(pixels[:, None] > 0, sums / np.maximum(pixels, 1)[:, None], np.nan)
-    spectra = mosaic.spectra(means.astype(np.float32))
-    spectra[pixels == 0] = np.nan
-    return spectra
-
-
-def curve_with_gaps(
-    wavelength_nm: NDArray[np.floating], values: NDArray[np.floating]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a curve (band,) in the order of wavelengths, with a NaN wherever bands were removed.
-
-    Bands that do not cover the spectrum (`CONTIGUOUS_NM`) have no gaps.
-    """
-    order = np.argsort(wavelength_nm, kind="stable")
-    nm, curve = np.asarray(wavelength_nm, np.float64)[order], np.asarray(values, np.float64)[order]
-    apart = np.diff(nm)
-    usual = float(np.median(apart)) if len(apart) else np.inf
-    breaks = np.flatnonzero((apart > GAP * usual) & (usual <= CONTIGUOUS_NM)) + 1
-    return np.insert(nm, breaks, np.nan), np.insert(curve, breaks, np.nan)

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt import Receipt, hectares_of_classes, is_pending
+from flows.publish.receipt import Receipt, is_pending
 from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
@@ -49,7 +49,6 @@ SMALL_RUN = 2_000_000  # bytes kept, most of which do not depend on the field
 MOST_NAMED = 4  # changes of class in a row
 LEADING_CLASSES = 3  # of a plot
 LEAST_LOSS = 0.0005  # of expected mIoU, below which it rounds to 0.0 points
-LEAST_TURN_DEG = 0.05  # of a prior map; less is not shown
 FOREIGN = 0.2  # fraction of unknown pixels above which the weights do not fit the field
 FOREIGN_WORDS = (
     "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
@@ -233,7 +232,7 @@ def is_foreign(found: Mapping[str, Any]) -> bool:
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the findings of a receipt as rows of a table: label, and figures with their names.
 
-    With weights that do not fit the field, no score is predicted.
+    Zeros and what is empty are left out. With weights that do not fit the field, no score is predicted.
     """
     if is_foreign(found) and "scans" in found:
         found = {**found, "scans": {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}}
@@ -249,28 +248,25 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(label, words) for label, words in rows if words]
 
 
-def _figures(found: Mapping[str, Any] | None, names: Sequence[str]) -> str:
-    """Return the named figures of a part; None, most zeros and what is empty are left out."""
-    shown = [(name, found[name]) for name in names if found and (found.get(name) or (name, found.get(name)) in ZEROS)]
-    return "; ".join(words for name, value in shown if (words := format_figure(name, value)))
+def _figures(found: Mapping[str, Any] | None, names: str) -> str:
+    """Return the named figures of a part."""
+    shown = [(name, found[name]) for name in names.split() if found and found.get(name)]
+    return "; ".join(words for name, value in shown if (words := _figure(name, value)))
 
 
-def format_figure(name: str, value: Any) -> str:
-    """Return a figure with its label, both by the name that it has in a receipt."""
+def _figure(name: str, value: Any) -> str:
+    """Return a figure with its label, both by the name that it has in a receipt, which ends in its unit."""
     if name in _FORMATS:
         return _FORMATS[name](value)
+    if name in _FRACTIONS:
+        return f"{spaced(name)} {format_percent(value)}"
     label, _, unit = name.rpartition("_")
     if unit in _UNITS:
         return f"{spaced(label)} {_UNITS[unit](value)}"
-    return spaced(name) if value is True else f"{spaced(name)} {_format_value(value)}"
-
-
-def _format_value(value: Any) -> str:
-    if isinstance(value, str):
-        return value
     if isinstance(value, list | tuple):
-        return ", ".join(map(_format_value, value))
-    return format_count(value) if isinstance(value, int) else three_digits(value)
+        return f"{spaced(name)} {', '.join(map(str, value))}"
+    number = value if isinstance(value, str) else format_count(value) if isinstance(value, int) else three_digits(value)
+    return f"{spaced(name)} {number}"
 
 
 def format_days(days: float) -> str:
@@ -300,27 +296,6 @@ def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     ]
 
 
-def area_rows(receipt: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the classes of a map as a table: name, pixels, fraction of the pixels that have a class, hectares.
-
-    Hectares are left out where the size of a pixel on the ground is not known.
-    """
-    pixels: Mapping[str, int] = (receipt.get("areas") or {}).get("px", {})
-    hectares = hectares_of_classes(receipt)
-    every = sum(pixels.values())
-    return [
-        {"class": spaced(name), "pixels": format_count(count), "fraction": format_percent(count / every)}
-        | ({} if hectares is None else {"area": format_area(hectares.get(name, 0.0))})
-        for name, count in pixels.items()
-        if count
-    ]
-
-
-def _changes(changes: Sequence[Sequence[Any]]) -> str:
-    most = [f"{spaced(old)} to {spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_NAMED]]
-    return f"changed {format_area(sum(area for area, _, _ in changes))}: {', '.join(most)}"
-
-
 def _scan(scan: Mapping[str, Any]) -> str:
     words = f"{format_scan(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
     predicted = format_prediction(scan["expected_miou"], scan.get("expected_spread"))
@@ -329,25 +304,25 @@ def _scan(scan: Mapping[str, Any]) -> str:
 
 # rows of the findings: the part of the receipt, and its figures that are shown, in order
 COMPARISON = "comparison"
-ZEROS = (("differing_px", 0), ("changed_px", 0))  # shown although they are 0: the expected number stands beside them
-_SHOWN: Mapping[str, tuple[str, Sequence[str]]] = {
-    "field": ("field", ("view_deg", "range_m", "hectares", "ground_pixel_m", "hectares_per_hour")),
-    "plan": ("plan", ("reason", "lines")),
-    "recording": ("recording", ("lines_read", "lines_recorded", "passes_s", "full_scan_s")),
-    "signal": ("signal", ("saturated",)),
-    "pixels": ("pixels", ("px_no_reading", "map_without_a_class")),
-    "captured": ("extent", ("patches_touched", "lines", "expected_wrong", "due_left")),
-    "full network": ("kept", ("patches", "multiply_adds")),
-    "prior map": ("prior_map", ("run", "days", "shift_px", "turned_deg", "put_aside", "changed_px", "changes")),
-    COMPARISON: ("prior_map", ("agreement", "compared_px", "differing_px", "expected_differing_px")),
-    "unknown": ("unknown", ("fraction", "rate")),
-    "expected mIoU": ("expected", ("miou", "error", "not_predicted")),
-    "uniform scans": ("scans", ("taken", "best_in_time", "reference")),
-    "classes": ("areas", ("ha",)),
-    "zones": ("zones", ("kept_px", "kept_m2")),
-    "on the ground": ("ground", ("crs", "resolution_m", "changes_ha", "older_ha")),
+_SHOWN: Mapping[str, tuple[str, str]] = {
+    "field": ("field", "view_deg range_m hectares ground_pixel_m hectares_per_hour"),
+    "plan": ("plan", "reason lines"),
+    "recording": ("recording", "lines_read lines_recorded passes_s full_scan_s"),
+    "signal": ("signal", "saturated"),
+    "pixels": ("pixels", "px_no_reading map_without_a_class"),
+    "captured": ("extent", "patches_touched lines expected_wrong due_left"),
+    "full network": ("kept", "patches multiply_adds"),
+    "prior map": ("prior_map", "run days shift_px turned_deg put_aside changed_px changes"),
+    COMPARISON: ("prior_map", "agreement compared_px differing_px expected_differing_px"),
+    "unknown": ("unknown", "fraction rate"),
+    "expected mIoU": ("expected", "miou error not_predicted"),
+    "uniform scans": ("scans", "taken best_in_time reference"),
+    "classes": ("areas", "ha"),
+    "zones": ("zones", "kept_px kept_m2 no_go_px"),
+    "on the ground": ("ground", "crs resolution_m changes_ha"),
 }
-_OF_POINTING = ("sweeps", "residual_rms_px", "not_found", "too_narrow", "partly_seen")
+_OF_POINTING = "sweeps residual_rms_px not_found too_narrow partly_seen"
+_FRACTIONS = ("patches_touched", "expected_wrong", "agreement", "rate")
 _UNITS: Mapping[str, Callable[[Any], str]] = {
     "px": lambda value: f"{format_count(value) if isinstance(value, int) else f'{value:.2f}'} px",
     "s": format_seconds,
@@ -359,41 +334,25 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
     "days": format_days,
     "hectares": format_area,
-    "lines": lambda lines: f"lines {_format_value(lines)}{' (sweep:first-stop)' * isinstance(lines, str)}",
-    "patches_touched": lambda fraction: f"{format_percent(fraction)} of the patches",
-    "expected_wrong": lambda fraction: f"the prior map expected {format_percent(fraction)} of its pixels to be wrong",
-    "due_left": lambda count: f"{format_count(count)} patches beyond --max-age did not fit the time",
-    "taken": lambda scan: f"this one: {_scan(scan)}",
-    "best_in_time": lambda scan: f"best in the same time: {_scan(scan)}",
-    "reference": lambda scan: f"cheapest near the best: {_scan(scan)}",
+    "fraction": lambda fraction: f"{format_percent(fraction)} of the pixels are unlike the training data",
+    "saturated": lambda fraction: (
+        f"{format_percent(fraction)} of the spectra have saturated bands; a shorter exposure avoids them"
+    ),
     "shift_px": lambda px: f"shifted by {math.hypot(*px):.0f} px" if any(px) else "",
-    "turned_deg": lambda angle: f"turned by {angle:.3g} degrees" if abs(angle) >= LEAST_TURN_DEG else "",
-    "put_aside": lambda value: f"not used: {value}",
-    "changed_px": lambda px: f"{format_count(px)} px changed beyond errors of both maps",
     "changes": lambda pairs: ", ".join(
         f"{spaced(old)} to {spaced(new)} {format_count(px)} px" for px, _, old, new in pairs[:MOST_NAMED]
     ),
-    "agreement": lambda fraction: f"this scan alone gives the same class at {format_percent(fraction)} of its pixels",
-    "compared_px": lambda px: f"both maps are confident at {format_count(px)} px",
-    "differing_px": lambda px: f"of these, {format_count(px)} px differ",
-    "expected_differing_px": lambda px: f"errors alone would make {format_count(px)} px differ",
-    "fraction": lambda fraction: f"{format_percent(fraction)} of the pixels are unlike the training data",
-    "rate": lambda rate: f"{format_percent(rate)} are usual on a field that the weights know",
-    "miou": lambda miou: f"{format_points(miou)} of 100, estimated from the map's own probabilities",
+    "miou": lambda miou: f"{format_points(miou)} of 100",
     "error": lambda error: f"standard deviation {format_points(error)}",
+    "taken": lambda scan: f"this one: {_scan(scan)}",
+    "best_in_time": lambda scan: f"best in the same time: {_scan(scan)}",
+    "reference": lambda scan: f"cheapest near the best: {_scan(scan)}",
     "patches": lambda count: f"{format_count(count)} patches read in full",
     "multiply_adds": lambda did: f"multiply-adds {format_percent(did['done'] / did['everything'])} of those for all",
     "ha": lambda areas: ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in areas.items() if area),
-    "changes_ha": _changes,
-    "older_ha": lambda areas: ", ".join(
-        f"{format_area(ha)} captured longer ago than {counted(int(days), 'day')}" for days, ha in areas.items() if ha
+    "changes_ha": lambda changes: ", ".join(
+        f"{spaced(old)} to {spaced(new)} {format_area(area)}" for area, old, new in changes[:MOST_NAMED]
     ),
     "sweeps": lambda sweeps: f"corrected by up to {max(math.hypot(*one) for one in sweeps.values()):.1f} px",
-    "saturated": lambda fraction: (
-        f"{format_percent(fraction)} of the spectra have bands that are saturated or without data. They are restored "
-        "from the others; where fewer than half are left, the spectrum is unknown. A shorter exposure avoids saturation"
-    ),
-    "px_no_reading": lambda px: f"{format_count(px)} px with values out of the range of the weights",
-    "map_without_a_class": lambda px: f"{format_count(px)} px without a class",
     "too_narrow": lambda value: f"{counted(len(value), 'overlap')} too narrow to compare",
 }

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import posixpath
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.resources import files
 from typing import Any
 from urllib.parse import quote
@@ -24,20 +23,9 @@ from markupsafe import Markup
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import (
-    area_rows,
-    finding_rows,
-    format_change,
-    format_reason,
-    format_reference,
-    format_total,
-    headline,
-    plot_rows,
-    saving_rows,
-    shown_accuracy,
-)
+from flows.publish.receipt_table import finding_rows, format_reference, headline, plot_rows, saving_rows, shown_accuracy
 from flows.tasks.scores import error_matrix, format_false_classes
-from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
+from flows.terminal.figures import format_percent, format_points
 from pipeline.errors import visible
 from storage.archive.records import LINE_PRODUCTS
 from storage.readers.open_cubes import split_variable
@@ -65,15 +53,6 @@ def policy(names: tuple[str, ...]) -> str:
     )
 
 
-def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> str:
-    """Render an HTML template; text of ``facts`` that is no `Markup` is escaped. ``carries`` are the page's scripts."""
-    own = {
-        "policy": policy(carries),
-        "scripts": Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries),
-    }
-    return visible(_environment(markdown=False).get_template(template).render(facts | own))
-
-
 def render_markdown(template: str, **facts: Any) -> str:
     """Render a Markdown template; text that is no `Markup` is escaped."""
     return visible(_environment(markdown=True).get_template(template).render(facts))
@@ -91,13 +70,8 @@ def _environment(*, markdown: bool) -> Environment:
         finalize=_plain if markdown else None,
     )
     found.filters |= {
-        "bytes": format_bytes,
-        "change": format_change,
-        "reason": format_reason,
         "percent": format_percent,
         "points": format_points,
-        "seconds": format_seconds,
-        "json": partial(json.dumps, ensure_ascii=False),
         # data for scripts, which cannot end their tag
         "data": lambda content: htmlsafe_json_dumps(_format_visible(content), separators=(",", ":")),
     }
@@ -143,12 +117,12 @@ def render_report(
     """
     shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
-    total = receipt.get("effects_total")
     accuracy = shown_accuracy(receipt)
-    return render_page(
-        "report.html",
-        () if field is None else MAP_SCRIPTS,
-        kicker="SpectralZoom survey",
+    scripts = () if field is None else MAP_SCRIPTS
+    page = _environment(markdown=False).get_template("report.html")
+    text = page.render(
+        policy=policy(scripts),
+        scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in scripts),
         title=receipt["survey"],
         lead=headline(receipt, captured_again),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
@@ -164,22 +138,13 @@ def render_report(
         error_colours=ERROR_COLOURS,
         pictures=[{"address": data_address(one.content), "caption": one.caption} for one in shown],
         **_savings(receipt),
-        areas=area_rows(receipt),
-        findings=finding_rows({name: one for name, one in receipt.items() if name != "areas"}),
+        findings=finding_rows(receipt),
         plots=plot_rows(receipt.get("plots", [])),
         accuracy=accuracy,
         error_matrix=None if accuracy is None else error_matrix(accuracy),
         false_classes="" if accuracy is None else format_false_classes(accuracy),
-        format_total="" if total is None else " ".join(format_total(total)),
-        details={
-            "Settings": {
-                f"{name}.{key}" if key else name: item
-                for name, value in receipt["settings"].items()
-                for key, item in (value.items() if isinstance(value, Mapping) else [("", value)])
-            },
-            "Versions": receipt["versions"],
-        },
     )
+    return visible(text)
 
 
 def _run_folder(receipt: Receipt) -> str:

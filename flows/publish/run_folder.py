@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import draw_ground, draw_spectra, thinned
+from flows.publish.panels import draw_ground, thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Facts, Receipt, build_receipt, check_receipt
 from flows.publish.report import Picture, render_report
@@ -51,7 +51,6 @@ from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import choose_bands, load_attention, open_mosaic
 
-SPECTRA_CAPTION = "Mean spectra of the classes as mapped."
 REPORT = "report.html"
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
@@ -112,9 +111,6 @@ def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
     shown = quicklook_data(survey.run, survey.products, plan)
     maps = (load_ground_map(ref.path / STORE) for ref in survey.products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    drawn = load_class_map(survey.products["segment"].path / "class_map.zarr")
-    if (spectra := draw_spectra(open_mosaic(survey.products.mosaic.path / "mosaic.zarr"), drawn)) is not None:
-        pictures.append(Picture(spectra, SPECTRA_CAPTION))
     field = field_map(survey.run, plan, shown, prior_map(survey.run.prior, survey.products["segment"], receipt))
     return _Drawn(draw_quicklook(shown), tuple(pictures), field)
 

@@ -49,12 +49,12 @@ def test_findings_have_hectares_changes_and_ages() -> None:
     """Classes of no area are left out; changes name both classes, and ages have hectares."""
     areas = {"px": {"bare_soil": 30}, "ha": {"bare_soil": 0.3, "crop": 0.1, "weed": 0.0}}
     assert finding_rows({"areas": areas}) == [("classes", "bare soil 0.3 ha, crop 0.1 ha")]
-    later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]], "older_ha": {"1": 0.25, "7": 0.0}}
+    later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]]}
     first = "EPSG:32632; resolution 12 cm"
-    assert finding_rows({"ground": GROUND | {"older_ha": {"1": 0.0}}}) == [("on the ground", first)]
+    assert finding_rows({"ground": GROUND}) == [("on the ground", first)]
     ((_, words),) = finding_rows({"ground": GROUND | later})
-    changed = "changed 0.5 ha: crop to bare soil 0.5 ha, weed to crop 4 m²"
-    assert words == f"{first}; {changed}; 0.25 ha captured longer ago than 1 day"
+    changed = "crop to bare soil 0.5 ha, weed to crop 4 m²"
+    assert words == f"{first}; {changed}"
 
 
 def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
@@ -73,7 +73,7 @@ def test_a_uniform_scan_has_the_expected_score_of_its_map(survey_png: Survey, we
     assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
     assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)
-    words = f"{100 * told.miou:.1f} of 100, .*; standard deviation {100 * told.error:.1f}"
+    words = f"{100 * told.miou:.1f} of 100; standard deviation {100 * told.error:.1f}"
     assert re.fullmatch(words, dict(finding_rows(receipt))["expected mIoU"])
 
 
@@ -106,15 +106,11 @@ def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unknown: floa
 def test_changes_from_a_prior_map_exceed_the_expected_difference() -> None:
     """Two maps of unchanged ground differ in some pixels, and such a number is no change."""
     memory = {"run": "r", "days": 3.0, "differing_px": 950, "expected_differing_px": 810, "changed_px": 0}
-    words = {
-        "prior map": "r; 3.0 days earlier; 0 px changed beyond errors of both maps",
-        "comparison": "of these, 950 px differ; errors alone would make 810 px differ",
-    }
+    words = {"prior map": "r; 3.0 days earlier", "comparison": "differing 950 px; expected differing 810 px"}
     assert dict(finding_rows({"prior_map": memory})) == words
     changes = {"changed_px": 700, "changes": [[600, 650, "soil", "bare_weed"], [100, 120, "soil", "maize"]]}
     changed = dict(finding_rows({"prior_map": memory | changes}))["prior map"]
-    assert changed == words["prior map"].replace("0 px", "700 px") + "; soil to bare weed 600 px, soil to maize 100 px"
-    assert "these, 0 px differ" in dict(finding_rows({"prior_map": memory | {"differing_px": 0}}))["comparison"]
+    assert changed == words["prior map"] + "; changed 700 px; soil to bare weed 600 px, soil to maize 100 px"
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def test_a_receipt_has_the_fraction_of_saturated_spectra(survey_png: Survey, tmp
     saturated = float((cube["dn"].to_numpy() >= 4095).any(axis=2).mean())
     assert 0.01 < saturated < 0.5
     assert published.receipt["signal"] == {"saturated": pytest.approx(saturated)}
-    assert "of the spectra have bands that are saturated" in dict(finding_rows(published.receipt))["signal"]
+    assert "of the spectra have saturated bands" in dict(finding_rows(published.receipt))["signal"]
     assert "signal" not in survey_png(tmp_path, **BY_HAND).receipt
 
 
