@@ -24,7 +24,7 @@ VERBS = {  # verb: module of its function, loaded on demand
     "init": "flows.training.init_command",
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
-    "tradeoff": "flows.tradeoff.command",
+    "tradeoff": "flows.tradeoff",
 }
 GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve")  # verbs that resume
 

@@ -15,7 +15,7 @@ from functools import cache, lru_cache, wraps
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 else:  # a sixth of a second, which commands on manifests do not need
     zarr, zarr_codecs, zarr_storage = map(deferred, ("zarr", "zarr.codecs", "zarr.storage"))
 
-StorePlace: TypeAlias = "Path | zarr_storage.MemoryStore"  # where a store lies
 CHUNK_PX = 32
 SHARD_ROWS = 64
 SHARD_COLUMNS = 640
@@ -57,11 +56,10 @@ class SmallArray(NamedTuple):
 
 
 def create_group(
-    path: StorePlace, title: str, attributes: Mapping[str, Any], coordinates: Mapping[str, SmallArray] | None = None
+    path: Path, title: str, attributes: Mapping[str, Any], coordinates: Mapping[str, SmallArray] | None = None
 ) -> zarr.Group:
     """Create a Zarr v3 store with its coordinates at ``path``, which must not exist."""
-    if isinstance(path, Path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     group = zarr.create_group(path, zarr_format=3, attributes={"Conventions": "CF-1.12", "title": title, **attributes})
     for name, one in (coordinates or {}).items():
         write_small(group, name, *one)
@@ -239,7 +237,7 @@ def consolidate_stores(folder: Path) -> None:
                 zarr.consolidate_metadata(path)
 
 
-def open_group(path: StorePlace, mode: Literal["r", "r+"] = "r") -> zarr.Group:
+def open_group(path: Path, mode: Literal["r", "r+"] = "r") -> zarr.Group:
     """Open a store (IncompleteStoreError: there is none, or its metadata is damaged)."""
     with damage_named(str(path)):
         return zarr.open_group(path, mode=mode, zarr_format=3, use_consolidated=False)
@@ -256,8 +254,8 @@ def opened_once(open_store: Opener) -> Opener:
     kept = lru_cache(16)(lambda path, *stamp: open_store(path))
 
     @wraps(open_store)
-    def open_if_changed(path: StorePlace) -> Any:
-        if not isinstance(path, Path) or not (file := path / "zarr.json").is_file():
+    def open_if_changed(path: Path) -> Any:
+        if not (file := path / "zarr.json").is_file():
             return open_store(path)
         return kept(path, file.stat().st_ino, file.stat().st_mtime_ns)
 
@@ -296,18 +294,13 @@ def damage_named(where: str) -> Iterator[None]:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
 
 
-def numbers_in_memory(values: NDArray[Any]) -> tuple[int, zarr.Array[Any]]:
-    """Store integers (line, sample, band) in memory, in chunks of raw lines; return the bytes and the array."""
+def packed_size(values: NDArray[Any]) -> int:
+    """Return the bytes of integers (line, sample, band), packed in chunks as those of raw lines."""
     held: dict[str, Any] = {}
     spec = image_spec(("line", "sample", "band"), values.shape, values.dtype.str)
     array = create_array(zarr.create_group(zarr_storage.MemoryStore(store_dict=held), zarr_format=3), "dn", spec, {})
     array[...] = values
-    return bytes_held(held, "dn"), array
-
-
-def bytes_held(held: Mapping[str, Any], *names: str) -> int:
-    """Return the bytes of some arrays of a store in memory, without metadata."""
-    return sum(len(part) for key, part in held.items() if key.split("/")[0] in names and not key.endswith("zarr.json"))
+    return sum(len(part) for key, part in held.items() if not key.endswith("zarr.json"))
 
 
 def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, float]) -> None:

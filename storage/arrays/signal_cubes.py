@@ -36,8 +36,6 @@ from storage.arrays.cubes import (
 )
 from storage.arrays.layout import (
     ArraySpec,
-    StorePlace,
-    bytes_held,
     create_array,
     create_group,
     damage_named,
@@ -54,12 +52,10 @@ from storage.arrays.layout import (
     write_counts,
     write_small,
     zarr,
-    zarr_storage,
 )
 
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both
 MOST_DN = np.iinfo(np.uint16).max
-SIGNAL_ARRAYS = ("scores", "quality", "axes", "mean", "noise", "rare_line", "rare_sample", "rare_residual")
 
 
 class LineRows(NamedTuple):
@@ -77,7 +73,7 @@ class SignalCubeWriter:
 
     def __init__(
         self,
-        path: StorePlace,
+        path: Path,
         header: SweepHeader,
         components: Components,
         *,
@@ -135,7 +131,7 @@ class SignalCube(StoredSweep):
     components: Components
     step: float
     largest: float  # greatest absolute score
-    path: Path | None  # None: in memory
+    path: Path
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
@@ -146,7 +142,7 @@ class SignalCube(StoredSweep):
     def references(self) -> References:
         """Dark and white frames."""
         shared = self.group.attrs.get(FRAMES_OF)
-        if shared is not None and self.path is not None:
+        if shared is not None:
             return read_references(open_group(self.path.with_name(f"{shared}.zarr")))
         return read_references(self.group)
 
@@ -203,7 +199,7 @@ def read_coordinates(
 
 
 @opened_once
-def open_signal_cube(path: StorePlace) -> SignalCube:
+def open_signal_cube(path: Path) -> SignalCube:
     """Open a condensed sweep. Raises IncompleteStoreError: there is none, it was not closed, or it is damaged."""
     group = open_group(path)
     return SignalCube(
@@ -211,7 +207,7 @@ def open_signal_cube(path: StorePlace) -> SignalCube:
         components=read_components(group),
         step=step_of(group),
         largest=step_of(group, "largest"),
-        path=path if isinstance(path, Path) else None,
+        path=path,
     )
 
 
@@ -255,21 +251,3 @@ def open_lines(path: Path) -> RawCube:
     one = open_signal_cube(path)
     facts = {field.name: getattr(one, field.name) for field in fields(StoredSweep)}
     return RestoredCube(**facts, references=one.references, signal=one)
-
-
-class SignalCubeInMemory:
-    """A condensed sweep in memory, written and read like a stored one."""
-
-    def __init__(self, header: SweepHeader, components: Components, *, step: float, largest: float) -> None:
-        self._held: dict[str, Any] = {}
-        self._store = zarr_storage.MemoryStore(store_dict=self._held)
-        self.writer = SignalCubeWriter(self._store, header, components, step=step, largest=largest)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the signal: scores, components and rare spectra, without frames and facts of lines."""
-        return bytes_held(self._held, *SIGNAL_ARRAYS)
-
-    def open(self) -> SignalCube:
-        """Open what was written."""
-        return open_signal_cube(self._store)

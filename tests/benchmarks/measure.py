@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import gc
+import math
 import multiprocessing
 import os
+import statistics
 import textwrap
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -12,10 +16,6 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TypeVar
 
-from flows.tradeoff.entries import Timing, ratio
-from flows.tradeoff.entries import time_in_turn as in_turn
-
-__all__ = ["Timing", "ratio"]
 ROOT = Path(__file__).resolve().parents[2]
 T = TypeVar("T")
 
@@ -29,6 +29,19 @@ class Row:
     goal: str = ""
     met: bool | None = None
     peers: str = ""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of one call in each round, by the processor's clock and by the wall clock."""
+
+    cpu_s: tuple[float, ...]
+    wall_s: tuple[float, ...]
+
+    @property
+    def cpu_min_s(self) -> float:
+        """Least processor time [s]."""
+        return min(self.cpu_s)
 
 
 def data_folder(name: str) -> Path:
@@ -45,7 +58,22 @@ def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> 
     """Time calls round by round, after one untimed run of each; every round begins with another call."""
     for call in calls.values():
         call()
-    return in_turn(calls, rounds)
+    names = list(calls)
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
+    for turn in range(rounds):
+        first = turn % len(names)
+        for name in names[first:] + names[:first]:
+            gc.collect()
+            wall, cpu = time.perf_counter(), time.process_time()
+            calls[name]()
+            spent[name].append((time.process_time() - cpu, time.perf_counter() - wall))
+    return {name: Timing(*map(tuple, zip(*pairs, strict=True))) for name, pairs in spent.items()}
+
+
+def ratio(clocks: Mapping[str, Timing], of: str, to: str) -> float:
+    """Return the median over the rounds of one call's processor time over another's. Load hardly changes it."""
+    pairs = zip(clocks[of].cpu_s, clocks[to].cpu_s, strict=True)
+    return statistics.median([own / other for own, other in pairs if other > 0] or [math.nan])
 
 
 def ns_of(clock: Timing, values: float) -> float:

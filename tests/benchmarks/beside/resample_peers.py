@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flows.tradeoff.stages import draw_waves
-
 SIDE = 256  # px of the sweep
 BANDS = 270
+WAVES = 24
 EDGE = 176  # px of the output grid, which stays inside when rotated
 TURN_DEG = 14.0
 CRS = "EPSG:32631"
@@ -56,17 +55,25 @@ def turned_waves(falloff: float, bands: int = BANDS) -> Turned:
 
     The amplitude is the period to the power of ``falloff``: 1 as in images of natural scenes, 0 for equal amplitudes.
     """
-    waves = draw_waves(0, bands, (4.0, 40.0))
-    size = np.linalg.norm(waves.frequency, axis=1)[:, None] ** -falloff
-    waves = replace(waves, cosine=waves.cosine * size, sine=waves.sine * size)
+    rng = np.random.default_rng(0)
+    period = np.exp(rng.uniform(np.log(4.0), np.log(40.0), WAVES))
+    angle = rng.uniform(0, np.pi, WAVES)
+    frequency = np.stack([np.sin(angle), np.cos(angle)], axis=-1) / period[:, None]
+    size = period[:, None] ** falloff
+    cosine, sine = rng.standard_normal((WAVES, bands)) * size, rng.standard_normal((WAVES, bands)) * size
+
+    def waves(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        phase = 2 * np.pi * at @ frequency.T
+        return np.cos(phase) @ cosine + np.sin(phase) @ sine
+
     cos, sin = np.cos(np.deg2rad(TURN_DEG)), np.sin(np.deg2rad(TURN_DEG))
     turn = np.array([[cos, -sin], [sin, cos]])
     middle = np.array([SIDE / 2 + 0.2, SIDE / 2 - 0.3])
     affine = np.column_stack([turn, middle - turn @ np.full(2, (EDGE - 1) / 2)])
     coordinates = np.argwhere(np.ones((EDGE, EDGE), bool)) @ turn.T + affine[:, 2]
     lines = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
-    samples = waves.at(lines).astype(np.float32).reshape(SIDE, SIDE, bands)
-    return Turned(samples, coordinates, affine, waves.at(coordinates))
+    samples = waves(lines).astype(np.float32).reshape(SIDE, SIDE, bands)
+    return Turned(samples, coordinates, affine, waves(coordinates))
 
 
 def peers(scene: Turned, order: int, only: str | None = None) -> list[Peer]:

@@ -10,7 +10,7 @@ import pytest
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
 from flows.tasks.survey_model import shipped_weights, weights_path
-from flows.tradeoff.store import coarse_of_sweeps
+from flows.tradeoff import coarse_of_sweeps
 from models.evaluation.metrics import mean_iou
 from models.policies.placement import ReadTwice
 from models.weights.files import Weights, describe_weights, load_weights

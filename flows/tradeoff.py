@@ -1,0 +1,627 @@
+"""The verb `tradeoff`: what accuracy costs in time, processor time and bytes, stage by stage.
+
+Settings of a stage run in turn on one thread. A loaded machine then slows all of them alike.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import numpy as np
+from cyclopts import Parameter
+from cyclopts.validators import Number
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+from scipy.ndimage import gaussian_filter
+
+from flows.publish.panels import GRID, INK, PAPER, png
+from flows.settings.flags import AsJson, OutFile
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import RASTER, Settings, SignalChoice
+from flows.tasks.run import SurveyRun, open_run
+from flows.tasks.scene import check_labels
+from flows.terminal.figures import format_bytes
+from flows.terminal.processes import writing
+from flows.terminal.progress import on_stdout, print_json, stderr, table
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.machine import keep_freed_memory, one_thread
+from models.network.sizes import TOKEN_PX
+from models.network.spectral import LineSpec
+from models.policies.policies import score_patches
+from models.reading.inference import CoarsePrediction, DrawnMap, read_coarse_pass, read_coarse_prediction, segment
+from models.weights.files import Weights
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import BYTES_PER_SAMPLE, cheapest_full, frame_patches, raw_bytes, uniform_sweeps
+from pipeline.planning.uniform_scans import format_scan
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.region import mosaic_rows
+from pipeline.rectify.resample import resample
+from pipeline.signal.calibrate import calibrate
+from pipeline.signal.components import Components
+from pipeline.signal.condense import score_lines, whole_steps
+from pipeline.signal.lines import BLOCK_LINES
+from pipeline.signal.subspace import SignalStatistics, find_components
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
+from pipeline.source import SweepLines
+from storage.archive.archive import Archive
+from storage.archive.whole_files import to_json
+from storage.arrays.layout import packed_size
+
+Setting = str | float
+Values = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Error of a setting, bytes of what it keeps or reads, and the camera's seconds where it scans."""
+
+    error: float
+    bytes: int
+    camera_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """Define the measurement of one stage. Only ``run`` is timed.
+
+    ``prepare`` takes a seed, a scene and weights; the last two are None without a scene of one's own. Its state is
+    passed to ``run`` with a setting, and to ``judge`` with a setting and the result of ``run``.
+    """
+
+    stage: str
+    knob: str
+    error: str  # with its unit
+    bytes: str  # whose they are
+    settings: tuple[Setting, ...]
+    prepare: Callable[[int, str | None, Path | None], Any]
+    run: Callable[[Any, Setting], Any]
+    judge: Callable[[Any, Setting, Any], Figures]
+    default: Setting | None = None  # setting of a survey by its defaults
+    takes_scene: bool = False
+
+
+@dataclass(frozen=True)
+class Point:
+    """The four measures of one setting. Times are the least of all rounds."""
+
+    setting: Setting
+    error: float
+    time_s: float  # of the camera where the setting scans, else by the wall clock
+    processor_s: float
+    bytes: int
+    pareto: bool = False
+
+
+@dataclass(frozen=True)
+class Result:
+    """Points of all settings of one trade-off."""
+
+    stage: str
+    knob: str
+    error: str
+    bytes: str
+    default: Setting | None
+    repeats: int
+    seed: int
+    notes: tuple[str, ...]  # on labels
+    machine: Mapping[str, object]
+    points: tuple[Point, ...]
+
+
+def describe_machine(threads: int) -> dict[str, object]:
+    """Return processor, cores, system, threads in use and versions of the numerical packages."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return {
+        "processor": next(names, platform.processor() or "unknown"),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "threads": threads,
+        "versions": {name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
+    }
+
+
+def mean_load() -> float:
+    """Return the mean number of running processes over the last minute."""
+    return round(os.getloadavg()[0], 2)
+
+
+def measure_tradeoff(
+    tradeoff: Tradeoff, *, repeats: int = 5, seed: int = 0, scene: str | None = None, weights: Path | None = None
+) -> Result:
+    """Judge every setting by its first run, and time ``repeats`` runs of each in turn, on one thread.
+
+    Every round begins with another setting.
+    """
+    state = tradeoff.prepare(seed, scene, weights)
+    settings = list(tradeoff.settings)
+    figures: dict[Setting, Figures] = {}
+    clocks: dict[Setting, list[tuple[float, float]]] = {one: [] for one in settings}
+    with one_thread():
+        load_before = mean_load()
+        for turn in range(repeats):
+            first = turn % len(settings)
+            for one in settings[first:] + settings[:first]:
+                gc.collect()
+                wall, processor = time.perf_counter(), time.process_time()
+                result = tradeoff.run(state, one)
+                clocks[one].append((time.perf_counter() - wall, time.process_time() - processor))
+                if turn == 0:
+                    figures[one] = tradeoff.judge(state, one, result)
+        machine = describe_machine(threads=1) | {"load_before": load_before, "load_after": mean_load()}
+    points = []
+    for one, found in figures.items():
+        wall, processor = (min(times) for times in zip(*clocks[one], strict=True))
+        points.append(Point(one, found.error, found.camera_s or wall, processor, found.bytes))
+    about = tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.bytes, tradeoff.default
+    return Result(*about, repeats, seed, getattr(state, "notes", ()), machine, mark_pareto(points))
+
+
+def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
+    """Mark the points that no other beats: as good in error, time and bytes, and better in one of them."""
+    rows = [(point.error, point.time_s, point.bytes) for point in points]
+    marked = []
+    for point, row in zip(points, rows, strict=True):
+        beaten = any(other != row and all(a <= b for a, b in zip(other, row, strict=True)) for other in rows)
+        marked.append(replace(point, pareto=math.isfinite(point.error) and not beaten))
+    return tuple(marked)
+
+
+# rectify: kernels, between the pixels of a blurred farm
+
+FINE = 4  # pixels of the truth to a sample
+BLUR = 0.7  # deviation [samples], about that of the rig's light spread
+RECTIFY_SHAPE = (1024, 1024)  # of the truth
+POINTS = 40_000
+
+
+@dataclass(frozen=True)
+class Scattered:
+    """Samples on a grid, points between them, and the truth there."""
+
+    samples: Values  # (line, sample, band)
+    coordinates: NDArray[np.float64]  # (n, 2)
+    truth: Values  # (n, band)
+
+    def judge(self, _kernel: Setting, found: Values) -> Figures:
+        """Return the root mean square error over the standard deviation of the scene."""
+        return Figures(float(np.sqrt(np.mean((found - self.truth) ** 2)) / np.std(self.truth)), found.nbytes)
+
+
+def scatter_points(seed: int, _scene: str | None = None, _weights: Path | None = None) -> Scattered:
+    """Sample a blurred farm at every fourth pixel; draw points of its other pixels in the order of a grid's rows."""
+    values = farm_scene(seed, RECTIFY_SHAPE).values()[..., ::4]
+    fine = gaussian_filter(values, (FINE * BLUR, FINE * BLUR, 0))
+    pixels = np.random.default_rng(seed).integers(2 * FINE, np.array(fine.shape[:2]) - 3 * FINE, (POINTS, 2))
+    pixels = pixels[np.lexsort((pixels[:, 1], pixels[:, 0] // FINE))]
+    return Scattered(fine[::FINE, ::FINE].copy(), pixels / FINE, fine[tuple(pixels.T)])
+
+
+RECTIFY = Tradeoff(
+    stage="rectify",
+    knob="resampling",
+    error="rmse / standard deviation of the scene",
+    bytes="values",
+    settings=("nearest", "bilinear", "catmull-rom"),
+    default=Settings().resampling,
+    prepare=scatter_points,
+    run=lambda state, kernel: resample(
+        state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
+    )[0],
+    judge=Scattered.judge,
+)
+
+
+# simulate: effects left out by their bounds, on lines of a farm
+
+LAND_SHAPE = (512, 1280)
+PATCH = 16
+LINES = 8  # at each end of a sweep and in its middle
+EXACT = "exact"
+TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma
+
+
+@dataclass(frozen=True)
+class FarmLines:
+    """Lines of an outer sweep over a farm, and the decision for every tolerance."""
+
+    scene: RasterScene
+    rig: Rig
+    blocks: tuple[SweepBlock, ...]
+    decisions: Mapping[Setting, Decision]
+
+    def simulate(self, setting: Setting) -> tuple[Values, NDArray[np.uint16]]:
+        """Return expected electrons before the readout, and raw numbers, (line, sample, band) each."""
+        chosen = self.decisions[setting].chosen
+        light = [expected_light(self.scene, block, chosen) for block in self.blocks]
+        raw = [read_out(one, block, chosen) for one, block in zip(light, self.blocks, strict=True)]
+        return np.concatenate(light), np.concatenate(raw)
+
+    def judge(self, setting: Setting, made: tuple[Values, NDArray[np.uint16]]) -> Figures:
+        """Return the greatest change against all exact effects, in deviations of the sample's noise."""
+        off = (self._electrons(setting, made[0]) - self.exact) / noise_electrons(self.exact, self.rig)
+        return Figures(float(np.abs(off).max()), packed_size(made[1]))
+
+    @cached_property
+    def exact(self) -> Values:
+        """Exact electrons of the samples, (line, sample, band)."""
+        return self._electrons(EXACT, self.simulate(EXACT)[0])
+
+    def _electrons(self, setting: Setting, light: Values) -> Values:
+        """Add the dark signal to light. [e-]"""
+        per_dn = np.float32(self.rig.camera.electrons_per_dn)
+        return light + dark_frame(self.blocks[0], self.decisions[setting].chosen) * per_dn
+
+
+def decide_for_lines(seed: int, _scene: str | None = None, _weights: Path | None = None) -> FarmLines:
+    """Plan the full scan of a farm, decide on effects for every tolerance, and take lines of the first sweep."""
+    scene = farm_scene(seed, LAND_SHAPE)
+    rig = Rig()
+    _, sweeps, _ = cheapest_full(SceneGrid(*LAND_SHAPE, PATCH), rig.camera, CostModel())
+    probe = probe_scene(scene, rig, sweeps)
+    starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
+    blocks = tuple(sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts)
+    limits: dict[Setting, float] = {EXACT: 0.0} | {one: one for one in TOLERANCES}
+    return FarmLines(scene, rig, blocks, {one: decide(probe, rig, EFFECTS, limit) for one, limit in limits.items()})
+
+
+SIMULATE = Tradeoff(
+    stage="simulate",
+    knob="tolerance [σ]",  # noqa: RUF001
+    error="greatest change of a sample [σ of its noise]",  # noqa: RUF001
+    bytes="raw numbers, packed",
+    settings=(EXACT, *TOLERANCES),
+    default=Settings().tol.value,
+    prepare=decide_for_lines,
+    run=FarmLines.simulate,
+    judge=FarmLines.judge,
+)
+
+
+# condense: the step of scores, on a sweep over a farm
+
+FIELD_SHAPE = (128, 600)  # one swath
+EXPOSURE_MS = 10.0
+RAW = "raw"
+STEPS = (0.5, 1.0, 2.0, 3.0)  # deviations of the noise
+SIGNAL = SignalChoice()
+
+
+@dataclass(frozen=True)
+class CalibratedLines:
+    """Scene values of a sweep with and without noise, the noise's deviation, and the components of the field."""
+
+    raw: NDArray[np.uint16]
+    values: Values  # (line, sample, band)
+    valid: NDArray[np.bool_]
+    truth: Values
+    sigma: Values
+    components: Components
+
+    def condense(self, step: Setting) -> NDArray[Any]:
+        """Return the raw numbers, or the scores in whole steps, (line, sample, component)."""
+        if step == RAW:
+            return self.raw
+        scores = score_lines(self.values, self.valid, self.components).scores
+        return whole_steps(scores, float(step)).astype(np.int16)
+
+    def judge(self, step: Setting, kept: NDArray[Any]) -> Figures:
+        """Return the root mean square error of restored spectra, and the bytes of the numbers as stores pack them."""
+        restored = self.values if step == RAW else self.components.restore(kept.astype(np.float32) * np.float32(step))
+        planes = kept if step == RAW else np.ascontiguousarray(kept.transpose(2, 0, 1))
+        off = (restored - self.truth) / self.sigma
+        return Figures(float(np.sqrt(np.mean(np.square(off), dtype=np.float64))), packed_size(planes))
+
+
+def scan_farm(seed: int, _scene: str | None = None, _weights: Path | None = None) -> CalibratedLines:
+    """Scan a farm of one swath by every line at 10 ms; the simulator also gives the values without noise."""
+    rig = Rig()
+    scene = farm_scene(seed, FIELD_SHAPE)
+    along, _, _ = cheapest_full(SceneGrid(*FIELD_SHAPE, PATCH), rig.camera, CostModel())
+    (sweep,) = uniform_sweeps(SceneGrid(*FIELD_SHAPE, PATCH), rig.camera, along, step=1, exposure_ms=EXPOSURE_MS)
+    choice = Choice.of(USUAL)
+    block = sweep_block(scene, rig, sweep, range(sweep.lines), seed=seed)
+    light, dark = expected_light(scene, block, choice), dark_frame(block, choice)
+    raw = read_out(light, block, choice)
+    lines = SimulatedSweep(SimulatedSource(scene, rig, seed), sweep)
+    per_dn = np.float32(rig.camera.electrons_per_dn)
+
+    def calibrated(dn: NDArray[Any]) -> tuple[Values, NDArray[np.bool_]]:
+        return calibrate(dn, lines.references, saturated_dn=np.inf, position=lines.position)
+
+    values, valid = calibrated(raw)
+    statistics = SignalStatistics(values.shape[2], values[..., 0].size)
+    for part in cuts(len(values), BLOCK_LINES):
+        statistics.add(values[part], valid[part])
+    components = find_components(statistics, false_alarm=SIGNAL.false_alarm, least=SIGNAL.least)
+    truth = calibrated(light / per_dn + dark)[0]
+    sigma = calibrated(noise_electrons(light, block.rig) / per_dn + dark)[0]
+    return CalibratedLines(raw, values, valid, truth, sigma, components)
+
+
+CONDENSE = Tradeoff(
+    stage="condense",
+    knob="step [σ]",  # noqa: RUF001
+    error="rmse of a spectrum [σ of its noise]",  # noqa: RUF001
+    bytes="kept numbers, packed",
+    settings=(RAW, *STEPS),
+    default=SIGNAL.step,
+    prepare=scan_farm,
+    run=CalibratedLines.condense,
+    judge=CalibratedLines.judge,
+)
+
+
+# survey: uniform scans; segment: fractions of the patches
+
+FARM_SHAPE = (384, 512)
+ROWS = 64  # that are rectified at a time
+SCANS = {format_scan(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
+FRACTIONS = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
+POLICY = "gain"
+
+
+@dataclass(frozen=True)
+class PlannedPass:
+    """A coarse prediction, the patches to read in full, and the cost of the scan."""
+
+    coarse: CoarsePrediction
+    patch_index: NDArray[np.intp]
+    weights: Weights
+    bytes: int
+    seconds: float | None = None  # of the camera
+
+
+@dataclass(frozen=True)
+class PlannedField:
+    """A field with labels, scanned or read by several plans."""
+
+    labels: NDArray[np.uint8]
+    passes: Mapping[Setting, PlannedPass]
+    notes: tuple[str, ...]  # on the labels
+
+    def read(self, plan: Setting) -> DrawnMap:
+        """Return the class map of a plan; the overview is read anew, whose time counts."""
+        one = self.passes[plan]
+        coarse = replace(one.coarse, overview=None)
+        return segment(one.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
+
+    def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
+        """Return 1 - mIoU of a map, and the bytes and seconds of its scan."""
+        one = self.passes[plan]
+        miou = mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes))
+        return Figures(1 - miou, one.bytes, one.seconds)
+
+
+def coarse_of_sweeps(
+    sweeps: Sequence[SweepLines],
+    camera: LineCamera,
+    wavelength_nm: NDArray[np.floating],
+    grid: SceneGrid,
+    weights: Weights,
+    capture: LineSpec = LineSpec(),  # noqa: B008 - a value
+) -> CoarsePrediction:
+    """Rectify sweeps over a scene to its pixels, and predict from them."""
+    blocks = mosaic_rows(sweeps, camera, grid, rows=ROWS)
+    return read_coarse_prediction(weights, read_coarse_pass(weights, blocks, wavelength_nm, grid, capture=capture))
+
+
+def uniform_pass(
+    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: LineSpec
+) -> PlannedPass:
+    """Plan to read all patches of a uniform scan."""
+    seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
+    coarse = coarse_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, capture)
+    size = raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
+    return PlannedPass(coarse, grid.every_patch(), weights, size, cost.seconds(sweeps, source.camera))
+
+
+def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
+    """Open a field as a survey by its defaults does, or a farm without a ``scene``; nothing is written.
+
+    Raises SceneError: it has no labels; else as `flows.tasks.run.open_run`.
+    """
+    farm = {"scene": "farm", "size": "{1}x{0}".format(*FARM_SHAPE)}
+    asked = {**(farm if scene is None else {"scene": scene}), "source": source, "seed": seed, "weights": weights}
+    settings = load_settings(None, {name: str(one) for name, one in asked.items() if one is not None})
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-tradeoff-") as empty:
+        run = open_run(settings, planning=True, archive=Archive(Path(empty), writes=False))
+    if run.labels is None or (run.labels == UNLABELLED).all():
+        raise SceneError(f"{scene} has no labels by which a map could be judged; lay a label file beside it")
+    return run
+
+
+def plan_scans(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
+    """Scan a farm or another scene by every uniform scan."""
+    run = open_field(seed, scene, weights, "sim")
+    grid = SceneGrid(*run.scene.shape, run.described.config.patch)
+    along, _, _ = cheapest_full(grid, run.camera, run.settings.cost)
+    passes: dict[Setting, PlannedPass] = {}
+    for name, (step, exposure_ms) in SCANS.items():
+        sweeps = uniform_sweeps(grid, run.camera, along, step=step, exposure_ms=exposure_ms)
+        scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
+        passes[name] = uniform_pass(run.weights, run.simulated, sweeps, grid, run.settings.cost, scan)
+    return _planned(run, passes)
+
+
+def plan_fractions(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
+    """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
+    run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
+    grid, raster, wavelength_nm = run.grid, run.raster, run.scene.wavelength_nm
+    keep_freed_memory()  # as surveys do
+    if raster is not None:
+        parts = cuts(grid.height, raster.rows_at_once(run.settings.memory))
+        blocks = (raster.rows(part.start, part.stop) for part in parts)
+        coarse = read_coarse_prediction(run.weights, read_coarse_pass(run.weights, blocks, wavelength_nm, grid))
+    else:
+        _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
+        seen = [SimulatedSweep(run.simulated, sweep) for sweep in full]
+        coarse = coarse_of_sweeps(seen, run.camera, wavelength_nm, grid, run.weights)
+    scores = score_patches(POLICY, coarse)
+    passes: dict[Setting, PlannedPass] = {}
+    for fraction in FRACTIONS:
+        chosen = frame_patches(scores, fraction) if fraction < 1 else grid.every_patch()
+        pixels = grid.height * grid.width // TOKEN_PX**2 + len(chosen) * grid.patch**2
+        passes[fraction] = PlannedPass(coarse, chosen, run.weights, pixels * len(wavelength_nm) * BYTES_PER_SAMPLE)
+    return _planned(run, passes)
+
+
+def _planned(run: SurveyRun, passes: Mapping[Setting, PlannedPass]) -> PlannedField:
+    assert run.labels is not None
+    return PlannedField(run.labels, passes, check_labels(run.scene, run.described))
+
+
+SURVEY = Tradeoff(
+    stage="survey",
+    knob="scan",
+    error="1 - mIoU",
+    bytes="raw numbers",
+    settings=tuple(SCANS),
+    prepare=plan_scans,
+    run=PlannedField.read,
+    judge=PlannedField.judge,
+    takes_scene=True,
+)
+SEGMENT = replace(
+    SURVEY,
+    stage="segment",
+    knob="fraction of patches",
+    bytes="raw numbers of these patches and of means",
+    settings=FRACTIONS,
+    prepare=plan_fractions,
+)
+TRADEOFFS = {one.stage: one for one in (CONDENSE, RECTIFY, SEGMENT, SIMULATE, SURVEY)}
+
+
+# the verb
+
+
+def tradeoff(
+    stage: str | None = None,
+    *,
+    scene: str | None = None,
+    weights: Path | None = None,
+    out: OutFile = Path("tradeoff"),
+    repeats: Annotated[int, Parameter(validator=Number(gte=1))] = 5,
+    seed: Annotated[int, Parameter(validator=Number(gte=0))] = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Measure what accuracy costs in time and bytes, for STAGE or for all stages with a choice.
+
+    Parameters
+    ----------
+    stage
+        condense, rectify, segment, simulate or survey. Default: all.
+    scene
+        Labelled scene instead of a farm: a raster for segment, a scene of the simulated rig for survey.
+    weights
+        Weights for the classes of the scene.
+    out
+        Folder of tradeoff.json and tradeoff.png.
+    repeats
+        Rounds that time every setting once.
+    seed
+        Random seed of the scenes.
+    """
+    wanted = choose_tradeoffs(stage, scene, weights)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
+    results = []
+    for one in wanted:
+        with stderr.status(f"measuring {one.stage}: {one.knob}"):
+            results.append(measure_tradeoff(one, repeats=repeats, seed=seed, scene=scene, weights=weights))
+        print_tradeoff(results[-1], stderr if as_json else on_stdout())
+    content = {"tradeoffs": [asdict(result) for result in results]}
+    with writing(out):
+        (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
+        (out / "tradeoff.png").write_bytes(png(tradeoff_figure(results)))
+    stderr.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", markup=False, soft_wrap=True)
+    if as_json:
+        print_json(content)
+    return 0
+
+
+def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None) -> list[Tradeoff]:
+    """Return the trade-off of a stage, or all; with a scene only those that take one. Raises SettingsError."""
+    if stage is not None and stage not in TRADEOFFS:
+        raise SettingsError(f"no trade-off for stage {stage!r}; there are: {', '.join(TRADEOFFS)}")
+    chosen = list(TRADEOFFS.values()) if stage is None else [TRADEOFFS[stage]]
+    if scene is None and weights is None:
+        return chosen
+    chosen = [one for one in chosen if one.takes_scene]
+    if scene is None or weights is None or not chosen:
+        raise SettingsError(
+            "--scene FILE and --weights FILE go together, with the stages segment and survey: "
+            "spectralzoom tradeoff survey --scene FILE --weights FILE"
+        )
+    return chosen
+
+
+def print_tradeoff(result: Result, console: Console) -> None:
+    """Print the four measures of all settings, from the least error up, with the Pareto front marked."""
+    rows = []
+    for point in sorted(result.points, key=lambda point: point.error):
+        name = f"{point.setting} (default)" if point.setting == result.default else str(point.setting)
+        times = [f"{seconds:.3g} s" for seconds in (point.time_s, point.processor_s)]
+        cells = ["●" if point.pareto else "○", name, f"{point.error:.3g}", *times, format_bytes(point.bytes)]
+        rows.append([f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in cells])
+    headings = ("error", "time", "processor\ntime", "bytes")
+    title = f"{result.stage}: what accuracy costs"
+    console.print(table(("", escape(result.knob), *headings), rows, left=2, title=title, whole=("", *headings)))
+    machine = result.machine
+    caption = (
+        f"error: {result.error}; bytes: {result.bytes}; ● Pareto front\n"
+        f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn, {machine['threads']} thread, "
+        f"load {machine['load_before']} to {machine['load_after']}, {machine['processor']}"
+    )
+    console.print(escape("\n".join((caption, *result.notes))))
+
+
+def tradeoff_figure(results: Sequence[Result]) -> Figure:
+    """Draw error against time and against bytes for each trade-off; points of the Pareto front are filled."""
+    figure = Figure(figsize=(10, 4 * len(results)), dpi=110, layout="constrained", facecolor=PAPER)
+    for row, result in zip(figure.subplots(len(results), 2, squeeze=False), results, strict=True):
+        points = [point for point in result.points if math.isfinite(point.error)]
+        errors = [point.error for point in points]
+        for axes, label, costs in (
+            (row[0], "time [s]", [point.time_s for point in points]),
+            (row[1], f"bytes of {result.bytes}", [point.bytes for point in points]),
+        ):
+            for point, cost in zip(points, costs, strict=True):
+                axes.plot(cost, point.error, "o", color=INK, fillstyle="full" if point.pareto else "none")
+                axes.annotate(str(point.setting), (cost, point.error), (5, 4), textcoords="offset points", size=7)
+            axes.set_xscale("log")
+            axes.set_yscale("symlog", linthresh=min((one for one in errors if one > 0), default=1.0))  # 0 is exact
+            axes.set_title(f"{result.stage}: {result.knob}", loc="left", color=INK)
+            axes.set(xlabel=label, ylabel=result.error, facecolor=PAPER, axisbelow=True)
+            axes.grid(visible=True, color=GRID, linewidth=0.8)
+    return figure

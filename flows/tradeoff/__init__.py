@@ -1,1 +1,0 @@
-"""Trade-offs of accuracy against time: one measure a stage, with knob, reference and error."""
