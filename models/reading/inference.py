@@ -38,7 +38,7 @@ else:
 
 ROWS_DRAWN = 64  # at once
 # Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on
-# the surroundings of a pixel: .4 to 1.4 points more on scans of 4 ms (docs/measurements/accuracy.md).
+# the surroundings of a pixel: .4 to 1.4 points more on scans of 4 ms.
 FAINTER = 1.4
 
 

@@ -36,7 +36,7 @@ FREED_EVERY = 50  # steps: crops of several sizes leave gaps of 9 MB a step in k
 PIXELS = 60_000  # to fit classifiers to, of all scenes together
 CAPTURES = 16  # simulated for the linear classifier, of all scenes together or more
 ABSENT = -20.0  # logit of a class without a pixel
-# Their mean scores more than either (docs/measurements/accuracy.md); the regression has a weak penalty.
+# Their mean scores more than either; the regression has a weak penalty.
 LINEAR = (LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"), LogisticRegression(C=10.0, max_iter=200))
 KNOWN = ("overview_stem.first.", "overview_stem.stages.")  # parameters of large frames that ImageNet trained
 KNOWN_RATE = 0.3  # of the learning rate, for these
