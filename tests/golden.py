@@ -264,9 +264,9 @@ def machine() -> dict[str, str]:
 def close(name: str, expected: Any, found: Any, row: Row) -> bool:
     """Return whether a value is that of another machine but for rounding; hashes always are.
 
-    Scores of a component may differ by 1 % of their standard deviation, and pixels of a class by 0.1 % of all. Positions
-    of the mirror may differ by a millionth, other numbers by 1 % or 0.01. Other kernels of torch and OpenBLAS on one
-    processor change figures by a hundred-thousandth at most.
+    Scores of a component may differ by 1 % of their standard deviation, pixels of a class by 0.1 % of all pixels.
+    Positions of the mirror may differ by a millionth, other numbers by 1 % or 0.01. Other kernels of torch and OpenBLAS
+    on one processor change figures by a hundred-thousandth at most.
     """
     if name.endswith("sha256"):
         return True
