@@ -7,10 +7,9 @@ import io
 import os
 import sys
 
-from cyclopts import CycloptsError, UnknownOptionError
+from cyclopts import CycloptsError
 
 from flows.cli.app import GOES_ON, VERBS, build_app
-from flows.settings.renamed import RENAMED
 from flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
 from flows.terminal.progress import say, stderr
 from pipeline.errors import SettingsError
@@ -41,10 +40,6 @@ def _run(arguments: list[str]) -> int:
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
         what = str(error).partition(" Available commands:")[0].rstrip(".")  # the help lists all commands
-        flag = (error.token.keyword or error.token.value) if isinstance(error, UnknownOptionError) else ""
-        flag = flag.partition("=")[0]
-        now = RENAMED.get(flag.removeprefix("--").replace("-", "_"))
-        what = f"Unknown option: {flag}; it is called --{now.replace('_', '-')} now" if now else what
         say(f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help")
         return SettingsError.exit_code
     except KeyboardInterrupt as error:

@@ -344,6 +344,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     ),
     "miou": lambda miou: f"{format_points(miou)} of 100",
     "error": lambda error: f"standard deviation {format_points(error)}",
+    "due_left": lambda count: f"{format_count(count)} patches beyond --max-age left",
     "taken": lambda scan: f"this one: {_scan(scan)}",
     "best_in_time": lambda scan: f"best in the same time: {_scan(scan)}",
     "reference": lambda scan: f"cheapest near the best: {_scan(scan)}",

@@ -16,7 +16,6 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, g
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
-from flows.settings.renamed import RENAMED
 from flows.settings.survey_settings import (
     ALWAYS,
     AUTO,
@@ -130,7 +129,6 @@ OF_THE_RUN = (
     *("camera", "cost", "rig", "pose", "zones", "resampling", "pointing_px", "seed", "sky", "weights"),
     *("unknown", "expected_loss", "signal"),
 )
-OF_ZOOM = ("seconds", "scan_step")  # settings of a uniform scan that a first pass has too
 BUILT_IN_WEIGHTS = "farm"
 FLAGS = {  # of settings in tables; other keys of tables have none
     **{"camera.exposure_ms": "exposure_ms", "sky.light": "sky", "sky.light_fraction": "light_fraction"},
@@ -191,15 +189,15 @@ def load_settings(
     requested = {**(usual or {}), **recorded, **table}
     for wrong in _contradictions(stated, origin, zooms=requested.get("zoom") == ALWAYS):
         raise SettingsError(wrong)
-    zooms = requested.get("zoom") == ALWAYS and requested.get("seconds") is None
-    limits = {"budget", *UNIFORM} - ({"scan_step"} if zooms else set())  # which is then that of the first pass
-    if (zooms or stated & {*OF_TWO_PASSES}) and all(requested.get(name) is None for name in limits):
-        requested |= {} if _is_map(requested) else {"budget": USUAL_BUDGET}
-    if requested.get("prior", AUTO) not in (AUTO, "none") and "extent" not in stated and not _is_map(requested):
-        others = {"sweeps", "pointing_px", "macs", *UNIFORM} - {"seconds"}
-        chosen = any(requested.get(name) is not None for name in others) or requested.get("zoom") == ALWAYS
-        if requested.get("seconds") is not None and not chosen:  # the prior map can choose the lines of a revisit
-            requested["extent"] = EXTENT_PART
+    zooms = requested.get("zoom") == ALWAYS
+    lasts = any(requested.get(name) is not None for name in ("seconds", "budget"))
+    if (zooms or stated & {*OF_TWO_PASSES}) and not lasts and not _is_map(requested):
+        requested["budget"] = USUAL_BUDGET
+    others = ("sweeps", "pointing_px", "macs", "scan_step", "budget")
+    planned = zooms or "extent" in stated or any(requested.get(name) is not None for name in others)
+    revisits = requested.get("prior", AUTO) not in (AUTO, "none") and requested.get("seconds") is not None
+    if revisits and not planned and not _is_map(requested):  # the prior map can choose the lines of a revisit
+        requested["extent"] = EXTENT_PART
     return parse_settings(requested, origin)
 
 
@@ -262,10 +260,7 @@ def _check_table(
             near = near or [prefix + name for name in difflib.get_close_matches(key, declared, n=1, cutoff=0.5)]
             every = f"known keys: {', '.join(prefix + name for name in declared)}"
             hint = f"did you mean '{near[0]}'?" if near else every
-            raise SettingsError(
-                f"unknown setting {place}; "
-                + (f"it is called '{RENAMED[full]}' now" if RENAMED.get(full) in everywhere else hint)
-            )
+            raise SettingsError(f"unknown setting {place}; {hint}")
         if not prefix and key in TABLES:
             checked[key] = _parse_table(key, value, place, origin)
         else:
@@ -313,9 +308,7 @@ def _contradictions(stated: set[str], origin: Mapping[str, str], *, zooms: bool)
     def named(names: Iterable[str]) -> list[str]:
         return [place_of(key, origin.get(key)) for key in names if key in stated]
 
-    uniform = named(key for key in UNIFORM if not (zooms and key in OF_ZOOM))
-    if zooms and uniform:
-        yield f"{uniform[0]} selects one uniform scan of the field, --zoom always two passes; leave one out"
+    uniform = [] if zooms else named(UNIFORM)  # which a first pass has too
     passes = named(OF_TWO_PASSES)
     if uniform and passes:
         yield (

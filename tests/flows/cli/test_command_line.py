@@ -76,7 +76,6 @@ def test_every_flag_has_help(verb: str) -> None:
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
-        (["plan", "--compute=1"], "Unknown option: --compute; it is called --macs now; see spectralzoom plan --help"),
     ],
 )
 def test_a_misspelt_word_gives_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

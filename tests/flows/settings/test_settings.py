@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from flows.settings.documents import example_toml, settings_table
 from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
-from flows.settings.renamed import RENAMED
 from flows.settings.survey_settings import Settings
 from flows.settings.values import Tolerance
 from pipeline.errors import BudgetError, SettingsError
@@ -26,7 +25,6 @@ from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
 from storage.archive.whole_files import to_json
 
 EXAMPLE = Path(__file__).parents[3] / "survey.example.toml"
-OF_VERBS = {"min_exposure_ms", "train_temporal", "fractions"}
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}
 
 
@@ -105,20 +103,12 @@ def test_documents_have_every_setting_with_its_default():
         ("budgt = 0.5", "did you mean 'budget'"),
         ("[camera]\nexposure = 100", "did you mean 'camera.exposure_ms'"),
         ("exposure_ms = 100", "did you mean 'camera.exposure_ms'"),
-        *((f"{old} = 1", f"it is called '{new}' now") for old, new in RENAMED.items() if new not in OF_VERBS),
     ],
 )
-def test_unknown_key_is_refused_with_its_present_name_or_the_nearest(toml, line, hint):
-    """A misspelt or old key is reported with the file."""
+def test_unknown_key_is_refused_with_the_nearest(toml, line, hint):
+    """A misspelt key is reported with the file."""
     with pytest.raises(SettingsError, match=rf"unknown setting.*survey\.toml; {hint}"):
         load_settings(toml(line))
-
-
-def test_present_names_are_settings() -> None:
-    """Some are flags of `train` and `evaluate`."""
-    known = {*SURVEY, *(f"{table}.{name}" for table, names in TABLES.items() for name in names)}
-    assert set(RENAMED.values()) - known == OF_VERBS
-    assert not set(RENAMED) & known
 
 
 @pytest.mark.parametrize("budget", ["abc", 0, "0", -1, 1.5, float("nan"), True, float("inf"), [0.5]])
