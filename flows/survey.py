@@ -15,11 +15,10 @@ No ``from __future__ import annotations`` here: Prefect reads the signatures.
 
 from prefect import flow
 
-from flows.publish.publishing import add_accuracy, clear_raw, publish
+from flows.publish.publishing import clear_raw, publish
 from flows.settings.parameters import SurveySettings
 from flows.tasks.captures import captured_signal, first_mosaic, plan_capture
 from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_tasks import as_task
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import score
 from flows.tasks.stages.condense import condense_raster
@@ -32,7 +31,7 @@ from storage.archive.keys import StageRef
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
 def survey(settings: SurveySettings) -> RunRef:
-    """Survey a field: capture, rectify, score, capture again, segment and publish.
+    """Survey a field: capture, rectify, score, capture again, segment, evaluate and publish.
 
     Parameters
     ----------
@@ -55,9 +54,11 @@ def survey(settings: SurveySettings) -> RunRef:
     with opened.at_work():
         try:
             draw_class_map(opened)
+            if opened.is_judged:
+                evaluate(opened, *opened.products.judged)
         except SurveyStopped as stopped:
             return RunRef(stopped.uri, opened.run.archive.root / stopped.uri, stopped=stopped)
-        return clear_raw(opened, judge(opened, publish(opened)))
+        return clear_raw(opened, publish(opened))
 
 
 def draw_class_map(opened: OpenSurvey) -> None:
@@ -90,10 +91,3 @@ def _draw_captured(opened: OpenSurvey) -> tuple[StageRef, StageRef]:
         mosaic = rectify_fine(opened, signal, seams)
     opened.stop_after(mosaic, "capture", "mosaic")
     return mosaic, segment(opened, mosaic, request)
-
-
-def judge(opened: OpenSurvey, run: RunRef) -> RunRef:
-    """Evaluate a published class map if there are labels; this is not part of the survey's cost."""
-    if not run.pending:
-        return run
-    return as_task(add_accuracy, "add_accuracy")(opened, run, evaluate(opened, *opened.products.judged))

@@ -23,13 +23,11 @@ from spectralzoom.opened import OpenedRun
 if TYPE_CHECKING:
     from rich.console import Console
 
-    import flows.archive.reprocess_command as reprocess_command
     import flows.cli.model_verbs as model_verbs
     import flows.evaluate.command as evaluate_command
     import flows.survey_command as survey_command
     from flows.settings.survey_settings import Settings
 else:
-    reprocess_command = deferred("flows.archive.reprocess_command")
     model_verbs = deferred("flows.cli.model_verbs")
     evaluate_command = deferred("flows.evaluate.command")
     survey_command = deferred("flows.survey_command")
@@ -91,14 +89,13 @@ def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
     return content
 
 
-def evaluate(dataset: str | Path | OpenedRun, *, progress: Listener | None = None, **flags: Any) -> dict[str, Any]:
-    """Evaluate weights on scenes that they were not trained on, or the map of a run against labels.
+def evaluate(dataset: str | Path, *, progress: Listener | None = None, **flags: Any) -> dict[str, Any]:
+    """Evaluate weights on scenes that they were not trained on.
 
     Parameters
     ----------
     dataset
-        A data set of `spectralzoom evaluate`, with ``weights`` (one or several files). Or a run, to which the accuracy
-        is added; ``labels`` and ``controls`` replace those of its survey.
+        A data set of `spectralzoom evaluate`, with ``weights`` (one or several files).
     progress
         As for `survey`.
     flags
@@ -107,19 +104,15 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Listener | None = Non
     Returns
     -------
     dict
-        For weights the content of `spectralzoom evaluate --json`, for a run the ``accuracy`` of its receipt.
+        The content of `spectralzoom evaluate --json`.
 
     Raises
     ------
     Error
         A value or a file is not valid.
     """
-    if isinstance(dataset, OpenedRun):
-        if wrong := sorted(set(flags) - {"labels", "controls"}):
-            raise SettingsError(f"evaluate of a run has no {wrong[0]!r}; it has controls, labels")
-        return _judge(dataset, progress, **flags)
     if "weights" not in flags:
-        raise SettingsError("evaluate needs weights=FILE to judge them on a data set, or a run to judge its map")
+        raise SettingsError("evaluate needs weights=FILE, the weights to judge on the data set")
     weights = flags.pop("weights")
     files = tuple(map(Path, [weights] if isinstance(weights, str | Path) else weights))
     request = _flags(model_verbs.EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
@@ -192,17 +185,6 @@ def _working(progress: Listener | None, *, quiet: bool = True) -> Iterator[Conso
     # With several threads, rounding of sums and so the content of stores would depend on the number of cores.
     with heard_by(progress), threadpoolctl.threadpool_limits(1, user_api="blas"):
         yield console
-
-
-def _judge(
-    run: OpenedRun, progress: Listener | None, labels: str | Path | None = None, controls: bool | None = None
-) -> dict[str, Any]:
-    """Add the accuracy to a run, and return it."""
-    asked = None if labels is None else str(labels)
-    with _working(progress) as console:
-        receipt = reprocess_command.run_judge(run.archive_name, run.name, console, controls=controls, labels=asked)
-    vars(run).pop("receipt", None)  # read again, with the accuracy
-    return dict(receipt["accuracy"])
 
 
 def _flags(kind: type[Any], verb: str, given: Mapping[str, Any], **more: Any) -> Any:

@@ -25,7 +25,7 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
     It leaves out times, memory, the archive's path, the states of stages, and bytes of files that contain times.
     Hashes of manifests (which contain times) and addresses of products are left out too; product names stay.
     """
-    same = _without(receipt, ("started", "finished", "judged"))
+    same = _without(receipt, ("started", "finished"))
     same["settings"] = _without(receipt["settings"], ("out",))
     same["stages"] = [
         _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == "evaluate" else ())))

@@ -15,7 +15,6 @@ from rich.markup import escape
 from rich.tree import Tree
 
 from flows.archive.stale_runs import can_capture, weights_now
-from flows.publish.receipt import is_pending
 from flows.publish.retention import RawClearance, clear_raw_lines
 from flows.settings.flags import ArchiveName, AsJson, Switch
 from flows.settings.load import OF_THE_PLAN, of_this_version, parse_settings
@@ -193,7 +192,7 @@ def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
         "survey": run.receipt.get("survey", run.facts.get("survey")),
         **{name: run.settings.get(name) for name in ("scene", "seed", "budget")},
         **score_of(run.receipt),
-        **{name: run.receipt.get(name) for name in ("accuracy_is", "training_scene")},
+        "training_scene": run.receipt.get("training_scene"),
         "bytes": kept,
         "state": _run_state(catalogue, run),
     }
@@ -339,7 +338,7 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     learned = "" if run["training_scene"] is None or miou is None else "*"
     return [
         *map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)),
-        "not yet" if is_pending(run) else format_points(miou) + learned,
+        format_points(miou) + learned,
         format_bytes(run["own_bytes"]),
         _age(run["age_s"]),
         state,

@@ -144,7 +144,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         run = open_run(settings, planning=True, archive=archive)
         planner = Planner(run)
         survey_flow.draw_class_map(planner)
-        if run.scene.labelled and run.settings.accuracy:
+        if planner.is_judged:
             evaluate(planner, *planner.products.judged)
         fine: FinePlan | None = None
         attention = planner.products["score"]

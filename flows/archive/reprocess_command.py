@@ -1,4 +1,4 @@
-"""Survey the fields of an archive again, and judge published maps: `reprocess` and `evaluate ARCHIVE RUN`.
+"""Survey the fields of an archive again: the verb `reprocess`.
 
 Existing stores are found by their keys; only stores that new weights or newer stages change are made.
 """
@@ -24,25 +24,15 @@ from flows.archive.stale_runs import (
     is_current,
     newest_runs,
 )
-from flows.publish.receipt import Receipt
-from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
 from flows.settings.survey_settings import Settings
-from flows.survey_command import run_survey, show_published
-from flows.tasks.open_survey import STAGES, TITLES, OpenSurvey, Products, versions
-from flows.tasks.prefect_tasks import Observer
-from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.scene import for_rig
+from flows.survey_command import run_survey
 from flows.tasks.scores import score_of
-from flows.tasks.stages.accuracy import evaluate
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out, show_text, stderr
-from models.network.machine import keep_freed_memory, use_one_thread
+from flows.terminal.progress import put_out, show_text, stderr
 from models.weights.files import describe_weights
-from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
+from pipeline.errors import PipelineError, SettingsError
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
 from storage.parallel.pool import THREADS, WorkerPool
@@ -124,8 +114,7 @@ def reprocess_fields(
                 else:
                     folder = run_survey(settings, console).folder
                     row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
-                    renewed.pop(folder.name, None)  # a run that was stopped may be older than the one that it renews
-                    renewed[old] = folder.name  # the same where a run got the accuracy that it lacked
+                    renewed[old] = folder.name
             except PipelineError as error:
                 row |= {"message": str(error)}
             rows.append(row | {"seconds": time.perf_counter() - begun})
@@ -171,82 +160,3 @@ def _show(content: Mapping[str, Any], console: Console) -> None:
     total = f"{counted(len(rows), 'run')}: {counts}" if rows else "no field matches: nothing to do"
     for line in (*map(_format_row, rows), total):
         show_text(line, console)
-
-
-def run_judge(
-    archive: str, name: str, console: Console, *, controls: bool | None = None, labels: str | None = None
-) -> Receipt:
-    """Judge a run's map and add its accuracy to the run; return its receipt.
-
-    ``name`` may be `latest`; ``controls`` and ``labels`` are those of the survey if None. A run that has
-    its accuracy already stays as it is. Raises NoRunError; ArchiveError: the run is damaged or incomplete; SceneError,
-    WeightsError: scene, labels or weights are not those of the run, or there are no labels.
-    """
-    opened = open_archive(archive, create=False)
-    catalogue = Catalogue.read(opened.root)
-    found = read_run(opened.run_folder(name))
-    receipt = load_receipt(found.folder)
-    settings = replace(asked_again(found, opened.name, None), accuracy=True)
-    if controls is not None:
-        settings = for_rig(replace(settings, controls=controls))
-    if labels is not None:
-        settings = replace(settings, labels=labels)
-    there = "accuracy" in receipt and labels is None
-    placed = not settings.plain or settings.is_map  # patches, which are compared with other placements
-    if there and ("all" in receipt["accuracy"] or not (placed and settings.controls)):
-        show_text(f"{found.uri} has its accuracy already", console)
-        return receipt
-    use_one_thread()
-    keep_freed_memory()
-    with console.status("opening scene and weights"):
-        run = open_run(settings)
-        run.archive.reclaim()
-        survey = OpenSurvey(run)
-        for row in found.stages:
-            stage = STAGES.get(str(row.get("name")))
-            if stage is not None and stage.name != evaluate.name and row.get("key"):
-                what = f"{stage.title} of {found.uri}"
-                survey.products[stage.name] = _store(catalogue, run.archive, what, str(row["key"]))
-        raster, lines = ("condense_raster", "segment", "score"), ("rectify", "segment", "choose_effects", "score")
-        for name in raster if survey.is_map else lines:  # a map is judged by their stores
-            if name not in survey.products:
-                raise ArchiveError(f"the {TITLES[name]} of {found.uri} is missing or damaged; run verify --repair")
-        _check_same(catalogue, found, survey.products, run)
-    with survey.at_work(), StageProgress(console, TITLES) as progress:
-        survey.observer = Observer(progress.watch)
-        draft = run.archive.extend_run(found.folder.name, wait=False)
-        if draft is None:
-            raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
-        with draft:
-            published = extend_with_accuracy(survey, draft, evaluate(survey, *survey.products.judged))
-    show_published(published, settings.out, console)
-    return published.receipt
-
-
-def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:
-    uris = [uri for uri in catalogue.by_key.get(key, []) if uri in catalogue.stores]
-    store = catalogue.stores[uris[0]] if uris else None
-    if store is None or store.problem is not None:
-        raise ArchiveError(f"the {what} is missing or damaged; run verify --repair")
-    now = versions().get(store.ref.stage)
-    if store.version != str(now):
-        raise ArchiveError(
-            f"the {what} was made by version {store.version} of the stage {store.ref.stage}, which is now {now}:"
-            f" `spectralzoom reprocess {archive.name}` makes a new run, with its accuracy"
-        )
-    return archive.ref(store.ref.stage, store.ref.key)
-
-
-def _check_same(catalogue: Catalogue, found: Run, products: Products, run: SurveyRun) -> None:
-    """Refuse another scene or other weights than those of the map, and a scene without labels."""
-    if run.scene.key != found.receipt.get("scene"):
-        raise SceneError(
-            f"the scene {run.settings.scene} is not the one that {found.uri} captured; restore it, or survey again"
-        )
-    if run.described.key != catalogue.stores[products["segment"].uri].params.get("weights"):
-        raise WeightsError(
-            f"the weights {run.settings.weights or 'that come with SpectralZoom'} are not those of the map of"
-            f" {found.uri}; restore those, or reprocess with these"
-        )
-    if not run.scene.labelled:
-        raise SceneError(f"there are no labels to judge {found.uri} by; give --labels FILE, on the scene's pixels")

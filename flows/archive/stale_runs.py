@@ -5,7 +5,6 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
 
-from flows.publish.receipt import is_pending
 from flows.settings.load import load_settings, of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
 from flows.tasks.open_survey import STAGES, versions
@@ -144,4 +143,4 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     """Return whether a run is whole and its survey would find all of its stores, by versions and weights alone."""
     weights = weights_now(run, settings)
     complete = run.problem is None and all(row.get("state") != "failed" for row in run.stages)
-    return complete and not is_pending(run.receipt) and not stale_stores(catalogue, set(run.names), weights)
+    return complete and not stale_stores(catalogue, set(run.names), weights)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 from rich.console import Console
 
-from flows.archive.reprocess_command import run_judge
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
@@ -40,7 +38,7 @@ class SceneFlags:
     device
         Device of the network: `cpu`, `cuda`, `mps`, or `auto` (cuda or mps if available, else cpu).
     labels
-        For one scene or a run: label file.
+        For one scene: label file.
     bands
         For one scene: band numbers to use, counted from 0, with commas.
     wavelengths
@@ -186,8 +184,6 @@ class EvaluateFlags(SceneFlags):
         Policies that choose the patches, with commas.
     frames
         Names of the frames, with commas. Default: all.
-    controls
-        For a run: also judge the small network and the full one. Default: as in its survey.
     """
 
     weights: Annotated[tuple[Path, ...], Parameter(negative="")] = ()
@@ -195,7 +191,6 @@ class EvaluateFlags(SceneFlags):
     fractions: str = ",".join(map(str, FRACTIONS))
     policies: str = ",".join(USUAL)
     frames: str | None = None
-    controls: bool | None = None
 
     def request(self, dataset: str) -> EvaluateRequest:
         """Return the request to judge weights. Raises SettingsError: numbers are invalid."""
@@ -258,36 +253,15 @@ def check_default(flags: SceneFlags, but: Sequence[str], why: str) -> None:
             raise SettingsError(f"--{one.name.replace('_', '-')} is {why}; leave it out")
 
 
-def evaluate(
-    dataset: str, run: str | None = None, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json: AsJson = False
-) -> int:
+def evaluate(dataset: str, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json: AsJson = False) -> int:
     """Evaluate WEIGHTS on the frames of DATASET that they were not trained on: accuracy and costs.
-
-    `evaluate ARCHIVE RUN`, without weights, adds the accuracy to a published run; it takes only --labels, --controls
-    and --json.
 
     Parameters
     ----------
     dataset
-        `farm`, `scouting`, a folder of labelled scenes, one scene file, or an archive with RUN.
-    run
-        Run of the archive: its name, or `latest`. `evaluate archive/runs/NAME` is equivalent.
+        `farm`, `scouting`, a folder of labelled scenes, or one scene file.
     """
-    if run is None and not flags.weights:
-        found = re.fullmatch(r"(.+)/runs/([^/]+)/?", dataset)
-        if found is None:
-            raise SettingsError(
-                f"evaluate {dataset}: give --weights FILE to judge weights on this data set, or a run of this archive, "
-                f"such as evaluate {dataset} latest, to judge its map"
-            )
-        dataset, run = found[1], found[2]
-    if run is not None:
-        check_default(flags, ("labels", "controls"), "for weights that are judged on a data set, not for a run")
-        receipt = run_judge(dataset, run, stderr, controls=flags.controls, labels=flags.labels)
-        if as_json:
-            print_json(receipt)
-        return 0
-    if flags.controls is not None:
-        raise SettingsError("--controls is for a run of an archive, not for weights; leave it out")
+    if not flags.weights:
+        raise SettingsError(f"evaluate {dataset}: give --weights FILE, the weights to judge on this data set")
     run_evaluate(flags.request(dataset), stderr, as_json=as_json)
     return 0

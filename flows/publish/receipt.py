@@ -18,9 +18,6 @@ from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
 
 Receipt = dict[str, Any]
-AccuracyIs = Literal[
-    "judged", "pending", "left out", "without labels"
-]  # pending: it is added after the publication of the map
 Facts = dict[str, Any]
 COSTS = ("lines", "samples", "capture_s", "patches", "multiply_adds")
 
@@ -68,15 +65,17 @@ class Savings(_Part):
 
 
 class DataBytes(_Part):
-    """Bytes of a run, counted over whole files, and the reference.
+    """Bytes of a run's stores, counted over whole files, and the reference.
+
+    The run's own folder (receipt, report, pictures) does not count.
 
     The reference is every line at the camera's own exposure as captured (uint16, uncompressed), for a raster every
     pixel as uint16.
     """
 
     captured: int  # as the camera delivers them, of all passes
-    written: int  # stores that were built, including cleared ones, spools, and the run's folder
-    kept: int  # the run's folder, and its stores with their inputs, but for raw lines that ``keep`` drops
+    written: int  # stores that were built, including cleared ones, and spools
+    kept: int  # its stores with their inputs, but for raw lines that ``keep`` drops
     moved_bucket: int  # to and from a bucket, 0 without one
     reference: int
 
@@ -114,8 +113,6 @@ class ReceiptFields(_Part):
     stages: list[StageRecord]
     savings: Savings
     data_bytes: DataBytes
-    accuracy_is: AccuracyIs | None = None
-    judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None
     training_scene: Literal["all", "other pixels"] | None = None  # what of the scene the weights learned from
     effects: list[Facts] | None = None  # of a simulated source, with their bounds
@@ -144,8 +141,6 @@ class ReceiptFields(_Part):
         missing = [name for name in COSTS if self.source != RASTER and getattr(self.savings, name) is None]
         if missing:
             raise ValueError(f"savings.{missing[0]} is missing")
-        if self.accuracy_is == "judged" and (self.accuracy is None or self.judged is None):
-            raise ValueError("accuracy and judged belong to a map that is judged")
         return self
 
 
@@ -171,11 +166,6 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
         what = "is missing" if first["type"] == "missing" else f"is not of the design: {first['msg']}"
         raise ShapeError(f"receipt{place} {what}; survey again, or run verify --repair on the archive") from None
     return dict(receipt)
-
-
-def is_pending(receipt: Mapping[str, Any]) -> bool:
-    """Return whether a run waits for its accuracy."""
-    return receipt.get("accuracy_is") == "pending"
 
 
 def hectares_of_classes(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:

@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt import Receipt, is_pending
+from flows.publish.receipt import Receipt
 from flows.tasks.scene import TRAINING_SCENE
 from flows.tasks.scores import format_prediction, format_worst_class
 from flows.terminal.figures import (
@@ -115,13 +115,12 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         return f"{score}{full}. {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
         return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
-    later = " The accuracy against the labels is added later." if is_pending(receipt) else ""
     expected = receipt.get("expected") or {}
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
-        return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities.{later}"
-    if receipt.get("accuracy_is") == "left out":
-        return "The accuracy was left out; `spectralzoom evaluate ARCHIVE RUN` adds it."
-    return later.strip() or "The score is not known: there are no labels."
+        return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities."
+    if receipt["settings"].get("accuracy") is False:
+        return "The accuracy was left out; the same survey with --accuracy adds it in a new run."
+    return "The score is not known: there are no labels."
 
 
 def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:

@@ -1,28 +1,26 @@
-"""Make receipt, quicklook and report of a survey, and publish them as one run folder.
+"""Make receipt, quicklook and report of a survey, and publish them as one run folder, once.
 
-When the accuracy is known, the folder is made again with it and replaces the first. The bytes kept include the receipt
-and the report. Both are written again until the figure in them is right.
+The receipt counts the bytes of the survey's stores, and not those of its own folder.
 """
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.field_map import FieldMap, block_of, field_map, prior_map
+from flows.publish.field_map import block_of, field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground, thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
-from flows.publish.receipt import AccuracyIs, Facts, Receipt, build_receipt, check_receipt
+from flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
 from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
@@ -41,11 +39,9 @@ from pipeline.geometry.grid import patch_pixels
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan
-from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
-from storage.archive.records import LINE_PRODUCTS, RECEIPT, read_run
-from storage.archive.run_folders import RunDraft
+from storage.archive.records import RECEIPT, read_run
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
@@ -64,29 +60,6 @@ class Published:
     captured_again: float | None  # fraction of patches captured at full resolution; None for a uniform scan
 
 
-def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
-    """Replace a published run by one with its accuracy.
-
-    ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the evaluation. All else of the receipt stays: the
-    costs of the survey do not change. Raises ShapeError: a field of the receipt is missing or not valid.
-    """
-    before = load_receipt(draft.published)
-    asked = asked_settings(survey.run)
-    other_labels = asked["labels"] != before["settings"].get("labels")
-    names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
-    files = {name: place for name, place in before["products"].items() if place.startswith("runs/")}
-    stores = {name: place for name, place in before["products"].items() if name not in (*files, "accuracy")}
-    stage = STAGES["evaluate"]
-    added = {
-        **{"accuracy_is": "judged", "judged": now(), "accuracy": load_accuracy(accuracy)},
-        "settings": {**before["settings"], **{name: asked[name] for name in names}},
-        "stages": [row for row in before["stages"] if row["name"] != stage.name] + [asdict(survey.records[stage.name])],
-        "products": {**stores, **stage.addresses(accuracy), **files},
-    }
-    receipt = build_receipt(**(before | added))
-    return publish_draft(survey, draft, load_plan(survey.products["score"]), receipt)
-
-
 def load_receipt(folder: Path) -> Receipt:
     """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
     found = read_run(folder)
@@ -95,49 +68,30 @@ def load_receipt(folder: Path) -> Receipt:
     return check_receipt(found.receipt)
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Pictures of a survey, which stay as they are when its accuracy is added."""
-
-    quicklook: bytes
-    pictures: tuple[Picture, ...]
-    field: FieldMap
-
-
-_DRAWN: WeakKeyDictionary[OpenSurvey, _Drawn] = WeakKeyDictionary()  # of surveys that are still to be evaluated
-
-
-def _draw(survey: OpenSurvey, plan: FinePlan, receipt: Receipt) -> _Drawn:
-    shown = quicklook_data(survey.run, survey.products, plan)
-    maps = (load_ground_map(ref.path / STORE) for ref in survey.products.there("ground"))
+def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
+    """Publish the products of a survey as a run folder with receipt.json, quicklook.png and report.html."""
+    run, products = survey.run, survey.products
+    rests_on = run.archive.manifest_hashes(products.values())
+    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
+    shown = quicklook_data(run, products, plan)
+    quicklook = draw_quicklook(shown)
+    maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    field = field_map(survey.run, plan, shown, prior_map(survey.run.prior, survey.products["segment"], receipt))
-    return _Drawn(draw_quicklook(shown), tuple(pictures), field)
-
-
-def publish_draft(survey: OpenSurvey, draft: RunDraft, plan: FinePlan, receipt: Receipt) -> Published:
-    """Publish a draft as a run folder with receipt.json, quicklook.png and report.html."""
-    again = None if survey.run.plan.plain else len(plan.patch_index) / len(survey.run.grid.every_patch())
-    drawn = _DRAWN.pop(survey, None) or _draw(survey, plan, receipt)
-    if not draft.extends:
-        _DRAWN[survey] = drawn
-    draft.write_file("quicklook.png", drawn.quicklook)
-    if "plots" in receipt:
-        draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
-    receipt = publish_counted(
-        survey.run.archive,
-        draft,
-        receipt,
-        lambda final: render_report(final, drawn.quicklook, drawn.pictures, captured_again=again, field=drawn.field),
-        rests_on=survey.run.archive.manifest_hashes(survey.products.values()),
-        of_earlier=() if survey.run.prior is None else survey.run.archive.manifest_hashes(survey.run.prior.stores),
-        written=survey.take_written(),
-    )
+    with run.archive.new_run(run.name) as draft:
+        receipt = make_receipt(survey, plan, f"runs/{draft.id}", count_bytes(survey, plan, rests_on))
+        field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
+        page = render_report(receipt, quicklook, pictures, captured_again=again, field=field)
+        draft.write_file("quicklook.png", quicklook)
+        if "plots" in receipt:
+            draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
+        draft.write_file(RECEIPT, to_json(receipt))
+        draft.write_file(REPORT, page)
+        draft.publish(rests_on=rests_on, survey=receipt["survey"], settings=receipt["settings"])
     return Published(receipt, draft.published, again)
 
 
-def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
-    """Return the receipt of a run, without counted bytes."""
+def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str, data_bytes: Facts) -> Receipt:
+    """Return the receipt of a run whose folder has the address ``folder``."""
     products = survey.products
     read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # a plan assumes `SMOOTH` of them
     run = replace(survey.run, costs=replace(survey.run.costs, bands=read))
@@ -147,7 +101,6 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     if (products["segment"].path / READING).exists():  # patches were chosen in the segmentation
         stores["attention"] = f"{products['segment'].uri}/{READING}"
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
-    unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
     versions = {"python": platform.python_version()}
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
@@ -170,9 +123,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
         savings=_savings(
             run, plan, read_in_full(products["score"], products["segment"]), prior_map_figures(products["segment"].path)
         ),
-        data_bytes=open_account(run, plan),
-        accuracy_is="judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels",
-        judged=None if accuracy is None else now(),
+        data_bytes=data_bytes,
         accuracy=accuracy,
         training_scene=seen_in_training(run.scene, run.described),
         effects=effects.get("effects"),
@@ -321,58 +272,25 @@ def _pointing(ref: StageRef) -> dict[str, Any]:
     }
 
 
-def open_account(run: SurveyRun, plan: FinePlan) -> Facts:
-    """Return the bytes of the passes and of the reference; figures that are counted at publication are 0."""
+def count_bytes(survey: OpenSurvey, plan: FinePlan, rests_on: Iterable[str]) -> Facts:
+    """Return the bytes that a survey captured, wrote, keeps and moved, and those of the reference.
+
+    ``rests_on`` are its stores and their inputs. Raw lines that the setting ``keep`` drops do not count as kept, nor do
+    the stores of the visit of its prior map.
+    """
+    run, archive = survey.run, survey.run.archive
     bands = len(run.scene.wavelength_nm)
+    captured, reference = 0, int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
     if run.raster is None:
         captured = raw_bytes([*run.plan.coarse, *plan.sweeps], run.camera, bands)
         reference = raw_bytes(run.plan.full, run.camera, bands)
-    else:
-        captured = 0
-        reference = int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
-    return {"captured": captured, "written": 0, "kept": 0, "moved_bucket": 0, "reference": reference}
-
-
-def publish_counted(
-    archive: Archive,
-    draft: RunDraft,
-    receipt: Receipt,
-    page_of: Callable[[Receipt], str],
-    *,
-    rests_on: Mapping[str, str],
-    of_earlier: Collection[str] = (),
-    written: int = 0,
-) -> Receipt:
-    """Publish a run with receipt and page, and return the receipt with the bytes of the published run.
-
-    Raw lines that the setting ``keep`` drops after the publication do not count as kept, nor do the stores
-    ``of_earlier`` visits. All other files are in the draft's folder. ``rests_on`` is of `Archive.manifest_hashes`,
-    ``written`` are bytes of stores that the receipt does not count yet.
-    """
-    facts: dict[str, Any] = {"survey": receipt["survey"], "settings": receipt["settings"], "rests_on": rests_on}
-    products = receipt["products"]
-    drops_raw = receipt["settings"]["keep"] == KEEP_SIGNAL
-    others = {*of_earlier, *(products[name] for name in LINE_PRODUCTS if drops_raw and name in products)}
-    stores = archive.sizes(uri for uri in rests_on if uri not in others)
-    moved = archive.take_moved()
-    before = receipt["data_bytes"]
-    longest = {RECEIPT: 0, REPORT: 0}
-    folder = 0
-    while True:
-        measured = {
-            "written": before["written"] + written + folder,
-            "kept": sum(stores.values()) + folder,
-            "moved_bucket": before["moved_bucket"] + (moved + folder if archive.in_bucket else 0),
-        }
-        receipt = check_receipt(receipt | {"data_bytes": before | measured})
-        for name, text in ((RECEIPT, to_json(receipt)), (REPORT, page_of(receipt))):
-            content = text.encode()
-            longest[name] = max(longest[name], len(content))
-            draft.write_file(name, content.ljust(longest[name], b"\n"))  # no file shrinks, so that the loop ends
-        size = draft.bytes_published(**facts)
-        if size == folder:
-            break
-        folder = size
-    draft.publish(**facts)
-    archive.take_moved()  # the upload of the folder is counted already
-    return receipt
+    others = set() if run.prior is None else set(archive.manifest_hashes(run.prior.stores))
+    if run.settings.keep == KEEP_SIGNAL:
+        others |= {ref.uri for ref in survey.products.there("capture_coarse", "capture_fine")}
+    return {
+        "captured": captured,
+        "written": survey.bytes_written,
+        "kept": sum(archive.sizes(uri for uri in rests_on if uri not in others).values()),
+        "moved_bucket": archive.moved_bytes,
+        "reference": reference,
+    }

@@ -271,7 +271,7 @@ class Settings:
         "Maximum simulation error from omitted effects: in noise sigmas (0.1) or DN (0.5dn); 0: exact; inf: no limit",
         example=Tolerance().value,
     )
-    accuracy: bool = stated(True, "Compute the accuracy if there are labels; later with `evaluate ARCHIVE RUN`")
+    accuracy: bool = stated(True, "Compute the accuracy if there are labels")
     controls: bool = stated(False, "With the accuracy, also judge the small network alone and the full one everywhere")
     engine: Literal["prefect", "plain"] = stated("prefect", "Workflow engine; plain runs without a server")
     memory: Memory = stated(4 * 1024**3, "Memory limit for tiles and regions", example="4GiB")

@@ -55,7 +55,6 @@ class RunRef:
     uri: str  # relative to the archive
     folder: Path
     captured_again: float | None = None  # fraction of the patches; None after a uniform scan
-    pending: bool = False  # whether its accuracy is computed next
     stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
 
     @property
@@ -123,6 +122,11 @@ class OpenSurvey:
     def on_the_ground(self) -> bool:
         """Return whether there is also a map on the ground."""
         return self.run.settings.pose is not None
+
+    @property
+    def is_judged(self) -> bool:
+        """Return whether the class map is evaluated: there are labels, and the settings ask for the accuracy."""
+        return self.run.scene.labelled and self.run.settings.accuracy
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
@@ -217,11 +221,10 @@ class OpenSurvey:
         self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
         self.products[stage] = ref
 
-    def take_written(self) -> int:
-        """Return the bytes of stores and spools that were written since the last call."""
-        taken = self._written + self.run.archive.take_spooled()
-        self._written = 0
-        return taken
+    @property
+    def bytes_written(self) -> int:
+        """Return the bytes of stores and spools that were written."""
+        return self._written + self.run.archive.spooled_bytes
 
 
 def peak_bytes() -> int:

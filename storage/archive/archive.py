@@ -80,7 +80,7 @@ class Archive:
     def __init__(self, root: Path, *, writes: bool = True) -> None:
         self.root = root
         self.writes = writes
-        self._spooled = 0
+        self.spooled_bytes = 0  # of the spools that were removed
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
@@ -306,8 +306,9 @@ class Archive:
         """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
 
-    def take_moved(self) -> int:
-        """Return the bytes transferred to and from a bucket since the last call."""
+    @property
+    def moved_bytes(self) -> int:
+        """Return the bytes transferred to and from a bucket."""
         return 0
 
     def drop_run(self, uri: str) -> None:
@@ -340,7 +341,7 @@ class Archive:
     def _named_draft(self, run_id: str) -> RunDraft:
         """Create the folder of a run of this name. Raises ArchiveError: the name is taken."""
         with refusals(self.root, "write to the archive"):
-            draft = self._draft(run_id, wait=True, extends=False)
+            draft = self._draft(run_id, wait=True)
         if draft is None:
             raise ArchiveError(f"there is a run {run_id} in {self.name} already")
         return draft
@@ -360,30 +361,16 @@ class Archive:
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
         """Create an empty folder for a new run; None where its name is taken."""
-        return self._draft(run_id, wait=False, extends=False)
+        return self._draft(run_id, wait=False)
 
-    def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Return a draft that replaces a published run; the run is unchanged until `RunDraft.publish`.
-
-        One process at a time extends a run; None where another does and ``wait`` is false. Raises ArchiveError: there
-        is no run of this name.
-        """
-        check_name(run_id)
-        with refusals(self.root, "write to the archive"):
-            draft = self._draft(run_id, wait=wait, extends=True)
-        if draft is not None and not draft.published.is_dir():
-            draft.abandon()
-            raise ArchiveError(f"there is no run {run_id} in {self.name}; see ls")
-        return draft
-
-    def _draft(self, run_id: str, *, wait: bool, extends: bool) -> RunDraft | None:
+    def _draft(self, run_id: str, *, wait: bool) -> RunDraft | None:
         """Lock a run and create its draft; None where another process holds or has published it."""
         folder = self.root / "runs" / (run_id + PART_SUFFIX)
         release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
         if release is None:
             return None
         try:
-            if not extends and folder.with_name(run_id).exists():
+            if folder.with_name(run_id).exists():
                 release()
                 return None
             remove_tree(folder)  # of a process that was killed
@@ -391,7 +378,7 @@ class Archive:
         except BaseException:
             release()
             raise
-        return RunDraft(run_id, folder, self.root, release, extends=extends)
+        return RunDraft(run_id, folder, self.root, release)
 
     def runs(self) -> list[Path]:
         """Return the folders of the published runs, oldest first."""
@@ -420,16 +407,11 @@ class Archive:
         """Remove a spool whose lines are published; a read-only archive keeps it."""
         check_name(key)
         if self.writes:
-            self._spooled += bytes_below(self.root / "spool" / key)
+            self.spooled_bytes += bytes_below(self.root / "spool" / key)
             remove_tree(self.root / "spool" / key)
 
     def refresh(self) -> None:
         """Read again which runs there are; in a folder nothing has to be fetched for that."""
-
-    def take_spooled(self) -> int:
-        """Return the bytes of the spools removed since the last call."""
-        taken, self._spooled = self._spooled, 0
-        return taken
 
     def _lock_path(self, name: str) -> Path:
         return self.root / ".locks" / f"{name}.lock"

@@ -20,7 +20,6 @@ from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_
 
 FORMAT = 2
 CLEARED = "cleared"  # in a manifest: when the files of a store were cleared away, and their size
-EXTENDED = "extended"  # in a manifest: when a run was extended, and its manifests before
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
 
@@ -107,12 +106,6 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
 def is_cleared(manifest: Mapping[str, Any]) -> bool:
     """Return whether a store's files were cleared away."""
     return CLEARED in manifest
-
-
-def manifests_before(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the SHA-256 of a run's manifests before it was extended, oldest first."""
-    found = as_table(manifest.get(EXTENDED)).get("manifests")
-    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
 
 
 def as_table(value: object) -> dict[str, Any]:

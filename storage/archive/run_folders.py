@@ -1,8 +1,4 @@
-"""Publish the folder of one run: receipt, report and pictures; and replace it as a whole when something is added.
-
-When the accuracy is known, a new folder replaces the old one in one step, under the same name and date. Its manifest
-names the earlier one.
-"""
+"""Publish the folder of one run: receipt, report and pictures."""
 
 from __future__ import annotations
 
@@ -10,15 +6,13 @@ import ctypes
 import errno
 import os
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from storage.archive.keys import plain
-from storage.archive.manifests import EXTENDED, manifest_sha256, manifests_before, read_manifest, write_manifest
+from storage.archive.manifests import write_manifest
 from storage.archive.staging import (
     MANIFEST_NAME,
-    bytes_below,
     check_name,
     files_below,
     refusals,
@@ -33,15 +27,11 @@ _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
 
 
 class RunDraft:
-    """The folder of one run while it is written; published as a whole or abandoned.
+    """The folder of one run while it is written; published as a whole or abandoned."""
 
-    A draft that ``extends`` a published run replaces it only when `publish` is called.
-    """
-
-    def __init__(self, run_id: str, folder: Path, root: Path, release: Callable[[], None], *, extends: bool) -> None:
+    def __init__(self, run_id: str, folder: Path, root: Path, release: Callable[[], None]) -> None:
         self.id = run_id
         self.folder = folder
-        self.extends = extends
         self.send: Callable[[str], None] | None = None  # called with the address of the published run
         self._root = root
         self._release = release
@@ -60,7 +50,7 @@ class RunDraft:
             if isinstance(error, OSError):  # of a file that the block wrote by itself
                 with refusals(self._root, "write to the archive"):
                     raise error
-            if kind is None and not self.extends and not self._done:
+            if kind is None and not self._done:
                 self.publish()
         finally:
             self.abandon()
@@ -81,30 +71,13 @@ class RunDraft:
         """
         final = self.published
         with refusals(self._root, "write to the archive"):
-            self._write_manifest(rests_on, facts)
-            put_in_place = take_its_place if self.extends else rename_into_place
-            put_in_place(self.folder, final)
+            write_manifest(self.folder, {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)})
+            rename_into_place(self.folder, final)
         self._done = True
         if self.send is not None:
             self.send(f"runs/{self.id}")
         self._release()
         return final
-
-    def bytes_published(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> int:
-        """Return the bytes of the folder, manifest included, if it were published now with these facts."""
-        with refusals(self._root, "write to the archive"):
-            self._write_manifest(rests_on, facts)
-            return bytes_below(self.folder)
-
-    def _write_manifest(self, rests_on: Mapping[str, str] | None, facts: Mapping[str, Any]) -> None:
-        """Write the manifest; its size depends on files and facts alone."""
-        content = {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)}
-        if self.extends:
-            before = read_manifest(self.published)
-            manifests = [*manifests_before(before), manifest_sha256(self.published)]
-            content |= {"created": before["created"]} if "created" in before else {}
-            content[EXTENDED] = {"at": datetime.now(UTC).isoformat(timespec="milliseconds"), "manifests": manifests}
-        write_manifest(self.folder, content)
 
     def abandon(self) -> None:
         """Remove an unpublished draft and release its lock; may be called again."""

@@ -28,15 +28,7 @@ from typing import Any
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
-from storage.archive.manifests import (
-    check_files,
-    file_problem,
-    is_cleared,
-    manifests_before,
-    parse_manifest,
-    read_manifest,
-    try_manifest,
-)
+from storage.archive.manifests import check_files, file_problem, is_cleared, parse_manifest, read_manifest, try_manifest
 from storage.archive.records import RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import MANIFEST_NAME, is_name, refusals, remove_tree, rename_into_place, retire, sync_path
@@ -164,15 +156,11 @@ class ObjectArchive(Archive):
         assert draft is not None
         return draft
 
-    def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
-        """Return a draft that replaces a published run; see `Archive.extend_run`."""
-        return self._sending(super().extend_run(run_id, wait=wait))
-
     def _sending(self, draft: RunDraft | None) -> RunDraft | None:
         """Have a draft upload its run once it is published here, and then check its stores in the bucket."""
 
         def send(uri: str) -> None:
-            self._upload(uri, first=draft is not None and not draft.extends)
+            self._upload(uri, first=True)
             names = read_run(self.root / uri).names
             self._standing = {one: text for one, text in self._standing.items() if one not in names}
             self._ensure(names)
@@ -182,7 +170,7 @@ class ObjectArchive(Archive):
         return draft
 
     def refresh(self) -> None:
-        """Fetch manifests and receipts of new and extended runs; drop those that other machines removed."""
+        """Fetch manifests and receipts of new runs; drop those that other machines removed."""
         here = [f"runs/{folder.name}" for folder in self.runs()]  # before the bucket's: others here may add some
         found = _manifests(self.objects.listing("runs"))
         self._drop_removed(here, found)
@@ -191,25 +179,23 @@ class ObjectArchive(Archive):
         self._later_runs |= {self.root / uri for uri in changed}
 
     def send_runs(self) -> None:
-        """Upload runs and extensions of runs that a killed command has left in the working copy.
+        """Upload runs that a killed command has left in the working copy.
 
         A run stays here alone while its stores are neither here nor in the bucket.
         """
         here = [f"runs/{folder.name}" for folder in self.runs()]
         there = _manifests(self.objects.listing("runs"))
         self._drop_removed(here, there)
-        for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
-            if uri not in there:
-                try:
-                    self._ensure(read_run(self.root / uri).names)
-                except IncompleteStoreError:
-                    LOG.warning("%s stays on this machine until its survey runs again: a store of it was removed", uri)
-                else:
-                    self._upload(uri, first=True)
-            elif not self._is_dated(uri, there[uri]):
-                standing = hashlib.sha256(self.objects.read(f"{uri}/{MANIFEST_NAME}") or b"").hexdigest()
-                if standing in manifests_before(read_manifest(self.root / uri)):  # something was added to it
-                    self._upload(uri, first=False)
+        for folder in self.runs():
+            uri = f"runs/{folder.name}"
+            if uri in there or try_manifest(folder)[1] is not None:
+                continue
+            try:
+                self._ensure(read_run(folder).names)
+            except IncompleteStoreError:
+                LOG.warning("%s stays on this machine until its survey runs again: a store of it was removed", uri)
+            else:
+                self._upload(uri, first=True)
 
     def is_there(self, uri: str) -> bool:
         """Return whether a store has its files, by its manifest in the bucket."""
@@ -259,9 +245,10 @@ class ObjectArchive(Archive):
         names = list(uris)
         return dict(zip(names, some_at_a_time(self.size_of, names), strict=True))
 
-    def take_moved(self) -> int:
-        """Return the bytes of objects sent and received since the last call."""
-        return self.objects.take_moved()
+    @property
+    def moved_bytes(self) -> int:
+        """Return the bytes of objects sent and received."""
+        return self.objects.moved_bytes
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """Return what killed processes left here, and incomplete uploads that are older than ``keep_days``."""
@@ -417,10 +404,6 @@ class ObjectArchive(Archive):
         some_at_a_time(lambda name: self.objects.write(f"{place}/{name}", folder / name), waiting)
         if not first:
             standing = self.objects.read(f"{uri}/{MANIFEST_NAME}") or b""
-            known = {hashlib.sha256(text).hexdigest(), *manifests_before(read_manifest(folder))}
-            if uri.startswith("runs/") and standing and hashlib.sha256(standing).hexdigest() not in known:
-                self._find(uri)  # another machine has extended it meanwhile
-                return
             self.objects.write(f"{uri}/{MANIFEST_NAME}", text)
             if (before := _files_at(uri, standing)) != place:
                 self.objects.remove([path for path in there if path.startswith(f"{before}/")])

@@ -183,21 +183,12 @@ class Objects:
     def __init__(self, place: ObjectPlace) -> None:
         self.place = place
         self.store = connect(place)
-        self._moved = 0
+        self.moved_bytes = 0  # of objects written and read; names, listings and headers do not count
         self._counting = Lock()
-
-    def take_moved(self) -> int:
-        """Return the bytes of objects written and read since the last call.
-
-        Names, listings and headers do not count.
-        """
-        with self._counting:
-            taken, self._moved = self._moved, 0
-        return taken
 
     def _count(self, size: int) -> None:
         with self._counting:
-            self._moved += size
+            self.moved_bytes += size
 
     def read(self, name: str) -> bytes | None:
         """Return the content of a small object; None without one."""

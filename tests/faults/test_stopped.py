@@ -2,14 +2,13 @@
 
 After a kill at a random moment, published stores verify, and the rerun completes.
 
-A run is published once its map is drawn; if it is stopped during the evaluation, its accuracy is added later.
+A run is published once, after its evaluation; a survey that is stopped before has no run yet.
 """
 
 from __future__ import annotations
 
 import os
 import random
-import shutil
 import signal
 import time
 from dataclasses import replace
@@ -18,9 +17,7 @@ from typing import Any
 
 import pytest
 
-from flows.publish.receipt import is_pending
 from flows.terminal.processes import TERMINATED
-from tests.faults.nursery import Ended
 from tests.faults.small_survey import SETTINGS, Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
 from tests.receipts import comparable, receipts
 
@@ -28,10 +25,9 @@ GOING_ON = "terminated; run the same command to resume"
 SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "in the controls": ("flows.tasks.stages.accuracy:mixed", 1, signal.SIGTERM),
-    "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
-    "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
+    "before the publication": ("flows.publish.publishing:publish_run", 1, signal.SIGKILL),
+    "in the publication": ("storage.archive.run_folders:rename_into_place", 1, signal.SIGKILL),
 }
-ADDED = "after the run has changed"
 SECOND_PASS = {"storage.archive.archive:Archive.spool_folder": 2, "storage.arrays.spool:Spool.append": 20}  # as PLACES
 KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`
 MOMENTS = (0.28, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # as fractions of its time
@@ -47,26 +43,12 @@ def test_a_terminated_survey_is_resumed_by_the_same_command(subject: Subject, tm
     assert wrong_after_rerun(subject, out, subject.nursery.run(words(out)), runs=1) == []
 
 
-# --- while the map is judged ------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def mapped(subject: Subject) -> Path:
-    """Return the archive of a survey that was killed at the start of its evaluation."""
-    out = subject.folder / "mapped"
-    ended = stopped(subject, out, "flows.tasks.stages.accuracy:load_class_map", 1, signal.SIGKILL)
-    assert ended.code == -signal.SIGKILL, ended.text
-    return out
+# --- while the map is evaluated and published -------------------------------------------------------------------------
 
 
 def asked(out: Path) -> list[str]:
     """Return the command of the survey with controls."""
     return [*words(out), "--controls"]
-
-
-def stopped(subject: Subject, out: Path, place: str, call: int, number: int) -> Ended:
-    """Run the survey and stop it before a call."""
-    return subject.nursery.run(asked(out), "end_before", place=place, call=call, number=number)
 
 
 @pytest.fixture(scope="module")
@@ -77,26 +59,19 @@ def whole(subject: Subject) -> Any:
     return receipt
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_a_rerun_adds_the_accuracy(subject: Subject, whole: Any, mapped: Path, tmp_path: Path, place: str) -> None:
-    """A second stop leaves the run valid, with or without its accuracy; the rerun gives the undisturbed receipt."""
+def test_a_survey_stopped_before_its_publication_is_resumed(subject: Subject, whole: Any, tmp_path: Path) -> None:
+    """Each stop leaves whole stores and no run; the rerun publishes the undisturbed receipt, once."""
     out = tmp_path / "archive"
-    name, call, number = PLACES[place]
-    shutil.copytree(mapped, out)
-    (first,) = receipts(out)
-    ended = stopped(subject, out, name, call, number)
-    assert ended.code == (TERMINATED if number == signal.SIGTERM else -number), ended.text
-    (before,) = receipts(out)
-    assert problems(out) == []
-    assert is_pending(before) == (place != ADDED) == ("accuracy" not in before)
+    for place, call, number in PLACES.values():
+        ended = subject.nursery.run(asked(out), "end_before", place=place, call=call, number=number)
+        assert ended.code == (TERMINATED if number == signal.SIGTERM else -number), ended.text
+        assert receipts(out) == []
+        assert problems(out) == []
     again = subject.nursery.run(asked(out))
     assert again.code == 0, again.text
-    found = receipts(out)
-    assert len(found) == (2 if place == ADDED else 1)  # a survey with nothing missing is a new run
-    for receipt in found:
-        assert comparable(receipt) == comparable(whole)
-        assert list(receipt) == list(whole)
-    assert found[0]["finished"] == first["finished"]
+    (receipt,) = receipts(out)
+    assert comparable(receipt) == comparable(whole)
+    assert list(receipt) == list(whole)
     assert problems(out) == []
     assert not [*out.rglob("*.part"), *out.glob("spool/*")]
 

@@ -124,7 +124,6 @@ CASES = {
     # archives
     "folder that is no archive": (1, "export apart -o maps", "apart"),
     "unknown run": (2, "explain kept yesterday", "yesterday"),
-    "run of what is no archive": (1, "evaluate empty latest", "no archive"),
     "wavelengths of a farm": (2, "survey --wavelengths 460 --engine plain --out never", "brings its own"),
     "evaluation without weights": (2, "evaluate apart", "give --weights FILE"),
     "evaluation without labels": (1, "evaluate bare --weights w.safetensors", "has no labels"),

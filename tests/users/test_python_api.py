@@ -148,14 +148,6 @@ def test_keywords_override_a_settings_file(asked: dict[str, object], tmp_path: P
         spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 12})
 
 
-def test_evaluate_adds_accuracy_to_a_run(run: OpenedRun) -> None:
-    """The scores are returned, and are then in the run's receipt."""
-    assert "accuracy" not in run.receipt
-    scores = spectralzoom.evaluate(run)
-    assert 0 <= scores["overall_accuracy"] <= 1
-    assert run.receipt["accuracy"] == scores
-
-
 def test_weights_are_trained_and_evaluated(tmp_path: Path) -> None:
     """Two steps on frames of a small field give weights that are evaluated on the held-out frame."""
     heard = Mock()
@@ -187,8 +179,6 @@ def test_every_mistake_raises_the_error_of_the_package(make_weights: WeightsMake
         spectralzoom.evaluate("farm")
     with pytest.raises(spectralzoom.Error, match="evaluate has no 'fraction'"):
         spectralzoom.evaluate("farm", weights=make_weights(), fraction=[0.1])
-    with pytest.raises(spectralzoom.Error, match="evaluate of a run has no 'weights'; it has controls, labels"):
-        spectralzoom.evaluate(object.__new__(OpenedRun), weights="x")
     with pytest.raises(spectralzoom.Error, match=r"seed must be .* got -3"):
         spectralzoom.survey(seed=np.int64(-3), out=out)
     with pytest.raises(AttributeError, match="it has Error"):

@@ -31,7 +31,7 @@ RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=18, files=(RECORD,), by_weights=True)
 
 
-@stage("evaluate", "accuracy, after publication", ACCURACY)
+@stage("evaluate", "accuracy", ACCURACY)
 def evaluate(
     mosaic: StageRef,
     attention: StageRef,

@@ -11,7 +11,6 @@ import pytest
 from flows.archive.commands import contents
 from flows.publish.receipt_table import saving_rows
 from flows.publish.report import render_report
-from flows.publish.run_folder import publish_counted
 from storage.archive.archive import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
@@ -54,8 +53,8 @@ def test_the_account_of_a_survey_matches_its_folders(
 ) -> None:
     """Kept and written bytes are those of files, captured bytes those of lines; nothing is moved.
 
-    Raw lines and a first pass's mosaic, cleared after the publication, count as written and not as kept. A run that
-    gets its accuracy is counted again, with the stores of the evaluation and the new files of its folder.
+    Raw lines and a first pass's mosaic, which are cleared, count as written and not as kept. The folder of the run does
+    not count.
     """
     root = tmp_path / "archive"
     published = survey_png(root, accuracy=accuracy, keep=keep, budget=budget)
@@ -63,7 +62,7 @@ def test_the_account_of_a_survey_matches_its_folders(
     assert account == published.receipt["data_bytes"]
     cleared = [root / "stages" / "capture"] if keep == "signal" else []
     assert walked(*cleared) < 10_000  # manifests
-    assert account["kept"] == walked(root / "stages", root / "runs") - walked(*cleared)
+    assert account["kept"] == walked(root / "stages") - walked(*cleared)
     assert sum(spooled) > 0
     assert account["written"] >= account["kept"] + sum(spooled)
     assert keep == "signal" or account["written"] == account["kept"] + sum(spooled)
@@ -77,25 +76,25 @@ def test_the_account_of_a_survey_matches_its_folders(
 
 
 def test_cached_stores_count_as_kept_not_as_written(survey_png: Survey, tmp_path: Path) -> None:
-    """A second run of the same survey writes its folder alone, and keeps the stores of the first."""
+    """A second run of the same survey writes no store, and keeps those of the first."""
     root = tmp_path / "archive"
     first, again = (survey_png(root, accuracy=False, **ONE_SCAN) for _ in range(2))
     assert again.folder != first.folder
     account = told(again.folder)
-    assert account["written"] == walked(again.folder)
+    assert account["written"] == 0
     stores = [ref for ref in Archive.open(root).refs() if ref.stage != "capture"]
-    assert account["kept"] == walked(*(ref.path for ref in stores), again.folder)
+    assert account["kept"] == walked(*(ref.path for ref in stores))
     assert account["captured"] == told(first.folder)["captured"]  # its passes are the same
 
 
 def test_a_visit_does_not_count_the_one_before(survey_png: Survey, tmp_path: Path) -> None:
-    """The stores of its prior map belong to the visit before; both accounts add up to the archive."""
+    """The stores of its prior map belong to the visit before; both accounts add up to the stores of the archive."""
     root = tmp_path / "archive"
     flags = ONE_SCAN | {"prior": "latest", "accuracy": False}
     visits = [survey_png(root, **flags, visit=f"2026-06-0{day}T10:00:00Z") for day in (1, 8)]
     assert visits[1].receipt["prior_map"]["days"] == 7
     accounts = [told(visit.folder) for visit in visits]
-    everything = walked(root / "stages", root / "runs") - walked(root / "stages" / "capture")
+    everything = walked(root / "stages") - walked(root / "stages" / "capture")
     assert sum(one["kept"] for one in accounts) == everything
 
 
@@ -109,29 +108,13 @@ def test_a_run_in_a_bucket_counts_its_objects(
     sizes = {path: one.size for path, one in Objects(parse_place(bucket)).listing().items()}
     counted = ("stages/", "stages/capture/")  # raw lines are cleared after the publication
     stores = sum(size for path, size in sizes.items() if path.startswith(counted[0]) and counted[1] not in path)
-    assert account["kept"] == stores + sum(size for path, size in sizes.items() if path.startswith("runs/"))
+    assert account["kept"] == stores
     sent = account["written"] - sum(spooled)  # with the raw lines that were cleared after the publication
     assert account["kept"] < sent <= account["moved_bucket"] < 1.2 * sent  # manifests are read in addition
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
-    other = survey_png(bucket, accuracy=False, **ONE_SCAN)
-    again = told(other.folder)
-    listed = Objects(parse_place(bucket)).listing(f"runs/{other.folder.name}")
-    assert again["kept"] == stores + sum(one.size for one in listed.values())
-    assert again["written"] == again["kept"] - stores
-    assert again["written"] < again["moved_bucket"] < again["written"] + 1.2 * stores
-
-
-@pytest.mark.parametrize("stores", [899, 99_000, 999_400, 9_999_999_000])
-def test_the_account_includes_its_own_receipt(stores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It stays exact if a further digit makes the folder larger, or shorter text makes the page smaller."""
-    archive = Archive.open(tmp_path / "archive")
-    monkeypatch.setattr(archive, "sizes", lambda uris: {"stages/capture/ab12": stores})  # the run built these
-    widths = iter(range(100_000, 0, -1))  # a page that gets shorter at each call
-    with archive.new_run("north") as draft:
-        publish_counted(archive, draft, make_receipt(), lambda receipt: "x" * next(widths), rests_on={})
-    (folder,) = archive.runs()
-    assert told(folder)["kept"] == stores + walked(folder)
-    assert told(folder)["written"] == 7_000_000 + walked(folder)
+    again = told(survey_png(bucket, accuracy=False, **ONE_SCAN).folder)
+    assert (again["kept"], again["written"]) == (stores, 0)
+    assert 0 < again["moved_bucket"] < 1.2 * stores
 
 
 def test_terminal_and_page_show_bytes_against_the_reference() -> None:

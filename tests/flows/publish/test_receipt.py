@@ -132,12 +132,6 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
         assert ("the small network alone gives" in format_score(receipt)) == (why is not None)
 
 
-def test_a_judged_map_needs_an_accuracy():
-    """The state `judged` without an accuracy is refused."""
-    with pytest.raises(ShapeError, match="accuracy and judged belong to a map that is judged"):
-        check_receipt({**make_receipt(labels=False), "accuracy_is": "judged"})
-
-
 def printed(receipt: Receipt, width: int = 100, *, verbose: bool = False) -> str:
     """Return the end of a survey as a terminal of this width shows it."""
     console = Console(file=io.StringIO(), width=width)
@@ -172,9 +166,9 @@ def test_the_details_have_stages_effects_and_lost_lines():
     ("found", "words"),
     [
         ({}, "The score is not known: there are no labels."),
-        ({"accuracy_is": "left out"}, "The accuracy was left out; `spectralzoom evaluate ARCHIVE RUN` adds it."),
+        ({"settings": {"accuracy": False}}, "The accuracy was left out; the same survey with --accuracy adds it"),
         ({"expected": {"miou": 0.94, "error": 0.02}}, "Expected mIoU 94.0 ± 2.0 of 100, estimated from the map's own"),
-        ({"expected": {"miou": 0.94, "error": 0.4}, "accuracy_is": "pending"}, "is added later."),
+        ({"expected": {"miou": 0.94, "error": 0.4}}, "The score is not known: there are no labels."),
         ({"unknown": {"fraction": 0.5}, "expected": {"miou": 0.9, "error": 0.0}}, "Unknown: 50 % of the map. These"),
     ],
 )

@@ -88,13 +88,6 @@ def test_gc_sees_runs_published_after_the_archive_was_opened(machine: Machine) -
     assert problems(archive) == []
 
 
-def extend(archive: Archive, name: str, content: str) -> None:
-    """Add a note to a run."""
-    with archive.extend_run(name) as draft:
-        draft.write_file("note.txt", content)
-        draft.publish(survey="farm")
-
-
 def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
     """Runs from before the opening are listed at once, later ones after a refresh."""
     archive = machine(FIRST)
@@ -109,12 +102,14 @@ def test_a_survey_sees_runs_of_other_machines(machine: Machine) -> None:
 def test_a_run_removed_by_another_machine_is_removed_here(machine: Machine) -> None:
     """The run is not uploaded again, and does not stop the next command."""
     archive = machine(FIRST)
-    folder = small_survey(archive).run
-    extend(archive, folder.name, "of more files than the receipt")
-    assert len(machine(SECOND, create=False).runs()) == 1
-    archive.drop_run(f"runs/{folder.name}")
+    small_survey(archive)
+    with archive.new_run("farm") as draft:
+        for name in ("receipt.json", "report.html"):
+            draft.write_file(name, "{}")
+    assert len(machine(SECOND, create=False).runs()) == 2
+    archive.drop_run(f"runs/{draft.id}")
     for name in (FIRST, SECOND):
-        assert machine(name).runs() == []
+        assert draft.id not in {folder.name for folder in machine(name).runs()}
     assert problems(archive) == []
 
 
@@ -125,27 +120,6 @@ def test_a_store_removed_by_another_machine_is_not_listed(machine: Machine) -> N
     assert ref.uri in {one.uri for one in machine(SECOND, create=False).refs()}
     archive.discard(ref)
     assert ref.uri not in {one.uri for one in machine(SECOND, create=False).refs()}
-
-
-def test_two_machines_that_extend_one_run_leave_it_whole(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second finds that the manifest has changed, and takes the first's extension."""
-    archives = machine(FIRST), machine(SECOND)
-    name = small_survey(archives[0]).run.name
-    archives[1].refresh()
-    write = Objects.write
-    done: list[bool] = []
-
-    def first_goes_between(self: Objects, path: str, content: Any) -> None:
-        write(self, path, content)
-        if self is archives[1].objects and path.endswith("note.txt") and not done:
-            done.append(True)
-            extend(archives[0], name, "first")
-
-    monkeypatch.setattr(Objects, "write", first_goes_between)
-    extend(archives[1], name, "second")
-    assert problems(archives[0]) == []
-    for archive in archives:
-        assert archive.locate(f"runs/{name}/note.txt").read_text() == "first"
 
 
 def test_a_store_removed_by_another_machine_is_made_again(machine: Machine) -> None:
