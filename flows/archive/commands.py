@@ -15,7 +15,6 @@ from rich.markup import escape
 from rich.tree import Tree
 
 from flows.archive.stale_runs import can_capture, weights_now
-from flows.publish.retention import RawClearance, clear_raw_lines
 from flows.settings.flags import ArchiveName, AsJson, Switch
 from flows.settings.load import OF_THE_PLAN, of_this_version, parse_settings
 from flows.settings.survey_settings import ALWAYS, OF_THE_MACHINE, RECORDED, Settings
@@ -82,10 +81,7 @@ def gc(
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Remove stores that no run rests on, and raw lines that no run keeps.
-
-    Raw lines of published runs are removed by the setting `keep` of these runs, once each line was compared with its
-    condensed line.
+    """Remove stores that no run rests on.
 
     Parameters
     ----------
@@ -105,21 +101,16 @@ def gc(
             dry_run=dry_run,
             progress=lambda removal, fraction: bars.show("gc", fraction, removal.uri),
         )
-        raw = RawClearance(obstacle=done.obstacle)
-        if done.obstacle is None:
-            raw = clear_raw_lines(opened, dry_run=dry_run, progress=lambda uri, part: bars.show("gc", part, uri))
-    removals = [*done.removals, *raw.removals]
     content = {
         "archive": opened.name,
         "dry_run": dry_run,
-        "bytes": sum(removal.size for removal in removals),
-        "removals": [asdict(removal) for removal in removals],
+        "bytes": done.size,
+        "removals": [asdict(removal) for removal in done.removals],
         "kept": done.kept,
-        "raw_kept": raw.kept,
-        "obstacle": raw.obstacle,
+        "obstacle": done.obstacle,
     }
     put_out(content, show_clearance, as_json=as_json)
-    return DONE if raw.obstacle is None and not raw.kept else PARTLY
+    return DONE if done.obstacle is None else PARTLY
 
 
 def run_verify(archive: str | Path, console: Console, *, remake: bool = False, as_json: bool = False) -> int:
@@ -365,8 +356,6 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
     for reason in dict.fromkeys(content["kept"].values()):
         count = sum(why == reason for why in content["kept"].values())
         show_text(f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}", console)
-    for uri, why in content["raw_kept"].items():
-        console.print(f"[bold yellow]{escape(f'raw lines stay: {uri}: {why}')}[/]", soft_wrap=True)
     if content["obstacle"] is not None:
         console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", soft_wrap=True)
     show_text(f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}", console)

@@ -8,7 +8,6 @@ from contextlib import suppress
 
 from flows.publish.receipt_table import finding_rows, headline
 from flows.publish.report import render_markdown
-from flows.publish.retention import is_outlived
 from flows.publish.run_folder import Published, publish_run
 from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import OpenSurvey, RunRef
@@ -52,7 +51,7 @@ def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
         return run  # cleared before
     archive.refresh()
     catalogue = Catalogue.read(archive.root)
-    others = [one for raw in passes for one in catalogue.named_by(raw.uri) if not is_outlived(one, archive.now())]
+    others = [one for raw in passes for one in catalogue.named_by(raw.uri) if one.settings.get("keep") != KEEP_SIGNAL]
     kept = f"{others[0].uri} keeps them" if others else None
     why = kept or raw_differs(passes, survey.products.signals[0], survey.run.camera)
     if any(archive.find(raw.stage, raw.key) is None for raw in passes):

@@ -21,7 +21,6 @@ from flows.settings.values import (
     Compute,
     Effects,
     Extent,
-    Keep,
     Memory,
     Name,
     Scheduler,
@@ -189,10 +188,8 @@ class Settings:
         None, "White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr", example="white.hdr"
     )
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
-    keep: Keep = stated(
-        "signal",
-        "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), raw, or raw for"
-        " a limited time: raw 7d",
+    keep: Literal["signal", "raw"] = stated(
+        "signal", "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), or raw"
     )
     until: Literal["capture", "mosaic"] | None = stated(
         None,

@@ -25,12 +25,10 @@ from storage.archive.staging import is_name
 from storage.parallel.pool import WorkerPool
 
 LEAST_MEMORY = 256 * 1024**2
-LEAST_DAYS, MOST_DAYS = 1 / 24, 3660.0  # of an age
 EXTENT_WHOLE, EXTENT_PART = "whole", "part"
 KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
 UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
 LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
-_DAYS = {"h": 1 / 24, "d": 1.0, "w": 7.0}  # by unit
 _BYTES = TypeAdapter(ByteSize)
 _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d(?!\d)")
 
@@ -211,23 +209,6 @@ def format_extent(runs: Iterable[LineRun]) -> str:
     return ",".join(f"{sweep}:{first}-{stop}" for sweep, first, stop in runs)
 
 
-def parse_keep(value: object) -> str:
-    """Return ``signal``, ``raw``, or ``raw`` with an age such as raw 7d."""
-    word, _, age = str(value).strip().lower().partition(" ")
-    if word in (KEEP_SIGNAL, KEEP_RAW) and not age:
-        return word
-    days = _amount(age, _DAYS)
-    if word != KEEP_RAW or days is None or not LEAST_DAYS <= days <= MOST_DAYS:
-        raise ValueError(f"must be signal, raw, or raw and a time of 1h to {MOST_DAYS:g}d: raw 7d; got {value!r}")
-    return f"{KEEP_RAW} {age.strip()}"
-
-
-def raw_days(keep: str) -> float:
-    """Return for how many days raw lines are kept: 0 for ``signal``, infinite for ``raw``."""
-    word, _, age = keep.partition(" ")
-    return 0.0 if word == KEEP_SIGNAL else _amount(age, _DAYS) or math.inf
-
-
 def parse_unknown(value: object) -> str:
     """Return ``auto``, ``off``, or a false-alarm rate such as 0.5%."""
     word = str(value).strip().lower()
@@ -286,5 +267,4 @@ Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
 Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
 Extent = Annotated[str, PlainValidator(parse_extent)]
-Keep = Annotated[str, PlainValidator(parse_keep)]
 Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

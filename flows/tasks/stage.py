@@ -30,7 +30,7 @@ from pipeline.ground.georeference import georeference_record
 from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, array_digest, stage_key
-from storage.archive.manifests import try_manifest
+from storage.archive.manifests import is_cleared, try_manifest
 from storage.arrays.georeference import AngularGrid
 
 Report = Callable[[float], None]  # progress of a stage, 0..1
@@ -121,12 +121,12 @@ class Stage:
 
         def build(folder: Path) -> None:
             """Build the store, and check that its inputs are the same afterwards."""
-            manifests = [archive.root / ref.uri for ref in wanted.inputs]
-            before = [try_manifest(one) for one in manifests]
+            folders = [archive.root / ref.uri for ref in wanted.inputs]
+            before = [try_manifest(one) for one in folders]
             try:
                 wanted.build(folder)
             finally:  # a cleared array reads as nodata, or fails
-                if [try_manifest(one) for one in manifests] != before:
+                if any(map(is_cleared, folders)) or [try_manifest(one) for one in folders] != before:
                     raise ArchiveError(
                         f"another survey has cleared an input of {self.name} meanwhile; repeat the command"
                     )

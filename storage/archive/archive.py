@@ -37,16 +37,18 @@ from storage.archive.keys import (
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
     CLEARED,
-    as_table,
     check_files,
+    clear_files,
+    cleared_leftovers,
     is_cleared,
     listed_bytes,
     manifest_sha256,
     read_manifest,
+    refill,
     try_manifest,
     write_manifest,
 )
-from storage.archive.run_folders import RunDraft, take_its_place
+from storage.archive.run_folders import RunDraft
 from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -110,7 +112,7 @@ class Archive:
         """
         if (uri := in_text(address)) is not None:
             check_files(self.root / uri, hashes=False)
-            if is_cleared(read_manifest(self.root / uri)):
+            if is_cleared(self.root / uri):
                 raise IncompleteStoreError(
                     f"{self.name}/{uri}: its files were cleared away. Run its survey again, for raw lines with"
                     " --keep raw (explain prints the command of the run): only cleared stores are built again"
@@ -127,12 +129,12 @@ class Archive:
         if not ref.path.exists():
             return None
         check_files(ref.path, hashes=False)
-        return None if is_cleared(read_manifest(ref.path)) else ref
+        return None if is_cleared(ref.path) else ref
 
     def is_there(self, uri: str) -> bool:
         """Return whether a store has its files, not its manifest alone."""
         path = self.root / uri
-        return path.is_dir() and not is_cleared(read_manifest(path))
+        return path.is_dir() and not is_cleared(path)
 
     def is_known(self, ref: StageRef) -> bool:
         """Return whether a store was published here, even if its files were cleared away."""
@@ -171,7 +173,7 @@ class Archive:
                 remove_tree(part)
 
     def _put_in_place(self, part: Path, final: Path) -> None:
-        (take_its_place if final.exists() else rename_into_place)(part, final)  # there where its files were cleared
+        (refill if final.exists() else rename_into_place)(part, final)  # there where its files were cleared
 
     def produce(
         self,
@@ -197,9 +199,7 @@ class Archive:
 
     def stored_bytes(self, ref: StageRef) -> int:
         """Return the size of a store's files as they were published; cleared files count too."""
-        manifest = self.manifest(ref)
-        size = as_table(manifest.get(CLEARED)).get("bytes_before")
-        return size if isinstance(size, int) else listed_bytes(manifest)
+        return listed_bytes(self.manifest(ref))
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """Return the SHA-256 of the manifests of stores and all their inputs, and so of every byte, by address."""
@@ -227,18 +227,10 @@ class Archive:
         damaged.
         """
         final = self.root / ref.uri
-        part = final.with_name(ref.key + PART_SUFFIX)
         with refusals(self.root, "clear up the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
-            if held and not is_cleared(before := read_manifest(final)):
-                kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
-                at = datetime.now(UTC).isoformat(timespec="milliseconds")
-                try:
-                    remove_tree(part)
-                    part.mkdir()
-                    write_manifest(part, kept | {CLEARED: {"at": at, "bytes_before": listed_bytes(before)}})
-                    take_its_place(part, final)
-                finally:
-                    remove_tree(part)
+            if held:
+                read_manifest(final)
+                clear_files(final)
         return held
 
     @contextmanager
@@ -260,21 +252,23 @@ class Archive:
             return [uri for uri in Archive.leftovers(self, 0.0) if Archive.drop_leftover(self, uri)]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """Return addresses and bytes of what killed processes left: unfinished folders, spools of published captures.
+        """Return addresses and bytes of what killed processes left.
 
-        In a bucket also incomplete uploads that are older than ``keep_days``.
+        These are unfinished folders, spools of published captures, and stores that are marked as cleared and have
+        files. In a bucket also incomplete uploads that are older than ``keep_days``.
         """
         spools = [
             path
             for path in self.root.glob("spool/*")
             if any(
-                problem is None and not is_cleared(manifest)  # a cleared capture is being taken again
-                for manifest, problem in map(try_manifest, self.root.glob(f"stages/*/{path.name}"))
+                try_manifest(store)[1] is None and not is_cleared(store)  # a cleared capture is being taken again
+                for store in self.root.glob(f"stages/*/{path.name}")
             )
         ]
         parts = [*self.root.glob(f"stages/*/*{PART_SUFFIX}"), *self.root.glob(f"runs/*{PART_SUFFIX}")]
+        marked = (mark.parent for mark in self.root.glob(f"stages/*/*/{CLEARED}"))
         found: dict[str, int] = {}
-        for path in sorted((*parts, *spools)):
+        for path in sorted((*parts, *spools, *filter(cleared_leftovers, marked))):
             lock = self._lock_path(self._lock_name(path))
             release = take_lock(lock, wait=False) if lock.exists() else lambda: None
             if release is not None:
@@ -286,9 +280,11 @@ class Archive:
         """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
         path = self.root / uri
         with self._locked(self._lock_name(path), wait=False) as held:
-            if held:
+            if held and is_cleared(path):
+                clear_files(path)
+            elif held and (path.suffix == PART_SUFFIX or path.parent.name == "spool"):
                 remove_tree(path)
-        return not path.exists()
+        return held and (is_cleared(path) or not path.exists())
 
     def _lock_name(self, path: Path) -> str:
         kind = "capture" if path.parent.name == "spool" else path.parent.name

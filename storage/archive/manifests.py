@@ -16,10 +16,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
 from pipeline.errors import IncompleteStoreError
-from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
+from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, remove_tree, sync_path
 
 FORMAT = 2
-CLEARED = "cleared"  # in a manifest: when the files of a store were cleared away, and their size
+CLEARED = "cleared"  # file that marks a store whose other files were deleted; its manifest stays as it is
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
 
@@ -103,9 +103,36 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
     return sum(entry["size"] for entry in manifest["files"].values())
 
 
-def is_cleared(manifest: Mapping[str, Any]) -> bool:
-    """Return whether a store's files were cleared away."""
-    return CLEARED in manifest
+def is_cleared(folder: Path) -> bool:
+    """Return whether a store's files were cleared away, or are being deleted."""
+    return (folder / CLEARED).exists()
+
+
+def clear_files(folder: Path) -> None:
+    """Mark a store as cleared, then delete its files but the manifest; a killed process leaves it marked."""
+    if not is_cleared(folder):
+        (folder / CLEARED).touch()
+        sync_path(folder)
+    for path in cleared_leftovers(folder):
+        remove_tree(path) if path.is_dir() else path.unlink()
+
+
+def cleared_leftovers(folder: Path) -> list[Path]:
+    """Return what a cleared store has besides manifest and mark: files that a killed process was deleting."""
+    return [path for path in folder.iterdir() if path.name not in (MANIFEST_NAME, CLEARED)]
+
+
+def refill(part: Path, final: Path) -> None:
+    """Move a store that was built again into its cleared folder; it counts as cleared until all of it is there."""
+    clear_files(final)
+    for path in part.iterdir():
+        if path.name != MANIFEST_NAME:
+            path.rename(final / path.name)
+    sync_path(final)
+    (part / MANIFEST_NAME).replace(final / MANIFEST_NAME)
+    sync_path(final)
+    (final / CLEARED).unlink()
+    sync_path(final)
 
 
 def as_table(value: object) -> dict[str, Any]:
@@ -120,14 +147,19 @@ def check_files(folder: Path, *, hashes: bool) -> None:
     """
     manifest = read_manifest(folder)
     for name, problem in broken_files(folder, manifest, hashes=hashes):
-        if read_manifest(folder) != manifest:  # another process has cleared it, or made it anew
+        if is_cleared(folder) or read_manifest(folder) != manifest:  # another process has cleared it, or made it anew
             check_files(folder, hashes=hashes)
             return
         raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
 
 
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
-    """Yield name and problem of every file that differs from the manifest; with ``hashes`` also of extra files."""
+    """Yield name and problem of every file that differs from the manifest; with ``hashes`` also of extra files.
+
+    A cleared store has no files to compare.
+    """
+    if is_cleared(folder):
+        return
     for name, entry in manifest["files"].items():
         if (problem := file_problem(folder / name, entry, hashes=hashes)) is not None:
             yield name, problem

@@ -59,6 +59,7 @@ class Store:
     ref: StageRef
     facts: Mapping[str, Any] = field(default_factory=dict)
     problem: str | None = None
+    cleared: bool = False  # whether its files were cleared away
 
     @property
     def version(self) -> str:
@@ -87,14 +88,9 @@ class Store:
         return _text(self.facts.get("created"))
 
     @property
-    def cleared(self) -> bool:
-        """Return whether its files were cleared away."""
-        return is_cleared(self.facts)
-
-    @property
     def size(self) -> int:
-        """Bytes of its files."""
-        return listed_bytes(self.facts) if self.facts else 0
+        """Bytes of its files; 0 where they were cleared away."""
+        return listed_bytes(self.facts) if self.facts and not self.cleared else 0
 
 
 @dataclass(frozen=True)
@@ -146,7 +142,7 @@ class Run:
 def read_store(ref: StageRef) -> Store:
     """Return one store by its manifest, damaged or not."""
     facts, problem = try_manifest(ref.path)
-    return Store(ref, facts, problem and f"{MANIFEST_NAME} is damaged: {problem}")
+    return Store(ref, facts, problem and f"{MANIFEST_NAME} is damaged: {problem}", is_cleared(ref.path))
 
 
 def read_run(folder: Path) -> Run:

@@ -2,28 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
-import errno
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from storage.archive.keys import plain
 from storage.archive.manifests import write_manifest
-from storage.archive.staging import (
-    MANIFEST_NAME,
-    check_name,
-    files_below,
-    refusals,
-    remove_tree,
-    rename_into_place,
-    sync_path,
-)
-
-_AT_FDCWD = -100  # names are absolute, or of the working folder
-_RENAME_EXCHANGE = 2
-_UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
+from storage.archive.staging import check_name, refusals, remove_tree, rename_into_place
 
 
 class RunDraft:
@@ -84,43 +69,3 @@ class RunDraft:
         if not self._done:  # another process may have a draft of this name by now
             remove_tree(self.folder)
         self._release()
-
-
-def take_its_place(part: Path, final: Path) -> None:
-    """Replace a folder by a complete one, and remove it.
-
-    If the file system cannot exchange two folders, the files are replaced one by one, the manifest last. A folder
-    counts as damaged if the process is killed meanwhile.
-    """
-    sync_path(final.parent)
-    if not try_exchange(part, final):
-        old = set(files_below(final))
-        for path in (*files_below(part), part / MANIFEST_NAME):
-            new = final / path.relative_to(part)
-            new.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(new)
-            old.discard(new)
-        for path in old:
-            path.unlink()
-        sync_path(final)
-    remove_tree(part)
-
-
-def try_exchange(one: Path, other: Path) -> bool:
-    """Exchange the names of two folders in one step and sync them.
-
-    Linux does so (renameat2) on local file systems. Elsewhere, as on most network file systems, nothing is changed and
-    the result is False.
-    """
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if call is None:
-        return False
-    failed = call(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE))
-    error = ctypes.get_errno() if failed else 0
-    if error in _UNSUPPORTED:
-        return False
-    if error:
-        raise OSError(error, os.strerror(error), str(one))
-    for parent in {one.parent, other.parent}:
-        sync_path(parent)
-    return True

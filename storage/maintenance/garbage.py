@@ -26,7 +26,7 @@ class Removal:
     """Something that can be removed: its address, kind, size [bytes] and the reason."""
 
     uri: str
-    what: Literal["store", "files", "leftover"]  # files: raw lines that the setting `keep` of a run does not keep
+    what: Literal["store", "leftover"]
     size: int
     why: str
 

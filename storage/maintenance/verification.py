@@ -15,7 +15,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError, PipelineError
 from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json, without_manifest
 from storage.archive.lineage import Catalogue
-from storage.archive.manifests import broken_files, listed_bytes, try_manifest
+from storage.archive.manifests import broken_files, is_cleared, listed_bytes, try_manifest
 from storage.archive.records import RECEIPT, Run, moment_of, read_run
 from storage.archive.staging import MANIFEST_NAME
 
@@ -82,7 +82,7 @@ def _problems(folder: Path) -> Iterator[str]:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
         return
     found = [f"{name} {problem}" for name, problem in broken_files(folder, manifest, hashes=True)]
-    changed = found and try_manifest(folder)[0] != manifest  # cleared meanwhile, or made anew
+    changed = found and (is_cleared(folder) or try_manifest(folder)[0] != manifest)  # cleared meanwhile, or made anew
     yield from _problems(folder) if changed else found
 
 

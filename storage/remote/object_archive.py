@@ -28,7 +28,16 @@ from typing import Any
 from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
-from storage.archive.manifests import check_files, file_problem, is_cleared, parse_manifest, read_manifest, try_manifest
+from storage.archive.manifests import (
+    CLEARED,
+    check_files,
+    clear_files,
+    file_problem,
+    is_cleared,
+    parse_manifest,
+    read_manifest,
+    try_manifest,
+)
 from storage.archive.records import RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import MANIFEST_NAME, is_name, refusals, remove_tree, rename_into_place, retire, sync_path
@@ -80,7 +89,7 @@ class ObjectArchive(Archive):
                 return None
             if self.writes:
                 self._send(ref.uri)
-        return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
+        return None if is_cleared(self.root / ref.uri) else ref
 
     def is_known(self, ref: StageRef) -> bool:
         """Return whether a store was published, even if its files were cleared away; fetch its manifest.
@@ -134,11 +143,13 @@ class ObjectArchive(Archive):
         return gone
 
     def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
-        """Remove a store's files here and in the bucket; see `Archive.clear`."""
+        """Mark a store as cleared and remove its files, here and in the bucket; see `Archive.clear`."""
         self._ensure([ref.uri])
         cleared = super().clear(store_at(self.root, ref.stage, ref.key), wait=wait)
         if cleared:
-            self._upload(ref.uri, first=False)
+            kept = {f"{ref.uri}/{name}" for name in (MANIFEST_NAME, CLEARED)}
+            self.objects.write(f"{ref.uri}/{CLEARED}", b"")
+            self.objects.remove(self.objects.listing(ref.uri).keys() - kept)
         return cleared
 
     def drop_run(self, uri: str) -> None:
@@ -220,7 +231,7 @@ class ObjectArchive(Archive):
             manifest, problem = try_manifest(self.root / uri)
             files = [] if problem is not None else [name for name in manifest["files"] if name != RECEIPT]
             known = problem is None and not any((self.root / uri / name).exists() for name in files)
-            if uri not in there and known and (is_cleared(manifest) or self._lacks(uri, manifest)):
+            if uri not in there and known and self._lacks(uri, manifest):
                 retire(self.root / uri)
 
     def _bring(self, uri: str) -> None:
@@ -264,7 +275,7 @@ class ObjectArchive(Archive):
             if (latest - max(one.changed for one in files)).total_seconds() >= keep_days * DAY_S:
                 uri = folder.rpartition("/")[0]
                 text = self.objects.read(f"{uri}/{MANIFEST_NAME}")
-                if text is None or _files_at(uri, text) != folder:
+                if text is None or _files_at(uri, text) != folder or f"{uri}/{CLEARED}" in there:
                     old[folder] = sum(one.size for one in files)
         return old
 
@@ -281,7 +292,7 @@ class ObjectArchive(Archive):
         with TemporaryDirectory(prefix="spectralzoom-verify-") as named, refusals(Path(named), "read manifests into"):
             root = Path(named)
             (root / "stages").mkdir()
-            some_at_a_time(lambda uri: _lay_out(self.objects, root, uri), _manifests(there))
+            some_at_a_time(lambda uri: _lay_out(self.objects, there, root, uri), _manifests(there))
 
             def problems(folder: Path) -> Iterator[str]:
                 uri = folder.relative_to(root).as_posix()
@@ -307,7 +318,11 @@ class ObjectArchive(Archive):
     def _is_whole(self, uri: str) -> bool:
         """Return whether a store is complete here by the sizes of its files, and not cleared."""
         manifest, problem = try_manifest(self.root / uri)
-        return problem is None and not is_cleared(manifest) and not self._lacks(uri, manifest)
+        return problem is None and not is_cleared(self.root / uri) and not self._lacks(uri, manifest)
+
+    def _is_marked(self, uri: str) -> bool:
+        """Return whether a store is marked as cleared in the bucket."""
+        return uri.startswith("stages/") and self.objects.read(f"{uri}/{CLEARED}") is not None
 
     def _lacks(self, uri: str, manifest: Mapping[str, Any]) -> list[str]:
         return [name for name, one in manifest["files"].items() if _size(self.root / uri / name) != one["size"]]
@@ -325,6 +340,8 @@ class ObjectArchive(Archive):
         if parse_manifest(dated[0])[1] is None or try_manifest(self.root / uri)[1] is not None:
             self._lay(uri, *dated)  # a damaged one does not replace a valid one
         read_manifest(self.root / uri)
+        if self._is_marked(uri):
+            clear_files(self.root / uri)
         self._standing[uri] = dated[0]
         return True
 
@@ -338,7 +355,8 @@ class ObjectArchive(Archive):
             (made / MANIFEST_NAME).write_bytes(manifest)
             os.utime(made / MANIFEST_NAME, (changed.timestamp(), changed.timestamp()))
             sync_path(made / MANIFEST_NAME)
-            if problem is None and before["files"] == parse_manifest(manifest)[0].get("files"):
+            is_same = problem is None and before["files"] == parse_manifest(manifest)[0].get("files")
+            if is_same and not is_cleared(folder):
                 (made / MANIFEST_NAME).replace(folder / MANIFEST_NAME)
                 sync_path(folder)
             else:
@@ -385,14 +403,14 @@ class ObjectArchive(Archive):
         Raises IncompleteStoreError: a file of it has changed since it was published.
         """
         dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
-        if dated is None or is_cleared(parse_manifest(dated[0])[0]):
+        if dated is None or self._is_marked(uri):
             self._upload(uri, first=dated is None)
         else:
             self._lay(uri, *dated)
             self._standing[uri] = dated[0]
 
     def _upload(self, uri: str, *, first: bool) -> None:
-        """Upload a folder's files, then its manifest; ``first`` by a conditional put, else in place of the old one."""
+        """Upload a folder's files, then its manifest: ``first`` by a conditional put, or over a cleared one."""
         folder = self.root / uri
         text = (folder / MANIFEST_NAME).read_bytes()
         files = read_manifest(folder)["files"]
@@ -402,12 +420,10 @@ class ObjectArchive(Archive):
         sizes = {path: one.size for path, one in there.items()}
         waiting = [name for name, one in files.items() if sizes.get(f"{place}/{name}") != one["size"]]
         some_at_a_time(lambda name: self.objects.write(f"{place}/{name}", folder / name), waiting)
-        if not first:
-            standing = self.objects.read(f"{uri}/{MANIFEST_NAME}") or b""
+        if not first and self._is_marked(uri):
             self.objects.write(f"{uri}/{MANIFEST_NAME}", text)
-            if (before := _files_at(uri, standing)) != place:
-                self.objects.remove([path for path in there if path.startswith(f"{before}/")])
-        elif not self.objects.create(f"{uri}/{MANIFEST_NAME}", text):
+            self.objects.remove([f"{uri}/{CLEARED}"])
+        elif not first or not self.objects.create(f"{uri}/{MANIFEST_NAME}", text):
             self._find(uri)  # another writer was first, or the answer to this put was lost
             return
         self._standing[uri] = text
@@ -459,13 +475,15 @@ def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
     return {uri: one for uri, one in named.items() if depths.get(uri.split("/")[0]) == uri.count("/") + 2}
 
 
-def _lay_out(objects: Objects, root: Path, uri: str) -> None:
-    """Write the manifest at an address into a folder, and of a run the receipt, damaged or not."""
+def _lay_out(objects: Objects, there: Container[str], root: Path, uri: str) -> None:
+    """Write the manifest at an address into a folder with its mark, and of a run the receipt, damaged or not."""
     text = objects.read(f"{uri}/{MANIFEST_NAME}")
     if text is None:
         return
     (root / uri).mkdir(parents=True)
     (root / uri / MANIFEST_NAME).write_bytes(text)
+    if f"{uri}/{CLEARED}" in there:
+        (root / uri / CLEARED).touch()
     if uri.startswith("runs/") and (receipt := objects.read(f"{_files_at(uri, text)}/{RECEIPT}")) is not None:
         (root / uri / RECEIPT).write_bytes(receipt)
 
@@ -475,6 +493,7 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
     manifest, problem = try_manifest(folder)
     if problem is not None:
         yield f"{MANIFEST_NAME} is damaged: {problem}"
+    if problem is not None or is_cleared(folder):
         return
     for name, entry in manifest["files"].items():
         file = folder / name

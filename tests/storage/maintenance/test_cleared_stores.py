@@ -10,10 +10,11 @@ from unittest.mock import Mock
 import pytest
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive import manifests, run_folders
+from storage.archive import manifests
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import read_store
+from storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import problems, small_survey
 
 
@@ -29,15 +30,13 @@ def content(ref: StageRef) -> str:
 
 
 def test_clear_removes_files_and_keeps_the_manifest(archive: Archive) -> None:
-    """Key, parameters, inputs, date and size are still known, and verify finds no problem."""
+    """The manifest is unchanged, and so is its hash in those that name it; verify finds no problem."""
     small = small_survey(archive)
     before = archive.manifest(small.mosaic)
     size = archive.stored_bytes(small.mosaic)
     assert cleared(archive) == [small.mosaic.uri]
-    assert [path.name for path in small.mosaic.path.iterdir()] == ["manifest.json"]
-    after = archive.manifest(small.mosaic)
-    for name in ("key", "params", "inputs", "created"):
-        assert after[name] == before[name]
+    assert sorted(path.name for path in small.mosaic.path.iterdir()) == ["cleared", "manifest.json"]
+    assert archive.manifest(small.mosaic) == before
     assert archive.stored_bytes(small.mosaic) == size > read_store(small.mosaic).size == 0
     assert problems(archive) == []
     assert cleared(archive) == []
@@ -84,18 +83,57 @@ def test_a_store_cleared_during_a_check_is_not_damaged(archive: Archive, monkeyp
     assert problems(archive) == []
 
 
-@pytest.mark.parametrize("exchanges", [True, False])
-def test_interrupted_clear_keeps_the_store(archive: Archive, monkeypatch: pytest.MonkeyPatch, exchanges: bool) -> None:
-    """If a sync fails, with or without folder exchange, the files are still there and can be cleared later."""
+def test_an_interrupted_clear_counts_as_cleared(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mark comes first: a kill before or between the deletions leaves a cleared store, which gc empties."""
     small = small_survey(archive)
     before = content(small.mosaic)
-    if not exchanges:
-        monkeypatch.setattr(run_folders, "try_exchange", lambda one, other: False)
     with monkeypatch.context() as patch:
-        patch.setattr(run_folders, "sync_path", Mock(side_effect=OSError(28, "full")))
-        with pytest.raises(ArchiveError, match="the disk is full"):
+        patch.setattr(manifests, "cleared_leftovers", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
             cleared(archive)
     assert content(small.mosaic) == before
+    assert not archive.is_there(small.mosaic.uri)
     assert problems(archive) == []
-    assert cleared(archive) == [small.mosaic.uri]
+    assert [one.uri for one in clear_up(archive, keep_days=9).removals] == [small.mosaic.uri]
+    assert clear_up(archive, keep_days=9).removals == ()
+    assert sorted(path.name for path in small.mosaic.path.iterdir()) == ["cleared", "manifest.json"]
     assert content(small_survey(archive, named=False).mosaic) == before
+
+
+def test_a_full_disk_at_the_mark_is_one_error(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The store is there or cleared, and can be made again."""
+    small = small_survey(archive)
+    before = content(small.mosaic)
+    with monkeypatch.context() as patch:
+        patch.setattr(manifests, "sync_path", Mock(side_effect=OSError(28, "full")))
+        with pytest.raises(ArchiveError, match="the disk is full"):
+            cleared(archive)
+    assert problems(archive) == []
+    assert content(small_survey(archive, named=False).mosaic) == before
+
+
+def test_an_interrupted_refill_counts_as_cleared(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before its last step the store has files and its mark; the next request makes it again."""
+    small = small_survey(archive)
+    before = content(small.mosaic)
+    cleared(archive)
+    for step in range(1, 4):
+        with monkeypatch.context() as patch:
+            patch.setattr(manifests, "sync_path", _interrupt_at(step, manifests.sync_path))
+            with pytest.raises(KeyboardInterrupt):
+                small_survey(archive, named=False)
+        assert problems(archive) == []
+    assert content(small_survey(archive, named=False).mosaic) == before
+    assert problems(archive) == []
+
+
+def _interrupt_at(step: int, sync: Any) -> Any:
+    """Return a function that syncs, and is interrupted at the call of this number for a store's folder."""
+    calls = iter(range(1, 100))
+
+    def interrupted(path: Path) -> None:
+        sync(path)
+        if path.is_dir() and not path.name.endswith(".part") and next(calls) == step:
+            raise KeyboardInterrupt
+
+    return interrupted
