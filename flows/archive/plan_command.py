@@ -258,12 +258,12 @@ LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "multiply_adds": ("model's multiply-adds", format_count),
     "miou": ("mIoU", lambda score: format_prediction(score, None) or DASH),
 }
-# Bytes kept, fitted to seven surveys (docs/background/signal.md): receipt and report; pictures, by the side of the
-# field; the map, by its pixels; and the scores of a spectrum, by the bands of a file.
-PAGE, PICTURE_SIDE, MAP_PIXEL = 300_000, 1600.0, 5.0
+# Bytes kept, fitted to five surveys (docs/background/signal.md): records of the stores; the map, by its pixels; and the
+# scores of a spectrum, by the bands of a file.
+RECORDS, MAP_PIXEL = 150_000, 5.0
 FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES = 17.0, 4.5, 2.4
 BANDS_POWER = 0.57
-KEPT_FROM = "pixels, spectra and bands, by surveys of seven fields, which kept 0.5 to 2 times as much"
+KEPT_FROM = "pixels, spectra and bands, by surveys of five fields, which kept 0.5 to 2 times as much"
 
 
 @dataclass(frozen=True)
@@ -351,7 +351,7 @@ def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool) 
     spectra = pixels + captured / (BYTES_PER_SAMPLE * bands)  # of the mosaic and of the lines
     of_farm = FARM_SCORES if pixels < SMALL_FIELD else LARGE_FARM_SCORES
     scores = spectra * (of_farm if is_farm else FILE_SCORES * bands**BANDS_POWER)
-    return PAGE + PICTURE_SIDE * math.sqrt(pixels) + MAP_PIXEL * pixels + scores
+    return RECORDS + MAP_PIXEL * pixels + scores
 
 
 def format_estimate(name: str, one: Mapping[str, Any]) -> str:

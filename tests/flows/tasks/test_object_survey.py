@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +73,7 @@ def test_a_rerun_finds_every_stage_in_the_bucket(
     elsewhere = survey_png(bucket)
     assert states(elsewhere.receipt) == CACHED
     assert elsewhere.folder != again.folder
-    assert raw(bucket) == {"manifest.json", "cleared"}  # cleared in the bucket; neither machine captured or sent them again
+    assert raw(bucket) == {"manifest.json", "cleared"}  # neither machine captured or sent them again
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "a desk"))
     run = spectralzoom.open(bucket).latest

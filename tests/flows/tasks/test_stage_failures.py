@@ -140,9 +140,9 @@ def test_a_failed_stage_gives_one_message(stage: str, walk: Walk) -> None:
 
 
 def test_a_survey_completes_after_failures(walk: Walk) -> None:
-    """Each store was built twice, once to fail; the last run computes only map and evaluation."""
+    """Each store was built twice, once to fail; the last run computes only the evaluation."""
     assert walk.builds == dict.fromkeys(walk.keys, 2)
-    assert {name for name, state in walk.last.items() if state == "ran"} == {"segment", "evaluate"}
+    assert {name for name, state in walk.last.items() if state == "ran"} == {"evaluate"}
     np.testing.assert_array_equal(class_map(walk.out), class_map(walk.undisturbed))
     archive = Archive.open(walk.out)
     assert {ref.key for ref in archive.refs()} == set(walk.keys.values())
