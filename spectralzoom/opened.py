@@ -16,6 +16,7 @@ from pipeline.errors import IncompleteStoreError, NoRunError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import LATEST
+from storage.archive.manifests import CURE
 from storage.archive.records import LINE_PRODUCTS, Run, read_run
 from storage.arrays.layout import damage_named, open_group
 from storage.remote.opening import open_archive
@@ -115,7 +116,7 @@ class OpenedRun:
         """
         found: Run = read_run(self.folder)
         if found.problem is not None:
-            raise IncompleteStoreError(f"{found.uri} of {self._archive.name}: {found.problem}; run verify --repair")
+            raise IncompleteStoreError(f"{found.uri} of {self._archive.name}: {found.problem}; {CURE}")
         return found.receipt
 
     @property

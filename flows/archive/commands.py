@@ -7,40 +7,31 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import PurePath
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.tree import Tree
 
-from flows.archive.stale_runs import can_capture, weights_now
 from flows.settings.flags import ArchiveName, AsJson, Switch
-from flows.settings.load import OF_THE_PLAN, of_this_version, parse_settings
-from flows.settings.survey_settings import ALWAYS, OF_THE_MACHINE, RECORDED, Settings
-from flows.tasks.open_survey import versions
+from flows.settings.load import OF_THE_PLAN
+from flows.settings.survey_settings import ALWAYS, RECORDED, Settings
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
-from pipeline.lazy import deferred
 from storage.archive.archive import Archive
-from storage.archive.keys import in_text
-from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
+from storage.archive.lineage import Catalogue, find_product
 from storage.archive.records import Run, moment_of
 from storage.archive.whole_files import to_json
 from storage.maintenance.garbage import DAY_S, clear_up
-from storage.maintenance.verification import Finding, plan_repair, repair
+from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, verify_archive
-
-if TYPE_CHECKING:
-    import flows.survey_command as survey_command
-else:
-    survey_command = deferred("flows.survey_command")
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
-MOST_ROWS = 20  # stores of a stage, changes, removals
+MOST_ROWS = 20  # stores of a stage, removals
 
 
 def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
@@ -50,7 +41,7 @@ def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
 
 
 def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> int:
-    """Show the lineage of a product, and the changes since the version before it.
+    """Show the lineage of a product: its stages, their keys and inputs.
 
     Parameters
     ----------
@@ -62,15 +53,22 @@ def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> i
     return DONE
 
 
-def verify(archive: ArchiveName, *, repair: Switch = False, as_json: AsJson = False) -> int:
+def verify(archive: ArchiveName, *, as_json: AsJson = False) -> int:
     """Read every byte of an archive again and compare it with its manifests.
 
-    Parameters
-    ----------
-    repair
-        Remove broken stores and make them anew, by running the surveys again that name them.
+    It names damaged stores and what was made of them, and the commands that remove them and make them again.
     """
-    return run_verify(archive, stderr, remake=repair, as_json=as_json)
+    opened = open_archive(archive, create=False, write=False)
+    findings = _verified(opened)
+    put_out(verdict(opened, findings), show_verdict, as_json=as_json)
+    return DONE if all(finding.problem is None for finding in findings) else FAILED
+
+
+def _verified(archive: Archive) -> list[Finding]:
+    with StageProgress(stderr, {"verify": "reading again"}) as bars:
+        findings = verify_archive(archive, lambda uri, fraction: bars.show("verify", fraction, uri))
+        bars.show("verify", 1.0, ended=True)
+    return findings
 
 
 def gc(
@@ -78,10 +76,11 @@ def gc(
     *,
     keep_days: float = 1.0,
     raw_too: Switch = False,
+    damaged: Switch = False,
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
-    """Remove stores that no run rests on.
+    """Remove stores that no run rests on, or damaged ones.
 
     Parameters
     ----------
@@ -89,15 +88,20 @@ def gc(
         Stores younger than this stay: an unfinished survey may need them.
     raw_too
         Also remove raw lines of a rig that no run names; they cannot be captured again.
+    damaged
+        Instead, read every byte as `verify` does, and remove damaged stores, what was made of them, and damaged runs.
+        The surveys of these stores make them again.
     dry_run
         Only print what would be removed, and its size.
     """
     opened = open_archive(archive, create=False, write=not dry_run)
+    findings = _verified(opened) if damaged else None
     with StageProgress(stderr, {"gc": "clearing up"}) as bars:
         done = clear_up(
             opened,
             keep_days=keep_days,
             raw_too=raw_too,
+            damaged=findings,
             dry_run=dry_run,
             progress=lambda removal, fraction: bars.show("gc", fraction, removal.uri),
         )
@@ -110,34 +114,7 @@ def gc(
         "obstacle": done.obstacle,
     }
     put_out(content, show_clearance, as_json=as_json)
-    return DONE if done.obstacle is None else PARTLY
-
-
-def run_verify(archive: str | Path, console: Console, *, remake: bool = False, as_json: bool = False) -> int:
-    """Verify an archive; with ``remake`` run the surveys of broken stores again."""
-    opened = open_archive(archive, create=False, write=remake)
-    with StageProgress(console, {"verify": "reading again"}) as bars:
-        findings = verify_archive(opened, lambda uri, fraction: bars.show("verify", fraction, uri))
-        bars.show("verify", 1.0, ended=True)
-    bad = [finding for finding in findings if finding.problem is not None]
-    content = verdict(opened, findings)
-    if not (bad and remake):
-        put_out(content, show_verdict, as_json=as_json)
-        return FAILED if bad else DONE
-    if not as_json:
-        show_verdict(content, console)
-
-    def survey_again(settings: dict[str, Any]) -> str:  # with the settings of this machine
-        here = {**of_this_version(settings), "out": opened.name, **dict.fromkeys(OF_THE_MACHINE)}
-        done = survey_command.run_survey(parse_settings(here), console, summary=False)
-        return f"runs/{done.folder.name}"  # `repair` renames or removes it
-
-    done = repair(opened, bad, survey_again, versions=versions(), can_capture=can_capture, weights_of=weights_now)
-    kept = {name: getattr(done, name) for name in ("remade", "dropped", "failed", "complete")}
-    content["repair"] = {**kept, "hopeless": done.plan.hopeless}
-    put_out(content, show_repair, as_json=as_json)
-    stray = any(finding.kind == "stray" for finding in bad)
-    return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
+    return PARTLY if done.obstacle is not None or (damaged and done.kept) else DONE
 
 
 def contents(archive: Archive) -> dict[str, Any]:
@@ -205,7 +182,7 @@ def _age_s(created: str, now: datetime) -> float | None:
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
-    """Return the lineage of a product as nested tables, and the changes since the version before it.
+    """Return the lineage of a product as nested tables.
 
     Raises ArchiveError: there is no such product.
     """
@@ -218,14 +195,11 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
-    this, before = catalogue.stores[found], version_before(catalogue, found)
     return {
         "archive": archive.name,
         "product": found,
         "runs": [run.uri for run in catalogue.named_by(found)],
         "lineage": [_tree(catalogue, found, set())],
-        "before": None if before is None else before.ref.uri,
-        "changes": [] if before is None else [asdict(one) for one in changes_between(catalogue, before, this)],
     }
 
 
@@ -256,21 +230,25 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
-    """Return the summary of a verification, with the surveys that would repair the archive."""
+    """Return problems, stores made of damaged ones, and the commands that remove them and make them again."""
     bad = [finding for finding in findings if finding.problem is not None]
     places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "missing")}
+    damaged = {finding.uri for finding in bad if finding.kind in ("broken", "missing")}
     content: dict[str, Any] = {
         "archive": archive.name,
         "checked": len(places),
-        "whole": len(places - {finding.uri for finding in bad if finding.kind in ("broken", "missing")}),
+        "whole": len(places - damaged),
         "problems": [asdict(finding) for finding in bad],
     }
-    if bad:
-        plan = plan_repair(archive, bad, versions=versions(), can_capture=can_capture, weights_of=weights_now)
+    if damaged:
+        catalogue = Catalogue.read(archive.root)
+        below = catalogue.descendants(damaged)
+        runs = [run for run in catalogue.runs if run.uri in damaged or run.names & (damaged | below)]
+        surveys = {command(run.settings, archive.name): run.uri for run in runs if run.settings}
         content |= {
-            "to_remake": list(plan.remade),
-            "hopeless": plan.hopeless,
-            "surveys": [{"run": run.uri, "command": command(run.settings, archive.name)} for run in plan.surveys],
+            "made_of_them": sorted(below),
+            "removal": shlex.join(["spectralzoom", "gc", archive.name, "--damaged"]),
+            "surveys": [{"run": uri, "command": words} for words, uri in surveys.items()],
         }
     return content
 
@@ -355,14 +333,14 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
         show_text(f"and {len(content['removals']) - MOST_ROWS} more", console)
     for reason in dict.fromkeys(content["kept"].values()):
         count = sum(why == reason for why in content["kept"].values())
-        show_text(f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}", console)
+        show_text(f"{counted(count, 'store')} {'stays' if count == 1 else 'stay'}: {reason}", console)
     if content["obstacle"] is not None:
         console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", soft_wrap=True)
     show_text(f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}", console)
 
 
 def show_explanation(content: dict[str, Any], console: Console) -> None:
-    """Print a product's lineage, and the changes since the version before."""
+    """Print a product's lineage."""
     run = content.get("run")
     if run is not None:
         where = f"{content['product']}: {run['scene']}, seed {run['seed']}, budget {run['budget']}, {run['state']}"
@@ -371,19 +349,10 @@ def show_explanation(content: dict[str, Any], console: Console) -> None:
             show_text(run["command"], console)
     for node in content["lineage"]:
         console.print(_branch(node, None))
-    if run is not None:
-        return
-    show_text(f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}", console)
-    if content["before"] is None:
-        show_text("this archive has no other version of it before this one", console)
-        return
-    shown = content["changes"][:MOST_ROWS]
-    more = len(content["changes"]) - MOST_ROWS
-    parts = ([one["where"], one["kind"], one["name"], *(_short(one[when]) for when in ("old", "new"))] for one in shown)
-    rows = [list(map(escape, row)) for row in parts]
-    rows += [["", "", f"[dim]and {more} more; --json has all[/]"]] if more > 0 else []
-    title = escape(f"Changed since {content['before']}")
-    console.print(table(("stage", "what", "name", "before", "now"), rows, title=title, left=5, whole=WHOLE))
+    if run is None:
+        show_text(
+            f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}", console
+        )
 
 
 def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
@@ -411,38 +380,19 @@ def _format_node(node: Mapping[str, Any]) -> str:
 
 
 def show_verdict(content: dict[str, Any], console: Console) -> None:
-    """Print the summary of a verification, and the surveys that would repair the archive."""
+    """Print the summary of a verification, and the commands that remove damaged stores and make them again."""
     for finding in content["problems"]:
         console.print(f"[bold red]{escape(finding['uri'])}[/]: {escape(finding['problem'])}", soft_wrap=True)
-    for uri, why in content.get("hopeless", {}).items():
-        show_text(f"{uri} cannot be remade: {why}", console)
-    if content.get("to_remake") or content.get("surveys"):
-        broken = counted(len(content["to_remake"]), "broken store") if content["to_remake"] else "broken runs"
-        show_text(f"verify --repair makes {broken} anew by:", console)
-        for survey in content["surveys"]:
-            show_text(f"  {survey['run']}: {survey['command']}", console)
+    for uri in content.get("made_of_them", ()):
+        show_text(f"{uri}: was made of them", console)
+    if any(finding["kind"] == "broken" for finding in content["problems"]):
+        show_text(f"this removes damaged stores, and what was made of them: {content['removal']}", console)
+    for survey in content.get("surveys", ()):
+        show_text(f"this makes the stores of {survey['run']} again: {survey['command']}", console)
     show_text(f"{content['whole']} stores and runs are as published, out of {content['checked']}", console)
-
-
-def show_repair(content: dict[str, Any], console: Console) -> None:
-    """Print the summary of a repair."""
-    done = content["repair"]
-    for title, part in (("failed", done["failed"]), ("left as it is", done["hopeless"])):
-        for uri, why in part.items():
-            console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", soft_wrap=True)
-    left = "nothing broken is left" if done["complete"] else "some could not be made anew"
-    show_text(f"{len(done['remade'])} remade, {len(done['dropped'])} that no run names removed; {left}", console)
 
 
 def _age(seconds: float | None) -> str:
     if seconds is not None and seconds >= 2 * DAY_S:
         return f"{seconds // DAY_S:.0f} days"
     return DASH if seconds is None else format_seconds(max(seconds, 0))
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    if in_text(text) == text:
-        _, stage, key = text.split("/")
-        return f"{stage} {key[:SHORT_KEY]}"
-    return text if len(text) <= 60 else f"{text[:57]}..."

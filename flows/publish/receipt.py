@@ -164,7 +164,7 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
         first = error.errors()[0]
         place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
         what = "is missing" if first["type"] == "missing" else f"is not of the design: {first['msg']}"
-        raise ShapeError(f"receipt{place} {what}; survey again, or run verify --repair on the archive") from None
+        raise ShapeError(f"receipt{place} {what}; survey again; gc --damaged removes a damaged run") from None
     return dict(receipt)
 
 

@@ -40,7 +40,7 @@ from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_sa
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef
-from storage.archive.manifests import read_table
+from storage.archive.manifests import CURE, read_table
 from storage.archive.records import RECEIPT, read_run
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
@@ -64,7 +64,7 @@ def load_receipt(folder: Path) -> Receipt:
     """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
     found = read_run(folder)
     if found.problem is not None:
-        raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
+        raise IncompleteStoreError(f"{found.uri}: {found.problem}; {CURE}")
     return check_receipt(found.receipt)
 
 

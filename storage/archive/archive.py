@@ -15,16 +15,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError
+from pipeline.errors import IncompleteStoreError, NoRunError
 from storage.archive.keys import (
     LATEST,
-    SECOND,
     StageRef,
     in_text,
     open_folder,
@@ -53,7 +52,6 @@ from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
     check_name,
-    files_below,
     refusals,
     remove_tree,
     rename_into_place,
@@ -312,36 +310,6 @@ class Archive:
         with refusals(self.root, "remove from the archive"):
             retire(self.root / uri)
 
-    def rename_run(self, uri: str, to: str) -> None:
-        """Publish a run again under the name of one that is gone, and remove it under its own.
-
-        Later visits know their prior map by this name.
-        """
-        before = self.root / uri
-        name = Path(to).name
-        manifest = read_manifest(before)
-        own = {"run", "rests_on", "files", "format", "seal"}
-        with self._named_draft(name) as draft:
-            for path in files_below(before):
-                content = path.read_bytes()
-                if path.suffix in (".json", ".html"):
-                    content = content.replace(before.name.encode(), name.encode())
-                draft.write_file(path.name, content)
-            facts = {key: value for key, value in manifest.items() if key not in own}
-            with suppress(ValueError):  # of a folder that was renamed by hand
-                begun = datetime.strptime(name[:SECOND], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)  # runs are sorted by it
-                facts["created"] = begun.isoformat(timespec="milliseconds")
-            draft.publish(rests_on=manifest["rests_on"], **facts)
-        self.drop_run(uri)
-
-    def _named_draft(self, run_id: str) -> RunDraft:
-        """Create the folder of a run of this name. Raises ArchiveError: the name is taken."""
-        with refusals(self.root, "write to the archive"):
-            draft = self._draft(run_id, wait=True)
-        if draft is None:
-            raise ArchiveError(f"there is a run {run_id} in {self.name} already")
-        return draft
-
     # --- runs and spools ----------------------------------------------------------------------------------------------
 
     def new_run(self, name: str) -> RunDraft:
@@ -356,13 +324,9 @@ class Archive:
         return draft
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
-        """Create an empty folder for a new run; None where its name is taken."""
-        return self._draft(run_id, wait=False)
-
-    def _draft(self, run_id: str, *, wait: bool) -> RunDraft | None:
-        """Lock a run and create its draft; None where another process holds or has published it."""
+        """Lock a new run and create its draft; None where another process holds or has published it."""
         folder = self.root / "runs" / (run_id + PART_SUFFIX)
-        release = take_lock(self._lock_path(f"runs-{run_id}"), wait=wait)
+        release = take_lock(self._lock_path(f"runs-{run_id}"), wait=False)
         if release is None:
             return None
         try:

@@ -1,18 +1,16 @@
 """Find the stores that every store and run of an archive was made of, by manifests and receipts.
 
-Find products by name, and the differences between a store and its predecessor. A damaged manifest gives a store with a
-problem, a missing input a bare key.
+Find products by name. A damaged manifest gives a store with a problem, a missing input a bare key.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import Any, Literal
 
 from pipeline.errors import ArchiveError, NoRunError, list_some
 from storage.archive.keys import LATEST, StageRef, in_text, published_runs, published_stores
@@ -106,8 +104,17 @@ class Catalogue:
                 found.setdefault(row["key"], set()).add(row["name"])
         return found
 
-    def is_only_copy(self, uri: str, can_capture: Callable[[Run], bool] = lambda run: run.simulated) -> bool:
-        """Return whether a store cannot be made again: lines and pixels of a run that cannot capture them again.
+    def descendants(self, uris: Iterable[str]) -> set[str]:
+        """Return all stores that were made of these, directly or not, without themselves."""
+        given = set(uris)
+        found = set(given)
+        for uri in self.inputs_first(self.stores):
+            if not found.isdisjoint(self.inputs_of(uri)):
+                found.add(uri)
+        return found - given
+
+    def is_only_copy(self, uri: str) -> bool:
+        """Return whether a store cannot be made again by the archive alone: lines and pixels that were not simulated.
 
         So is a store that was made of such lines, if they were cleared away or are missing.
         """
@@ -115,9 +122,9 @@ class Catalogue:
         if stage != CAPTURED and RASTER_ROLE not in self.roles(uri):
             known = {one: self.stores.get(one) for one in self.inputs_of(uri)}
             gone = [one for one, store in known.items() if store is None or store.cleared]
-            return any(self.is_only_copy(one, can_capture) for one in gone)
+            return any(map(self.is_only_copy, gone))
         if asked := [run for run in self.named_by(uri) if run.settings]:
-            return not all(map(can_capture, asked))
+            return not all(run.simulated for run in asked)
         store = self.stores.get(uri)
         params = {} if store is None else store.params
         return bool(params.get("source", "sim" if "effects" in params else "rig") != "sim")
@@ -167,7 +174,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     if found:
         raise ArchiveError(f"{text} begins {len(found)} stores: {list_some(found, 3)}; give more of it")
     if newest is not None and text in products:
-        raise ArchiveError(f"the {text} of {newest.uri} lacks its store {wanted}; run verify --repair on the archive")
+        raise ArchiveError(f"the {text} of {newest.uri} lacks its store {wanted}; survey again to make it")
     near = difflib.get_close_matches(text, products, n=1)
     if near:
         known = f"did you mean {near[0]}?"
@@ -176,112 +183,3 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     else:
         known = f"no run has products; there is {list_some(sorted(catalogue.stores), 3) or 'nothing in it'}"
     raise NoRunError(f"{text!r} is no product, store or run of this archive; {known}")
-
-
-ABSENT = "(none)"
-Kind = Literal["parameter", "input", "version", "library"]
-
-
-@dataclass(frozen=True)
-class Change:
-    """One thing that differs. ``where`` is the stage whose store differs: that asked for, or one that it rests on."""
-
-    where: str
-    kind: Kind
-    name: str
-    old: Any
-    new: Any
-
-
-def version_before(catalogue: Catalogue, uri: str) -> Store | None:
-    """Return the newest earlier store of the same stage, part of the survey and scene; None for the first one.
-
-    The part is what runs call it (capture_fine), or else what kind of store it was made of. The scene is known where it
-    or a store that it rests on has a parameter ``scene``.
-    """
-    this = catalogue.stores[uri]
-    before = [
-        store
-        for store in catalogue.stores.values()
-        if store.ref.stage == this.ref.stage
-        and store.problem is None
-        and _moment(store) < _moment(this)
-        and _same_part(catalogue, store, this)
-    ]
-    scenes = scenes_of(catalogue, uri)
-    same = [store for store in before if not scenes or scenes_of(catalogue, store.ref.uri) in (scenes, set())]
-    return max(same, key=_moment, default=None)
-
-
-def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
-    """Return the differences of two stores and, for inputs that differ, those within them, down to their origin."""
-    found: list[Change] = []
-    seen: set[tuple[str, str]] = set()
-    waiting = [(old, new)]
-    while waiting:
-        before, after = waiting.pop(0)
-        if (before.ref.uri, after.ref.uri) in seen:
-            continue
-        seen.add((before.ref.uri, after.ref.uri))
-        where = after.ref.stage
-        if before.version != after.version:
-            found.append(Change(where, "version", "stage", before.version, after.version))
-        found += _differing(where, "parameter", flatten(before.params), flatten(after.params))
-        found += _differing(where, "library", before.libraries, after.libraries)
-        inputs = _differing(where, "input", _by_stage(catalogue, before), _by_stage(catalogue, after))
-        found += inputs
-        for one in inputs:
-            was, now = catalogue.stores.get(one.old), catalogue.stores.get(one.new)
-            if was is not None and now is not None and was.ref.stage == now.ref.stage:
-                waiting.append((was, now))
-    return found
-
-
-def flatten(value: object, name: str = "") -> dict[str, Any]:
-    """Return nested tables and lists of tables as dotted names: ``camera.samples``, ``sweeps[2].start_px``."""
-    if isinstance(value, Mapping) and value:
-        parts = {f"{name}.{key}" if name else str(key): part for key, part in value.items()}
-    elif isinstance(value, list) and any(isinstance(part, Mapping | list) for part in value):
-        parts = {f"{name}[{number}]": part for number, part in enumerate(value)}
-    else:
-        return {name: value}
-    return {inner: one for at, part in parts.items() for inner, one in flatten(part, at).items()}
-
-
-def _differing(where: str, kind: Kind, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:
-    names = [name for name in sorted(old.keys() | new.keys()) if name]
-    changes = [Change(where, kind, name, old.get(name, ABSENT), new.get(name, ABSENT)) for name in names]
-    return [one for one in changes if one.old != one.new]
-
-
-def _by_stage(catalogue: Catalogue, store: Store) -> dict[str, str]:
-    """Return the addresses of inputs by stage, numbered within one stage."""
-    found: dict[str, str] = {}
-    for uri in catalogue.inputs_of(store.ref.uri):
-        stage = uri.split("/")[1] if "/" in uri else "store that is not there"
-        number = sum(name.split(" #")[0] == stage for name in found)
-        found[stage if not number else f"{stage} #{number + 1}"] = uri
-    return found
-
-
-def _same_part(catalogue: Catalogue, *pair: Store) -> bool:
-    roles = [catalogue.roles(store.ref.uri) for store in pair]
-    if all(roles):
-        return bool(roles[0] & roles[1])
-    inputs = [[uri for uri in catalogue.inputs_of(store.ref.uri) if "/" in uri] for store in pair]
-    first = [given[0].split("/")[1] if given else "" for given in inputs]  # it tells a fine capture from a coarse one
-    return first[0] == first[1]
-
-
-def scenes_of(catalogue: Catalogue, uri: str) -> set[str]:
-    """Return the scenes that a store and what it rests on name in their parameters: at most one, but for damage."""
-    stores = (catalogue.stores.get(one) for one in {uri, *catalogue.ancestors([uri])})
-    return {str(store.params["scene"]) for store in stores if store is not None and "scene" in store.params}
-
-
-def _moment(store: Store) -> tuple[str, int]:
-    """Return the time at which a store was published; the file's own date decides between equal times."""
-    try:
-        return store.created, (store.ref.path / "manifest.json").stat().st_mtime_ns
-    except FileNotFoundError:  # it goes meanwhile
-        return store.created, 0

@@ -20,7 +20,7 @@ from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, remov
 
 FORMAT = 2
 CLEARED = "cleared"  # file that marks a store whose other files were deleted; its manifest stays as it is
-CURE = "restore it from a copy, or run verify --repair on the archive"
+CURE = "restore it from a copy, or remove it by gc --damaged and survey again"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
 
 

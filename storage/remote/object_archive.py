@@ -160,25 +160,18 @@ class ObjectArchive(Archive):
     # --- runs ---------------------------------------------------------------------------------------------------------
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
-        return self._sending(super()._begin_run(f"{run_id}-{secrets.token_hex(3)}"))  # which no other machine takes
-
-    def _named_draft(self, run_id: str) -> RunDraft:
-        draft = self._sending(super()._named_draft(run_id))
-        assert draft is not None
-        return draft
-
-    def _sending(self, draft: RunDraft | None) -> RunDraft | None:
-        """Have a draft upload its run once it is published here, and then check its stores in the bucket."""
-
-        def send(uri: str) -> None:
-            self._upload(uri, first=True)
-            names = read_run(self.root / uri).names
-            self._standing = {one: text for one, text in self._standing.items() if one not in names}
-            self._ensure(names)
-
+        """Create a draft under a name that no other machine takes; its run is uploaded once it is published here."""
+        draft = super()._begin_run(f"{run_id}-{secrets.token_hex(3)}")
         if draft is not None:
-            draft.send = send
+            draft.send = self._send_run
         return draft
+
+    def _send_run(self, uri: str) -> None:
+        """Upload a run, and then check its stores in the bucket."""
+        self._upload(uri, first=True)
+        names = read_run(self.root / uri).names
+        self._standing = {one: text for one, text in self._standing.items() if one not in names}
+        self._ensure(names)
 
     def refresh(self) -> None:
         """Fetch manifests and receipts of new runs; drop those that other machines removed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,12 +18,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import storage.readers.recordings
-from flows.archive.commands import run_verify
+from flows.archive.commands import gc
 from flows.archive.reprocess_command import run_reprocess
 from flows.publish.run_folder import Published, load_receipt
 from flows.settings.load import load_settings
 from flows.survey_command import run_survey
-from flows.terminal.processes import DONE, FAILED
+from flows.terminal.processes import DONE, PARTLY
 from models.weights.files import save_weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED, block_means
@@ -388,21 +387,16 @@ def test_a_recording_is_reprocessed_after_its_files_moved(
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
 
 
-def test_a_repair_needs_the_files_of_its_recording(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
-    """Without them, or with another recording there, the damaged signal is kept, as it is the only copy."""
+def test_a_damaged_signal_of_a_recording_goes_on_request(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
+    """It is the only copy in the archive, so it stays; with --raw-too the next survey reads the recording again."""
     folder, _ = pushbroom
     survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
     (chunk, *_) = sorted((tmp_path / "a").glob("stages/condense/*/*.zarr/scores/c/0/0/0"))
     flip(chunk, 40)
-    rotten = chunk.read_bytes()
-    folder.rename(tmp_path / "elsewhere")
-    assert run_verify(tmp_path / "a", QUIET, remake=True) == FAILED
-    shutil.copytree(tmp_path / "elsewhere", folder, copy_function=shutil.copy)  # later files count as another recording
-    assert run_verify(tmp_path / "a", QUIET, remake=True) == FAILED
-    assert chunk.read_bytes() == rotten
-    shutil.rmtree(folder)
-    (tmp_path / "elsewhere").rename(folder)
-    assert run_verify(tmp_path / "a", QUIET, remake=True) == DONE
+    assert gc(tmp_path / "a", damaged=True) == PARTLY
+    assert chunk.is_file()
+    assert gc(tmp_path / "a", damaged=True, raw_too=True) == DONE
+    survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "a"))} == {"whole"}
 
 

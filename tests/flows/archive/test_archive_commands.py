@@ -11,12 +11,15 @@ from typing import Any
 
 import pytest
 
-from flows.archive.commands import command, contents, explain, gc, ls, run_verify
+from flows.archive.commands import command, contents, explain, gc, ls, verify
+from flows.archive.reprocess_command import asked_again
 from flows.settings.load import load_settings, parse_settings
+from flows.survey_command import run_survey
 from flows.terminal.figures import format_bytes
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
+from storage.archive.records import read_run
 from storage.archive.whole_files import to_json
 from tests.conftest import QUIET
 from tests.storage.small_archive import flip, small_survey
@@ -79,33 +82,28 @@ def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest
     assert "no store is removed" in capsys.readouterr().out
 
 
-def test_explain_shows_lineage_and_changes(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The second map differs by its budget, from which the plan made other sweeps."""
+def test_explain_shows_lineage(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is a tree of stages with their keys, and with the names that runs give them."""
     content = _json(capsys, lambda: explain(two_budgets, "class_map", as_json=True))
     (top,) = content["lineage"]
     assert (top["stage"], top["called"]) == ("segment", ["segment"])
     assert [one["stage"] for one in top["inputs"]] == ["rectify_fine", "score"]
     assert top["wall_s"] > 0
-    assert content["before"].startswith("stages/segment/")
-    kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}
-    assert {("segment", "input", "rectify_fine"), ("score", "parameter", "fine_s")} <= kinds
     explain(two_budgets, "class_map")
     out = capsys.readouterr().out
     assert "segment" in out
     assert "└── capture" in out
     assert "(capture_fine)" in out
-    assert "fine_s" in out
+    assert "named by runs/" in out
 
 
 def test_explain_covers_captures_and_runs(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Coarse and fine sweeps are not versions of each other; a run has its command, and shows each store once."""
-    assert _json(capsys, lambda: explain(two_budgets, "raw_coarse", as_json=True))["before"] is None
-    explain(two_budgets, "raw_coarse")
-    assert "no other version" in capsys.readouterr().out
-    fine = _json(capsys, lambda: explain(two_budgets, "raw_fine", as_json=True))
-    (earlier,) = [run for run in contents(Archive.open(two_budgets))["runs"] if run["budget"] == 0.8]
-    runs = _json(capsys, lambda: explain(two_budgets, fine["before"], as_json=True))["runs"]
-    assert runs == [f"runs/{earlier['id']}"]
+    """Both runs name the first sweeps, one the fine ones; a run has its command, and shows each store once."""
+    named = []
+    for sweeps in ("raw_coarse", "raw_fine"):
+        explain(two_budgets, sweeps, as_json=True)
+        named.append(json.loads(capsys.readouterr().out)["runs"])
+    assert [len(runs) for runs in named] == [2, 1]
     (first, _) = (run["id"] for run in contents(Archive.open(two_budgets))["runs"])
     content = _json(capsys, lambda: explain(two_budgets, first, as_json=True))
     assert [tree["stage"] for tree in content["lineage"]] == ["evaluate"]
@@ -137,29 +135,38 @@ def test_explain_shows_damaged_and_circular_lineage(tmp_path: Path, capsys: pyte
         explain(tmp_path, "../../etc/passwd")
 
 
-def test_a_partial_repair_is_reported(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Foreign files and raw lines of a rig cannot be repaired; the exit code is that of a partial success."""
+def test_a_damaged_store_is_named_removed_and_made_again(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Verify names it with what was made of it, and prints the commands that remove and make them."""
     opened = Archive.open(archive)
     flip(opened.refs("rectify_fine")[0].path / "lines.json")
     (archive / "stages" / "notes.txt").write_text("mine")
-    content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
+    content = _json(capsys, lambda: verify(archive, as_json=True), FAILED)
     assert content["checked"] - content["whole"] == 1
-    content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), PARTLY)
-    assert content["repair"]["complete"]
+    assert [uri.split("/")[1] for uri in content["made_of_them"]] == ["evaluate", "segment"]
+    assert verify(archive) == FAILED
+    shown = capsys.readouterr().out
+    assert content["removal"] == f"spectralzoom gc {archive} --damaged"
+    assert content["removal"] in shown
+    assert all(one["command"] in shown for one in content["surveys"])
+    gone = _json(capsys, lambda: gc(archive, damaged=True, as_json=True))
+    assert [row["uri"].split("/")[1] for row in gone["removals"]] == ["evaluate", "segment", "rectify_fine"]
+    (one,) = content["surveys"]
     (archive / "stages" / "notes.txt").unlink()
-    assert run_verify(archive, QUIET) == DONE
-    assert "19 stores and runs are as published, out of 19" in capsys.readouterr().out
+    run_survey(asked_again(read_run(archive / one["run"]), archive, None), QUIET)
+    assert verify(archive) == DONE
+    assert "20 stores and runs are as published, out of 20" in capsys.readouterr().out
 
 
 def test_missing_stores_and_empty_receipts_count_as_damaged(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A run with an empty receipt needs no store to be made again."""
+    """A run with an empty receipt is removed."""
     run = next(archive.glob("runs/*"))
     (run / "receipt.json").write_text("")
-    assert run_verify(archive, QUIET) == FAILED
-    assert "makes broken runs anew by" in capsys.readouterr().out
     shutil.rmtree(Archive.open(archive).refs("rectify_fine")[0].path)
-    content = _json(capsys, lambda: run_verify(archive, QUIET, as_json=True), FAILED)
+    content = _json(capsys, lambda: verify(archive, as_json=True), FAILED)
     assert content["checked"] - content["whole"] == 2
+    gone = _json(capsys, lambda: gc(archive, damaged=True, as_json=True))
+    assert [row["uri"] for row in gone["removals"]] == [f"runs/{run.name}"]
+    assert not run.exists()
 
 
 def test_commands_repeat_the_settings_of_a_run(tmp_path: Path) -> None:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 
-from flows import survey_command
 from flows.cli.main import main
-from flows.tasks.local_server import ServerUnavailable
 from storage.archive.archive import Archive
 from storage.archive.staging import file_hash
 from tests.storage.small_archive import Small, rewrite, small_survey
@@ -53,15 +50,9 @@ CHANGES = (
     [(one, lead) for number, one in enumerate(CHANGES) for lead in (LEADS[number], LEADS[-1 - number])],
 )
 def test_no_command_leaves_the_archive(
-    tmp_path: Path,
-    change: Callable[[Small, str], None],
-    lead: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, change: Callable[[Small, str], None], lead: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each command ends with output or one message; files beside the archive stay, and are not shown."""
-    no_server = Mock(side_effect=ServerUnavailable("none here"))  # else each repair waits for a server
-    monkeypatch.setattr(survey_command, "_prefect_server", no_server)
     root = tmp_path / "archive"
     change(small_survey(Archive.open(root), simulated=False), lead)
     secrets = [tmp_path / "secret", root / "secret", root / "stages" / "secret"]
@@ -74,7 +65,7 @@ def test_no_command_leaves_the_archive(
         ["verify"],
         ["export"],
         ["gc", "--keep-days", "0", "--raw-too"],
-        ["verify", "--repair"],
+        ["gc", "--damaged"],
     ):
         with pytest.raises(SystemExit) as ended:
             main([verb[0], str(root), *verb[1:]])

@@ -135,7 +135,7 @@ def test_a_damaged_store_blocks_later_stages(settings: Settings, archive: Path, 
     (store.path / "lines.json").unlink()
     planned = _plan(settings, archive)
     assert planned["rectify_fine"].state == "blocked"
-    assert "verify --repair" in planned["rectify_fine"].why
+    assert "gc --damaged" in planned["rectify_fine"].why
     assert planned["segment"].why == "waits for rectify_fine"
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
@@ -149,7 +149,7 @@ def test_damaged_plan_stops_survey(settings: Settings, archive: Path, survey_png
     path.write_text(path.read_text().replace(*change))
     fine = _plan(settings, archive)["capture_fine"]
     assert (fine.state, "plan.json has changed" in fine.why) == ("blocked", True)
-    with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*verify --repair"):
+    with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*gc --damaged"):
         survey_png(archive)
 
 

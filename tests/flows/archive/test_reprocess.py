@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 from flows.archive import reprocess_command
-from flows.archive import stale_runs as generations
-from flows.archive.commands import run_verify
+from flows.archive import reprocess_command as generations
+from flows.archive.commands import verify
 from flows.archive.reprocess_command import run_reprocess
 from flows.settings.survey_settings import Settings
 from flows.survey_command import run_survey
@@ -117,7 +117,7 @@ def test_new_weights_add_runs_and_keep_old_ones(archive: Path, other: Path, repr
         assert (states["condense_coarse"], states["locate"], states["segment"]) == ("cached", "cached", "ran")
     assert reprocess.states(archive, weights=other) == [("turned", "skipped"), ("scene", "skipped")]
     assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "skipped")]
-    assert run_verify(archive, QUIET) == DONE
+    assert verify(archive) == DONE
 
 
 def test_a_run_that_gets_its_accuracy_remains_a_prior_map(
@@ -160,13 +160,13 @@ def test_a_failed_field_does_not_stop_the_others(archive: Path, other: Path, rep
 
 
 def test_fields_with_missing_stores_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
-    """A missing store leads to a new run; a damaged one is left to verify --repair."""
+    """A missing store leads to a new run; a damaged one is left to gc --damaged."""
     newest = Catalogue.read(archive).runs[-1]
     store = archive / newest.products["class_map"].rpartition("/")[0]
     manifest = (store / "manifest.json").read_bytes()
     (store / "manifest.json").unlink()
     (row,) = reprocess(archive, FAILED, field="scene")
-    assert "verify --repair" in row["message"]
+    assert "gc --damaged" in row["message"]
     (store / "manifest.json").write_bytes(manifest)
     shutil.rmtree(store)
     assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "ran")]

@@ -156,28 +156,22 @@ def rot_mosaic(address: str) -> None:
     rot(archive, name, 100)
 
 
-def test_a_flipped_bit_is_reported_and_repaired(
-    bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """verify names store and array; --repair uses this machine's working copy, and another machine surveys again."""
-    published = survey_png(bucket, source="raster", budget=None)
+def test_a_flipped_bit_is_reported_and_removed(bucket: str, survey_png: Survey, command_line: CommandLine) -> None:
+    """verify names store and array; gc --damaged removes it with the map, and the next survey makes both again."""
+    flags: dict[str, Any] = {"source": "raster", "budget": None, "accuracy": False}
+    published = survey_png(bucket, **flags)
     before = map_of(open_archive(bucket), published)
     rot_mosaic(bucket)
     ended = command_line("verify", bucket, "--json")
     (problem,) = json.loads(ended.out)["problems"]
     assert ended.code == 1
     assert "mosaic.zarr/scores/c/0/0/0 has changed since it was published" in problem["problem"]
-    repaired = command_line("verify", bucket, "--repair", "--json")
-    assert repaired.code == 0
-    assert json.loads(repaired.out)["repair"]["remade"] == [problem["uri"]]
+    gone = command_line("gc", bucket, "--damaged", "--raw-too", "--json")
+    assert gone.code == 0
+    assert [row["uri"].split("/")[1] for row in json.loads(gone.out)["removals"]] == ["segment", "score", "rectify"]
+    again = survey_png(bucket, **flags)
     assert command_line("verify", bucket).code == 0
-    rot_mosaic(bucket)
-    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
-    repaired = command_line("verify", bucket, "--repair", "--json")
-    assert repaired.code == 0
-    assert json.loads(repaired.out)["repair"]["complete"]
-    assert command_line("verify", bucket).code == 0
-    np.testing.assert_array_equal(map_of(open_archive(bucket), published), before)
+    np.testing.assert_array_equal(map_of(open_archive(bucket), again), before)
 
 
 def test_missing_buckets_are_reported(bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.archive.stale_runs import asked_again, newest_runs
+from flows.archive.reprocess_command import asked_again, newest_runs
 from flows.settings.load import parse_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.scene import farm_refusal, open_scene

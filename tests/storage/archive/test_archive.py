@@ -292,7 +292,7 @@ def test_read_table_refuses_a_changed_table(table: Path, content: str) -> None:
     """An unchanged table is read; one changed digit is refused as invalid JSON is."""
     assert read_table(table) == {"patch_index": [1, 2], "fraction": 0.25}
     table.write_text(content)
-    with pytest.raises(IncompleteStoreError, match=r"plan\.json has .*verify --repair"):
+    with pytest.raises(IncompleteStoreError, match=r"plan\.json has .*gc --damaged"):
         read_table(table)
 
 

@@ -87,7 +87,7 @@ def test_brightness_is_the_mean_over_bands(stored: Stored, factor: int) -> None:
 
 
 def test_an_opened_mosaic_is_cached_until_it_is_replaced(tmp_path: Path) -> None:
-    """`verify --repair` replaces a store by a new one at the same path."""
+    """A store that was removed and made again is another one at the same path."""
     path = tmp_path / "mosaic.zarr"
     writer(path)
     first = open_mosaic(path)

@@ -8,8 +8,9 @@ import pytest
 
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.maintenance.garbage import IN_USE, Removal, clear_up, plan_clearance
-from tests.storage.small_archive import flip, grow_old, problems, small_survey
+from storage.maintenance.garbage import IN_USE, Clearance, Removal, clear_up, plan_clearance
+from storage.remote.opening import verify_archive
+from tests.storage.small_archive import flip, grow_old, make_store, problems, small_survey
 
 
 def test_gc_removes_only_stores_that_no_run_needs(archive: Archive) -> None:
@@ -43,7 +44,7 @@ def test_gc_keeps_young_stores_and_their_inputs(archive: Archive) -> None:
     assert plan.kept == {
         small.raw.uri: "an input of a store that stays",
         small.mosaic.uri: "an input of a store that stays",
-        small.map.uri: "younger than 2 days",
+        small.map.uri: "no run names it, and it is younger than 2 days",
     }
     assert len(plan_clearance(archive, keep_days=4).removals) == 0
 
@@ -182,3 +183,76 @@ def test_a_negative_age_is_refused(tmp_path: Path) -> None:
     for days in (-1.0, float("nan")):
         with pytest.raises(SettingsError, match="expected a number of days"):
             clear_up(Archive.open(tmp_path), keep_days=days)
+
+
+# --- damaged stores ---------------------------------------------------------------------------------------------------
+
+
+def remove_damaged(archive: Archive, *, raw_too: bool = False, dry_run: bool = False) -> Clearance:
+    """Verify an archive, and remove what is damaged."""
+    return clear_up(archive, raw_too=raw_too, damaged=verify_archive(archive), dry_run=dry_run)
+
+
+def test_a_damaged_store_goes_with_what_was_made_of_it(archive: Archive) -> None:
+    """A dry run lists the same removals; the next survey makes them again, and the run is whole."""
+    small, other = small_survey(archive), small_survey(archive, seed=1)
+    flip(small.mosaic.path / "data.bin")
+    planned = remove_damaged(archive, dry_run=True)
+    assert [(one.uri, one.why) for one in planned.removals] == [
+        (small.map.uri, "it was made of a damaged store"),
+        (small.mosaic.uri, "it is damaged"),
+    ]
+    assert remove_damaged(archive) == planned
+    assert {ref.uri for ref in archive.refs()} == {small.raw.uri, other.raw.uri, other.mosaic.uri, other.map.uri}
+    assert len(archive.runs()) == 2
+    assert len(problems(archive)) == 2  # which the run names
+    small_survey(archive, named=False)
+    assert problems(archive) == []
+    assert remove_damaged(archive).removals == ()
+
+
+@pytest.mark.parametrize("damage", ["a flipped bit", "a damaged manifest", "no manifest"])
+def test_damaged_lines_of_a_rig_go_on_request(archive: Archive, damage: str) -> None:
+    """They cannot be captured again, so they stay with what was made of them, with a reason."""
+    small = small_survey(archive, simulated=False)
+    if damage == "no manifest":
+        (small.raw.path / "manifest.json").unlink()
+    else:
+        flip(small.raw.path / ("data.bin" if damage == "a flipped bit" else "manifest.json"), at=40)
+    if damage != "no manifest":  # nothing is known of such a folder
+        kept = remove_damaged(archive)
+        assert (kept.removals, list(kept.kept)) == ((), [small.raw.uri])
+        assert "restore it from a copy" in kept.kept[small.raw.uri]
+    assert small.raw.uri in {one.uri for one in remove_damaged(archive, raw_too=True).removals}
+    small_survey(archive, named=False, simulated=False)
+    assert problems(archive) == []
+
+
+def test_lines_of_a_rig_outlive_the_damaged_store_that_planned_them(archive: Archive) -> None:
+    """The lines of a second pass were captured by the scores of a mosaic, and cannot be captured again."""
+    small = small_survey(archive, simulated=False)
+    fine = make_store(archive, "capture", {"source": "rig", "pass": 2}, [small.mosaic])
+    drawn = make_store(archive, "segment", {"pass": 2}, [fine])
+    flip(small.mosaic.path / "data.bin")
+    assert {one.uri for one in remove_damaged(archive).removals} == {small.map.uri, small.mosaic.uri, drawn.uri}
+    assert problems(archive)[-1].endswith("was made of it") or archive.find("capture", fine.key) is not None
+
+
+def test_a_damaged_run_goes_and_its_stores_stay(archive: Archive) -> None:
+    """Without it nothing stands in the way of gc, which spares its stores for a day."""
+    small = small_survey(archive)
+    (small.run / "manifest.json").unlink()
+    assert clear_up(archive, keep_days=9).obstacle is not None
+    assert [(one.uri, one.what) for one in remove_damaged(archive).removals] == [(f"runs/{small.run.name}", "run")]
+    assert problems(archive) == []
+    assert len(archive.refs()) == 3
+    assert clear_up(archive, keep_days=9).obstacle is None
+
+
+def test_nothing_damaged_is_removed_from_an_archive_in_use(archive: Archive) -> None:
+    """A survey may be reading it."""
+    small = small_survey(archive)
+    flip(small.mosaic.path / "data.bin")
+    with archive.in_use():
+        assert remove_damaged(archive).obstacle == IN_USE
+    assert len(archive.refs()) == 3

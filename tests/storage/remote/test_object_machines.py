@@ -1,4 +1,4 @@
-"""Several machines share an archive in a bucket: none harms a store that another clears, repairs or uploads."""
+"""Several machines share an archive in a bucket: none harms a store that another clears, removes or uploads."""
 
 from __future__ import annotations
 
