@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from flows.archive import reprocess_command
-from flows.archive import reprocess_command as generations
+from flows.archive import reprocess_command as reprocessing
 from flows.archive.commands import verify
 from flows.archive.reprocess_command import run_reprocess
 from flows.settings.survey_settings import Settings
@@ -183,24 +183,24 @@ def test_a_run_without_settings_is_reported(archive: Path, reprocess: Reprocess)
 def test_a_run_is_current_only_if_it_is_complete(archive: Path) -> None:
     """It needs a valid receipt and no failed stage; its settings are in the manifest, too."""
     run = Catalogue.read(archive).runs[-1]
-    settings = generations.asked_again(run, archive, None)
-    assert generations.is_current(Catalogue.read(archive), run, settings)
+    settings = reprocessing.asked_again(run, archive, None)
+    assert reprocessing.is_current(Catalogue.read(archive), run, settings)
     failed = {**run.receipt, "stages": [*run.stages[:-1], {**run.stages[-1], "state": "failed"}]}
-    assert not generations.is_current(Catalogue.read(archive), dataclasses.replace(run, receipt=failed), settings)
+    assert not reprocessing.is_current(Catalogue.read(archive), dataclasses.replace(run, receipt=failed), settings)
     flip(run.folder / "receipt.json")
     damaged = Catalogue.read(archive).runs[-1]
-    assert generations.asked_again(damaged, archive, None) == settings
-    assert not generations.is_current(Catalogue.read(archive), damaged, settings)
+    assert reprocessing.asked_again(damaged, archive, None) == settings
+    assert not reprocessing.is_current(Catalogue.read(archive), damaged, settings)
 
 
 def test_fields_differ_by_scene_and_name(surveyed: Path, tmp_path: Path) -> None:
     """Each run without a scene is a field of its own; only the star is a wildcard."""
-    (one, _) = generations.newest_runs(Catalogue.read(surveyed))
+    (one, _) = reprocessing.newest_runs(Catalogue.read(surveyed))
     odd = dataclasses.replace(one, receipt={**one.receipt, "survey": "field[1]?.png"})
     for pattern in ("field[1]?.png", "*[1]*", "*"):
-        assert generations.is_called(odd, pattern)
+        assert reprocessing.is_called(odd, pattern)
     for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
-        assert not generations.is_called(odd, pattern)
+        assert not reprocessing.is_called(odd, pattern)
     archive = Archive.open(tmp_path)
     for scene in (None, None, "farm@2/seed=1", "farm@2/seed=2", "farm@2/seed=1"):
         with archive.new_run("farm") as draft:
@@ -210,4 +210,4 @@ def test_fields_differ_by_scene_and_name(surveyed: Path, tmp_path: Path) -> None
                 )
             draft.publish(survey="farm")
     runs = Catalogue.read(tmp_path).runs
-    assert generations.newest_runs(Catalogue.read(tmp_path)) == [runs[n] for n in (0, 1, 3, 4)]
+    assert reprocessing.newest_runs(Catalogue.read(tmp_path)) == [runs[n] for n in (0, 1, 3, 4)]
