@@ -41,16 +41,13 @@ def survey(settings: SurveySettings) -> RunRef:
 
     Returns
     -------
-    The address of the published run; of an earlier one where nothing had to be captured. Of the last store, where
-    ``until`` of the settings stops the survey.
+    The address of the published run. Of the last store, where ``until`` of the settings stops the survey.
 
     Raises
     ------
     PipelineError : what is wrong, what is allowed, and what to do.
     """
     opened = plan_capture(settings)
-    if isinstance(opened, RunRef):  # nothing has to be captured
-        return opened
     with opened.at_work():
         try:
             draw_class_map(opened)

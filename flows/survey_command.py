@@ -42,8 +42,7 @@ else:
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
     """Survey, publish the run and print its ``summary`` on ``console``; with ``verbose`` also its stages and effects.
 
-    Raises PipelineError: of the flow; NothingToMend: the expected error of an earlier map is small enough;
-    SurveyStopped: the settings stop the survey before its class map.
+    Raises PipelineError: of the flow; SurveyStopped: the settings stop the survey before its class map.
     """
     gc.collect()
     give_back_freed_memory()  # of a survey before

@@ -128,14 +128,6 @@ class WorkerError(PipelineError, RuntimeError):
     """Worker processes died, or the connection to their scheduler was lost."""
 
 
-class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends without a capture
-    """The prior map of a field is certain enough, and no capture is needed; ``run`` is the run of that map."""
-
-    def __init__(self, run: str, why: str) -> None:
-        super().__init__(why)
-        self.run = run
-
-
 class SurveyStopped(Exception):  # noqa: N818 - no error: the settings stop a survey before its class map
     """A survey stored the last product of the stage ``until`` of its settings, at ``uri`` of its archive."""
 

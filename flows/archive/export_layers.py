@@ -292,15 +292,13 @@ def _picture(run: ExportedRun) -> Layer:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return the days since each pixel was captured, and what a prior map adds: changes, and earlier classes.
+    """Return what a prior map adds: changes, and earlier classes.
 
     Raises IncompleteStoreError: class probabilities cannot be read.
     """
     layers = []
     if run.store(PROBABILITIES) is not None:
         ProbabilityStore(run.path(PROBABILITIES))
-    if (product := _product_with(run, "age")) is not None:
-        layers.append(image_layer(run, product, "age", "age", "Days since the pixel was captured", unit="days"))
     if (product := _product_with(run, "changed")) is not None:
         title = "Fraction of the patch's pixels with another class than in the prior map"
         make = image_layer if product == "ground_map" else patch_layer

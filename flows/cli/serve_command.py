@@ -41,7 +41,7 @@ from flows.tasks.survey_model import weights_path
 from flows.terminal.processes import DONE, terminable
 from flows.terminal.progress import show_text
 from models.weights.files import describe_weights
-from pipeline.errors import ArchiveError, NoSceneYet, NothingToMend, PipelineError, SettingsError
+from pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
 from storage.archive.staging import read_toml, take_lock
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import open_archive
@@ -155,8 +155,6 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
             )
         try:
             open_run(replace(settings, name=name), planning=True)
-        except NothingToMend as known:
-            show_text(f"{name}: {known}")
         except NoSceneYet as error:
             describe_weights(weights_path(settings))  # raises where they are invalid
             show_text(f"{name}: {error}; each due run looks for it again")

@@ -11,7 +11,7 @@ from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.terminal.processes import format_failure
 from flows.terminal.progress import print_json, say, stderr
-from pipeline.errors import NothingToMend, SurveyStopped
+from pipeline.errors import SurveyStopped
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
@@ -44,9 +44,6 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
                 stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
             try:
                 printed.append(survey_command.run_survey(requested, stderr, verbose=verbose).receipt)
-            except NothingToMend as skipped:
-                printed.append({"captured": False, "run": skipped.run, "why": str(skipped)})
-                stderr.print(f"{skipped}", markup=False, soft_wrap=True)
             except SurveyStopped as stopped:
                 printed.append({"until": stopped.until, "stored": stopped.uri, "archive": stopped.archive})
                 stderr.print(f"{stopped}", markup=False, soft_wrap=True)

@@ -14,7 +14,6 @@ from PIL import Image
 
 from flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
 from flows.publish.quicklook import QuicklookData
-from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import format_days
 from flows.tasks.prior_maps import Prior
 from flows.tasks.run import SurveyRun
@@ -22,8 +21,7 @@ from flows.terminal.figures import format_percent
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import FinePlan
-from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ProbabilityStore, class_counts
+from storage.arrays.class_maps import class_counts
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.mosaics import develop
 
@@ -62,26 +60,21 @@ class FieldMap:
 
 @dataclass(frozen=True)
 class PriorMapField:
-    """Images of the prior map: the class map of an earlier run, and the ages."""
+    """The class map of an earlier run."""
 
     days: float  # between that capture and this one
     classes: Bytes  # (y, x) of that run's map, by the class numbers of this run; 255 for other classes
-    age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where it never was
 
 
-def prior_map(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> PriorMapField | None:
-    """Return the images of the prior map; None without one, or where it was not used.
-
-    ``drawn`` is the store of the class map and the class probabilities.
-    """
-    figures = receipt.get("prior_map")
-    if figures is None or prior is None or figures["put_aside"]:
+def prior_map(prior: Prior | None) -> PriorMapField | None:
+    """Return the image of the prior map; None without one."""
+    if prior is None:
         return None
     earlier = np.array(prior.classes)
     names = np.full(256, UNLABELLED, np.uint8)
     names[earlier[earlier >= 0]] = np.flatnonzero(earlier >= 0)
     before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
-    return PriorMapField(prior.days, names[before], ProbabilityStore(drawn.path / "class_probabilities.zarr").age())
+    return PriorMapField(prior.days, names[before])
 
 
 def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
@@ -97,7 +90,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     layers = [MapLayer(shown.caption.capitalize(), data_address(webp(picture, quality=QUALITY)), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     if shown.confidence is not None:
-        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence, 1.0)))
+        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence)))
     errors = None
     if shown.truth is not None:
         layers.append(MapLayer("Truth", classes(shown.truth)))
@@ -105,9 +98,6 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         layers.append(MapLayer("Errors: map and truth differ", errors, opacity=0.8))
     if before is not None:
         layers.append(MapLayer(f"Before: {format_days(before.days)}", classes(before.classes)))
-        oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
-        ages = _ramp_address(before.age_days[thin], oldest)
-        layers.append(MapLayer(f"Days since it was captured, 0 to {oldest:.2g}", ages, opacity=0.8))
     if shown.was is not None:
         differs = (shown.was[thin] != UNLABELLED).astype(np.uint8)
         table = np.array([(0, 0, 0, 0), (*DIFFERS_RGB, 255)], np.uint8)
@@ -151,12 +141,12 @@ def layer_address(numbers: Bytes, colours: Bytes) -> str:
     return data_address(webp(Image.fromarray(table[numbers]), lossless=True, quality=0))
 
 
-def _ramp_address(values: NDArray[np.floating], most: float) -> str:
-    """Draw (y, x) values from 0 to ``most`` from dark to bright; unknown ones are transparent."""
+def _ramp_address(values: NDArray[np.floating]) -> str:
+    """Draw (y, x) values from 0 to 1 from dark to bright; unknown ones are transparent."""
     table = np.zeros((LEVELS + 2, 4), np.uint8)
     table[: LEVELS + 1] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, LEVELS + 1)))
     known = np.isfinite(values)
-    levels = np.rint(LEVELS * np.clip(np.where(known, values, 0) / (most or 1.0), 0, 1))
+    levels = np.rint(LEVELS * np.clip(np.where(known, values, 0), 0, 1))
     return layer_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)
 
 

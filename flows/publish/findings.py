@@ -1,4 +1,4 @@
-"""Compute the findings of a run: areas, changes, ages, zones, plots, unknown pixels, expected score."""
+"""Compute the findings of a run: areas, changes, zones, plots, unknown pixels, expected score."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import EXTENT_WHOLE
-from flows.tasks.prior_maps import prior_map_figures
 from flows.tasks.run import SurveyRun
 from flows.tasks.scores import MOST_ERROR
 from flows.tasks.stages.maps import OUT_OF_RANGE
@@ -30,7 +29,6 @@ from storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
 from storage.arrays.ground_maps import GroundMap
 from storage.arrays.layout import SHARD_ROWS
 
-OLDER_DAYS = (1, 7, 30)  # since a capture, for which hectares are given
 PLOTS_FILE = "plots.csv"
 STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
 
@@ -92,31 +90,20 @@ def find_ground(
     probabilities: ProbabilityStore,
     prior: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return ``ground``: grid, changes against the prior map, and old areas. Empty without a georeference."""
+    """Return ``ground``: grid, and changes against the prior map. Empty without a georeference."""
     geobox = run.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
-    age_days = np.where(found.classes != UNLABELLED, probabilities.age(), np.nan)
     figures: dict[str, Any] = {
         "crs": crs_name(geobox),
         "resolution_m": pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x)),
         "shape": [int(size) for size in geobox.shape],
-        "older_ha": older_hectares(run.zones.place, age_days),
     }
     if (old_class := probabilities.old_class()) is not None:
         changes = [] if prior is None else prior["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
         figures |= {"changes_ha": changed_hectares(run.zones.place, old_class, found, beyond)}
     return {"ground": figures}
-
-
-def older_hectares(place: FieldPlace, age_days: NDArray[np.float32]) -> dict[str, float]:
-    """Return the hectares of (y, x) pixels captured longer ago than each of `OLDER_DAYS`; NaN is left out."""
-    passed = np.searchsorted(OLDER_DAYS, age_days, side="left")  # number of limits that an age exceeds
-    areas = areas_by_number(place, np.where(np.isnan(age_days), -1, passed), len(OLDER_DAYS) + 1)
-    assert areas is not None
-    above = areas[::-1].cumsum()[::-1][1:] / M2_PER_HECTARE
-    return {str(days): area for days, area in zip(OLDER_DAYS, above.tolist(), strict=True)}
 
 
 def changed_hectares(
@@ -211,7 +198,7 @@ def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
         or not run.plan.plain
         or run.settings.extent != EXTENT_WHOLE
         or run.settings.macs is not None
-        or ((prior := prior_map_figures(ref.path)) is not None and prior["put_aside"] is None)
+        or run.prior is not None
     ):
         return None
     names = run.described.class_names

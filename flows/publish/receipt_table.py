@@ -126,8 +126,7 @@ def format_score(receipt: Mapping[str, Any]) -> str:
 def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """Return the accuracy; after a revisit without the maps to compare, which lack the prior map."""
     accuracy = receipt.get("accuracy")
-    prior = receipt.get("prior_map")
-    if accuracy is None or prior is None or prior["put_aside"] is not None:
+    if accuracy is None or receipt.get("prior_map") is None:
         return accuracy
     return {name: value for name, value in accuracy.items() if name not in ("none", "all")}
 
@@ -311,13 +310,13 @@ _SHOWN: Mapping[str, tuple[str, str]] = {
     "pixels": ("pixels", "px_no_reading map_without_a_class"),
     "captured": ("extent", "patches_touched lines expected_wrong due_left"),
     "full network": ("kept", "patches multiply_adds"),
-    "prior map": ("prior_map", "run days shift_px turned_deg put_aside changed_px changes"),
+    "prior map": ("prior_map", "run days changed_px changes"),
     COMPARISON: ("prior_map", "agreement compared_px differing_px expected_differing_px"),
     "unknown": ("unknown", "fraction rate"),
     "expected mIoU": ("expected", "miou error not_predicted"),
     "uniform scans": ("scans", "taken best_in_time reference"),
     "classes": ("areas", "ha"),
-    "zones": ("zones", "kept_px kept_m2 no_go_px"),
+    "zones": ("zones", "kept_px kept_m2"),
     "on the ground": ("ground", "crs resolution_m changes_ha"),
 }
 _OF_POINTING = "sweeps residual_rms_px not_found too_narrow partly_seen"
@@ -337,7 +336,6 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "saturated": lambda fraction: (
         f"{format_percent(fraction)} of the spectra have saturated bands; a shorter exposure avoids them"
     ),
-    "shift_px": lambda px: f"shifted by {math.hypot(*px):.0f} px" if any(px) else "",
     "changes": lambda pairs: ", ".join(
         f"{spaced(old)} to {spaced(new)} {format_count(px)} px" for px, _, old, new in pairs[:MOST_NAMED]
     ),

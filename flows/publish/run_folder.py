@@ -6,7 +6,7 @@ The receipt counts the bytes of the survey's stores, and not those of its own fo
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -79,7 +79,7 @@ def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}", count_bytes(survey, plan, rests_on))
-        field = field_map(run, plan, shown, prior_map(run.prior, products["segment"], receipt))
+        field = field_map(run, plan, shown, prior_map(run.prior))
         page = render_report(receipt, quicklook, pictures, captured_again=again, field=field)
         draft.write_file("quicklook.png", quicklook)
         if "plots" in receipt:
@@ -120,9 +120,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str, data_bytes: Fa
         versions=versions,
         settings=asked_settings(run),
         stages=[asdict(one) for one in survey.records.values()],
-        savings=_savings(
-            run, plan, read_in_full(products["score"], products["segment"]), prior_map_figures(products["segment"].path)
-        ),
+        savings=_savings(run, plan, read_in_full(products["score"], products["segment"])),
         data_bytes=data_bytes,
         accuracy=accuracy,
         training_scene=seen_in_training(run.scene, run.described),
@@ -139,9 +137,9 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
-def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp], prior: Mapping[str, Any] | None) -> dict[str, Any]:
+def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
-    did = run.work_done(read, prior)
+    did = run.work_done(read)
     of_model = {
         "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
         "multiply_adds": {**SavingEntry(did.total, run.costs.of_map(run.kept_patches).total).as_dict(), **asdict(did)},
@@ -186,7 +184,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         class_colours=found.colours,
         truth=run.labels,
         confidence=np.ascontiguousarray(found.confidence[thinned(found.classes)]),
-        was=None if prior is None or prior["put_aside"] else ProbabilityStore(drawn).old_class(),
+        was=None if prior is None else ProbabilityStore(drawn).old_class(),
         days=0.0 if prior is None else prior["days"],
     )
 
@@ -216,14 +214,14 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
         }
     if run.chooses and (run.plan.plain or run.least_gain is not None):
-        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]), prior)
+        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]))
     if prior is not None:
         found["prior_map"] = prior
     if run.settings.extent != EXTENT_WHOLE:
         found["extent"] = {
             "lines": run.settings.extent,
             "patches_touched": len(plan.patch_index) / max(len(run.kept_patches), 1),
-            "uses_prior_map": prior is not None and prior["put_aside"] is None,
+            "uses_prior_map": prior is not None,
             **({} if run.extent is None else asdict(run.extent)),
         }
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}

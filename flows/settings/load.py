@@ -21,7 +21,6 @@ from flows.settings.survey_settings import (
     AUTO,
     BUILT_IN_SCENES,
     OF_A_CAMERA,
-    OF_A_PART,
     OF_A_VIEW,
     OF_CHOOSING,
     OF_RECORDINGS,
@@ -443,9 +442,8 @@ def _extent_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str
             f"{at('extent')} leaves sweeps out, and registration (pointing_px = {settings.pointing_px:g}) needs all "
             "of them; leave one of the two out"
         )
-    for name in OF_A_PART:
-        if getattr(settings, name) is not None and settings.extent == EXTENT_WHOLE:
-            yield f"{at(name)} is for a partial scan: give --extent part too"
+    if settings.max_age is not None and settings.extent == EXTENT_WHOLE:
+        yield f"{at('max_age')} is for a partial scan: give --extent part too"
 
 
 def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:

@@ -49,7 +49,6 @@ BUILT_IN_SCENES = BUILT_IN_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # scene in front of a rig or in a recording: only its size and bands are known
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # settings that depend on the machine of the survey
-OF_A_PART = ("max_age", "skip_below_error")  # settings of a partial scan
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white")
 USUAL_BUDGET = 0.5  # of a zoomed survey
 MOST_STEP = 8  # greatest line spacing [px]
@@ -67,7 +66,7 @@ SIM, RIG, RASTER, RECORDED = "sim", "rig", "raster", "recorded"  # values of the
 # settings and tables that only a camera has
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *UNIFORM, "scan_exposure_ms"),
-    *("coarse_exposure_ms", "budget", "zoom", "effects", "tol", "resampling", "pointing_px", "extent", *OF_A_PART),
+    *("coarse_exposure_ms", "budget", "zoom", "effects", "tol", "resampling", "pointing_px", "extent", "max_age"),
 )
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # these give the IFOV, which a [pose] needs
 
@@ -142,14 +141,6 @@ class Settings:
         0.04,
         3660,
         example=14.0,
-    )
-    skip_below_error: float | None = stated(
-        None,
-        "With --extent part: skip the visit if the prior map's expected error is lower and no place exceeds --max-age",
-        "",
-        0.001,
-        0.5,
-        example=0.02,
     )
     scene: str = stated(
         "farm",

@@ -12,7 +12,7 @@ from datetime import datetime
 from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
 from flows.settings.values import KEEP_RAW
-from flows.tasks.open_survey import OpenSurvey, RunRef
+from flows.tasks.open_survey import OpenSurvey
 from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow, prefect_context
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
@@ -20,9 +20,8 @@ from flows.tasks.stages.attention import score
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import condense_coarse, condense_fine
 from flows.tasks.stages.placement import rectify
-from pipeline.errors import IncompleteStoreError, NothingToMend
+from pipeline.errors import IncompleteStoreError
 from storage.archive.keys import StageRef
-from storage.remote.opening import open_archive
 
 OPENING = "plan"
 _opened: ContextVar[list[tuple[Settings, SurveyRun]] | None] = ContextVar("opened", default=None)
@@ -30,11 +29,10 @@ PASSES = {"coarse": capture_coarse, "fine": capture_fine}
 CONDENSED = {"coarse": condense_coarse, "fine": condense_fine}
 
 
-def plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
+def plan_capture(settings: SurveySettings) -> OpenSurvey:
     """Open scene, weights and archive, and plan the first pass; a task inside a flow.
 
-    Returns an earlier run if its expected error is low enough for the settings. Raises PipelineError: the first error,
-    before anything is captured.
+    Raises PipelineError: the first error, before anything is captured.
     """
     return as_task(_plan_capture, "plan_capture")(settings)
 
@@ -46,8 +44,8 @@ def opened_first(settings: Settings) -> Iterator[None]:
     watch(OPENING, "running", 0.0)
     try:
         run = open_run(settings)
-    except BaseException as error:
-        watch(OPENING, "opened" if isinstance(error, NothingToMend) else "failed", 1.0)
+    except BaseException:
+        watch(OPENING, "failed", 1.0)
         raise
     watch(OPENING, "opened", 1.0)
     opened = [(settings, run)]
@@ -59,19 +57,15 @@ def opened_first(settings: Settings) -> Iterator[None]:
         opened.clear()  # event loops of Zarr and Prefect keep the context in which they began
 
 
-def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
+def _plan_capture(settings: SurveySettings) -> OpenSurvey:
     observer = current_observer()
     requested = settings.settings()
     due = _due_time()
     first, run = next(iter(_opened.get() or ()), (None, None))
     if run is None or first is not requested:
-        try:
-            if due is not None:
-                requested = scene_of_visit(at_due_time(requested, due), due.astimezone())
-            run = open_run(requested)
-        except NothingToMend as known:
-            observer.log(str(known))
-            return RunRef(f"runs/{known.run}", open_archive(requested.out).root / "runs" / known.run)
+        if due is not None:
+            requested = scene_of_visit(at_due_time(requested, due), due.astimezone())
+        run = open_run(requested)
     run.archive.reclaim()  # remove incomplete stores of killed runs
     for note in run.notes:
         observer.note(note)

@@ -15,14 +15,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.field_prior_map import FieldPriorMap
 from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse_region, overview_file, seen_patches
+from flows.tasks.prior_maps import Prior
 from models.network.ood import OodDetector
 from models.network.spectral import LineSpec
 from models.policies.policies import class_errors, gain_of
 from models.reading.inference import CoarsePass, CoarsePrediction, load_overview, read_coarse_prediction, segment
 from models.reading.prior_map import (
+    ClassProbabilities,
     CurrentVisit,
+    PriorMap,
     TemporalAgreement,
     as_captured,
     changed_fractions,
@@ -30,12 +32,15 @@ from models.reading.prior_map import (
     compare,
     first_probabilities,
     fuse,
+    in_classes,
     pooled,
 )
 from models.reading.regions import Region
-from pipeline.geometry.grid import UNLABELLED, patch_pixels
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED, pad_by_reflection, patch_pixels
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import (
+    ProbabilityStore,
     packed_probabilities,
     write_changes_tile,
     write_class_tile,
@@ -57,7 +62,7 @@ class Drawing:
     mosaic: StageRef
     attention: StageRef  # whose ranks say which patches are read in detail
     capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
-    prior_map: FieldPriorMap | None = None  # prior map of the field
+    prior: Prior | None = None  # prior map of the field
     left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # whether the scan covers a part of the field; the rest is that of the prior map
@@ -66,7 +71,7 @@ class Drawing:
     @property
     def inputs(self) -> list[StageRef]:
         """Return the stores that workers read."""
-        return [self.mosaic, self.attention, *(() if self.prior_map is None else self.prior_map.inputs)]
+        return [self.mosaic, self.attention, *(() if self.prior is None else self.prior.stores)]
 
     @property
     def chosen(self) -> NDArray[np.int64]:
@@ -102,12 +107,12 @@ class Drawing:
         classes, confidence = drawn.classes, drawn.confidence
         comparison = None
         old = None
-        if self.prior_map is None:
+        if self.prior is None:
             after = first_probabilities(observation)
             if not shown.all():
                 classes, confidence = after.classes()
         else:
-            local = self.prior_map.of(region, weights)
+            local = prior_map_of(self.prior, region, weights)
             after = fuse(local, observation, self.weights.load_reader())
             if unknown is not None:  # the classes say nothing of them
                 after.log_probability[unknown], after.light[unknown] = np.nan, 0
@@ -144,7 +149,7 @@ class Drawing:
             here = seen.capture.where(spec)
             own_light[... if here is None else here] = spec.light / spec.step**2
         light, step, _ = seen.capture.usual
-        coarse = seen.columns[:0] if self.prior_map is None else pooled(seen.seen_columns)
+        coarse = seen.columns[:0] if self.prior is None else pooled(seen.seen_columns)
         return CurrentVisit(log_probability, shown, coarse, light, int(step), own_light[: len(shown), : shown.shape[1]])
 
     def _shown(self, region: Region, mosaic: Mosaic) -> NDArray[np.bool_]:
@@ -163,6 +168,18 @@ class Drawing:
         reached &= reached.mean(axis=(1, 2), keepdims=True) >= enough
         pixels = reached.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
         return np.ascontiguousarray(pixels[: region.grid.height, : region.grid.width])
+
+
+def prior_map_of(prior: Prior, region: Region, weights: Weights) -> PriorMap:
+    """Read the prior map of a region, in the classes of the weights."""
+    store = ProbabilityStore(prior.probabilities.path / PROBABILITIES)
+    values, age, light = store.read(region.read.rows, region.read.columns)
+    if prior.classes != tuple(range(values.shape[-1])):
+        values = in_classes(values, prior.classes)
+    height, width = region.read.shape
+    columns = coarse_region(weights, prior.mosaic, region, LineSpec()).seen_columns[:height, :width]
+    whole = np.asarray(pad_by_reflection(columns, region.grid.padded_shape), np.float32)
+    return PriorMap(ClassProbabilities(values, age, light), pooled(whole), prior.days, prior.day_of_year)
 
 
 @dataclass(frozen=True)

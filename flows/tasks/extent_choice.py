@@ -16,7 +16,7 @@ from flows.terminal.figures import format_percent
 from models.reading.expected_errors import Floats, PatchExpectedErrors
 from models.reading.prior_map import COME_TRUE, EVERY_PX, HALO, ClassProbabilities, PriorMap, carried, in_classes
 from models.weights.files import Description, load_reader
-from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
+from pipeline.errors import BudgetError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid, cuts
 from pipeline.planning.coverage import patches_shown
 from pipeline.planning.partial_scans import (
@@ -80,14 +80,12 @@ def choose_extent(
     *,
     seconds: float,
     max_age: float | None,
-    skip_below_error: float | None,
     left_out: Mask | None = None,
 ) -> tuple[PassLayout, ExtentChoice, str]:
     """Choose the lines of a partial scan within a time; return their layout, the choice, and a sentence.
 
     Patches that would become older than ``max_age`` days come first. Pixels of ``left_out`` (y, x) are not of interest:
-    they lie outside of zones or have no data. Raises NothingToMend: the expected error of the prior map is below
-    ``skip_below_error``, and no patch is too old; WeightsError: the weights have no scan performance table;
+    they lie outside of zones or have no data. Raises WeightsError: the weights have no scan performance table;
     BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
     """
     content = weights.record.get("scans")
@@ -112,12 +110,6 @@ def choose_extent(
     record = ScanPerformance.read(content, light_fraction)
     extent_gains = ExtentGains(record, weights.class_names, expected_errors, available & due, available)
     wrong = expected_errors.expected_wrong()
-    if skip_below_error is not None and wrong < skip_below_error and not extent_gains.due.any():
-        raise NothingToMend(
-            prior.run,
-            f"nothing is captured: the prior map's expected error is {format_percent(wrong)}, below "
-            f"--skip-below-error {skip_below_error:g}; the map of {prior.run} remains",
-        )
     free = replace(layout, recorded=None)
     step, exposure_ms, extent = _best_extent(free, extent_gains, seconds)
     captured = patches_shown(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +14,8 @@ from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.ground.georeference import shift_px
+from pipeline.ground.georeference import OFF_GRID_PX, shift_px
+from pipeline.lazy import GeoBox
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive, run_stem
@@ -27,24 +27,13 @@ from storage.arrays.georeference import load_geobox
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
-REACH_PX = 64.0  # greatest shift of a prior map that is found
-MOST_EARLIER = 12  # earlier visits that show a field which was captured in parts
 PROBABILITIES = "class_probabilities"  # a product of runs
 _WITH_TIME = re.compile(r"\s*[\dW-]+[^\d-]\d\d")  # a date and an hour, in ISO 8601
 PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
-TURNED, ANOTHER_FIELD = "turned", "another field"  # reasons to put a prior map aside
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
     *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),
 )
-
-
-@dataclass(frozen=True)
-class EarlierRun:
-    """Coarse view of a field by an earlier run."""
-
-    mosaic: StageRef
-    shift_px: tuple[int, int] = (0, 0)  # (down, right) to the newest visit
 
 
 @dataclass(frozen=True)
@@ -53,7 +42,7 @@ class Prior:
 
     run: str
     probabilities: StageRef  # the store with class_probabilities.zarr
-    scan_passes: tuple[EarlierRun, ...]  # that run, then visits of what it did not capture, the newest first
+    mosaic: StageRef  # of that run
     days: float  # between that visit and this one
     day_of_year: float | None  # of this visit; None if it is unknown
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
@@ -61,7 +50,7 @@ class Prior:
     @property
     def stores(self) -> list[StageRef]:
         """Return the stores of earlier runs that a visit reads."""
-        return [self.probabilities, *(one.mosaic for one in self.scan_passes)]
+        return [self.probabilities, self.mosaic]
 
 
 def find_prior(
@@ -142,14 +131,8 @@ def _usable(
         before = load_geobox(probabilities.path / "class_map.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
-    if store.shape != (grid.height, grid.width):
-        return f"it has {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
-    if before is not None and scene.geobox is not None:
-        shift = shift_px(scene.geobox, before) if before.crs == scene.geobox.crs else None
-        if shift is None:
-            return "it has another coordinate system, pixel size or direction than this scene"
-        if math.hypot(*shift) > REACH_PX:
-            return f"it shows another place: its corner lies {math.hypot(*shift):.0f} px from that of this scene"
+    if (why := _off_grid(store.shape, before, grid, scene)) is not None:
+        return f"it has another grid than this field: {why}"
     if any(run.settings["camera"][part] != getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")):
         return "its camera has another pitch or focal length"
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
@@ -158,36 +141,23 @@ def _usable(
     days = _days_since(run, settings.visit, settings.moment)
     if days < 0:
         return f"it was captured {-days:.3g} days after this visit"
-    earlier = (EarlierRun(mosaic), *_earlier_runs(archive, run))
     day = None if settings.moment is None else float(settings.moment[0])
     if (called := moment_of(settings.visit)) is not None:
         day = float(called.timetuple().tm_yday)
-    return Prior(run.folder.name, probabilities, earlier, days, day, classes)
+    return Prior(run.folder.name, probabilities, mosaic, days, day, classes)
 
 
-def _earlier_runs(archive: Archive, run: Run) -> Iterator[EarlierRun]:
-    """Yield the earlier visits of a run that captured a part of the field, with their shifts."""
-    down, across = 0, 0
-    for _ in range(MOST_EARLIER - 1):
-        figures = run.receipt.get("prior_map")
-        if (
-            run.settings.get("extent", EXTENT_WHOLE) == EXTENT_WHOLE
-            or figures is None
-            or figures["put_aside"] is not None
-        ):
-            return
-        down, across = (sum(both) for both in zip((down, across), figures["shift_px"], strict=True))
-        run = read_run(archive.root / "runs" / figures["run"])
-        parts = run.products.get("mosaic", "").split("/")
-        if run.problem is not None or len(parts) < 3:
-            return
-        try:
-            mosaic = archive.find(parts[1], parts[2])
-        except IncompleteStoreError:
-            return
-        if mosaic is None:
-            return
-        yield EarlierRun(mosaic, (down, across))
+def _off_grid(shape: tuple[int, int], before: GeoBox | None, grid: SceneGrid, scene: RasterScene) -> str | None:
+    """Return the difference of a map's grid from that of the field; None for the same grid."""
+    if shape != (grid.height, grid.width):
+        return f"{shape[1]} x {shape[0]} px and not {grid.width} x {grid.height}"
+    if before is None or scene.geobox is None:
+        return None
+    shift = shift_px(scene.geobox, before) if before.crs == scene.geobox.crs else None
+    if shift is None:
+        return "another coordinate system, pixel size or direction"
+    off = max(map(abs, shift))
+    return f"its corner lies {off:.3g} px away" if off > OFF_GRID_PX else None
 
 
 def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
@@ -21,7 +20,7 @@ from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
 from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
-from flows.tasks.prior_maps import ANOTHER_FIELD, AUTO, NONE, TURNED, Prior, find_prior
+from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
 from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scene import (
     FieldSource,
@@ -51,7 +50,7 @@ from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
 from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
 from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NothingToMend, SceneError, SettingsError, WeightsError
+from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -309,32 +308,21 @@ class SurveyRun(CaptureRun):
         assert isinstance(self.zones.place, PosedField)
         return self.zones.place.grid
 
-    def work_done(self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None) -> MultiplyAdds:
-        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used.
-
-        ``prior`` are the figures of the prior map. One of another field is put aside, and the map drawn again.
-        """
-        aside = None if prior is None else prior["put_aside"]
+    def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
+        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used."""
         done = self.costs.of_map(patch_index)
-        scored = self.least_gain is not None and self.plan.plain  # while drawn, which reads the overview once
-        if scored:
+        if self.least_gain is not None and self.plan.plain:  # while drawn, which reads the overview once
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
             done = self.costs.with_scores(patch_index, self.settings.policy)
-        if prior is not None and aside == ANOTHER_FIELD:
-            every = self.costs.of_map(self.kept_patches)
-            before = every.detail * prior["patches_read"] // max(len(self.kept_patches), 1)
-            done = MultiplyAdds(done.overview + every.overview, done.score * (2 if scored else 1), done.detail + before)
         if self.prior is None or self.reader is None:
             return done
-        pixels = (aside != TURNED) * self.grid.height * self.grid.width
+        pixels = self.grid.height * self.grid.width
         if self.extent is not None:  # its lines were chosen by the prior map
             pixels += -(-self.grid.height // EVERY_PX) * -(-self.grid.width // EVERY_PX)
         return replace(done, detail=done.detail + self.reader.sizes.multiply_adds(pixels))
 
-    def reading_figures(
-        self, patch_index: NDArray[np.integer], prior: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
+    def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings = self.settings
         everything = self.kept_patches
@@ -343,7 +331,7 @@ class SurveyRun(CaptureRun):
             "patches": len(patch_index),
             "of_patches": len(everything),
             "multiply_adds": {
-                "done": self.work_done(patch_index, prior).total,
+                "done": self.work_done(patch_index).total,
                 "everything": self.costs.of_map(everything).total,
             },
         }
@@ -369,8 +357,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     """Open and check everything that a survey needs; the archive last, so that bad input creates none.
 
     With ``planning``, no pixels are drawn, and a scene that exceeds the memory is no error but ``refused`` of the run.
-    ``archive`` is that of the settings by default. Raises PipelineError: the first error; NothingToMend: the expected
-    error of the prior map is low enough.
+    ``archive`` is that of the settings by default. Raises PipelineError: the first error.
     """
     settings = scene_of_visit(for_rig(settings), datetime.now().astimezone())
     check_scene_there(settings.scene)
@@ -398,7 +385,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     planned = _PlannedCapture(settings)
     if pixels is None:
         prior = None if found is None else found[0]
-        planned = _plan_capture(settings, scene, zones, model.path, described, prior, passes, planning=planning)
+        planned = _plan_capture(settings, scene, zones, model.path, described, prior, passes)
     settings = planned.settings
     # a plan assumes `SMOOTH` components; most mosaics have 11 to 33
     costs = ReadingCosts(described.config, grid, min(len(scene.wavelength_nm), SMOOTH))
@@ -499,34 +486,28 @@ def _plan_capture(
     described: Description,
     prior: Prior | None,
     passes: RecordedPasses | None,
-    *,
-    planning: bool,
 ) -> _PlannedCapture:
     """Choose the extent, then the uniform scan or two passes, for the weights of the file ``path``.
 
-    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise. With ``planning``, a visit that a
-    survey would skip has a note.
+    Raises what `choose_extent`, `choose_uniform_scan` and `lay_out_passes` raise.
     """
     extent = None
     extent_notes: tuple[str, ...] = ()
     is_part = settings.extent == EXTENT_PART
     if is_part and prior is None:
-        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None, skip_below_error=None)
+        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None)
         extent_notes = ("there is no prior map: the whole field is captured",)
     shown = None if zones.kept is None else zones.shown_patches
     layout = PassLayout.of(settings, zones.grid, shown, passes)
     if is_part and prior is not None:
-        limits: dict[str, Any] = {"max_age": settings.max_age, "skip_below_error": settings.skip_below_error}
         masks = [one for one in (zones.left_out, scene.missing) if one is not None]
-        limits |= {"seconds": settings.seconds, "left_out": np.logical_or.reduce(masks) if masks else None}
-        given = (layout, prior, described, path, settings.sky.fraction_of_clear)
-        try:
-            layout, extent, note = choose_extent(*given, **limits)
-        except NothingToMend as known:
-            if not planning:
-                raise
-            layout, extent, note = choose_extent(*given, **limits | {"skip_below_error": None})
-            note = f"a survey would skip this visit: {str(known).removeprefix('nothing is captured: ')}; else it {note}"
+        assert settings.seconds is not None
+        layout, extent, note = choose_extent(
+            *(layout, prior, described, path, settings.sky.fraction_of_clear),
+            seconds=settings.seconds,
+            max_age=settings.max_age,
+            left_out=np.logical_or.reduce(masks) if masks else None,
+        )
         extent_notes = (note,)
     scans = choose_uniform_scan(layout, described, path, len(scene.wavelength_nm), settings)
     plan, scans, settings, plan_notes = lay_out_passes(layout, scans, described, settings)

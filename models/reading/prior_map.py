@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.evaluation.expected_scores import expected_counts
-from models.evaluation.metrics import confusion, kappa, overall_accuracy
+from models.evaluation.metrics import confusion, overall_accuracy
 from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.lazy import Tensor, torch
@@ -35,7 +35,6 @@ ERRORS_BEYOND = 2.0  # standard errors above the expected difference of two maps
 ROWS = 128  # fused at a time
 DAYS_A_YEAR = 365.25
 HALO = 5 * CELL_PX  # reach of the reader around a pixel, three coarse pixels and 3 px, in whole coarse pixels
-LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # below both a prior map is of another field
 Floats = NDArray[np.float32]
 
 
@@ -291,11 +290,6 @@ class TemporalAgreement:
     def agreement(self) -> float:
         """Return the fraction of pixels with equal classes in prior map and visit; NaN without a pixel."""
         return overall_accuracy(self.observation)
-
-    @property
-    def is_of_another_field(self) -> bool:
-        """Return whether prior map and visit agree no better than two different fields."""
-        return self.agreement < LEAST_AGREEMENT and kappa(self.observation) < LEAST_KAPPA  # NaN is not
 
 
 def compare(

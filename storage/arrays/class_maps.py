@@ -24,7 +24,6 @@ from storage.arrays.layout import (
     SHARD_ROWS,
     array_of,
     create_array,
-    damage_named,
     image_spec,
     open_group,
     read_array,
@@ -215,12 +214,6 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
     Raises IncompleteStoreError: the store is missing, or is of a first visit.
     """
     array_of(open_group(path, "r+"), OLD_CLASS)[tile_place(origin, old_class.shape)] = old_class
-
-
-def drop_changes(path: Path) -> None:
-    """Remove the previous classes from stored class probabilities."""
-    with damage_named(str(path)):
-        del open_group(path, "r+")[OLD_CLASS]
 
 
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:

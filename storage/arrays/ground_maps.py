@@ -78,7 +78,7 @@ def open_image(path: Path, name: str) -> StoredImage:
 
 @dataclass(frozen=True)
 class GroundMap:
-    """A stored map in memory, without its ages, confidence and changes."""
+    """A stored map in memory, without its confidence and changes."""
 
     classes: NDArray[np.uint8]  # (y, x) index into the legend's names, 255 = none or not seen
     picture: NDArray[np.uint8]  # (y, x, 3) red green blue, 0 where not seen
@@ -103,7 +103,6 @@ class GroundMapWriter:
             "classes": ("|u1", class_flags(legend.names, legend.colours)),
             "confidence": ("<f4", CONFIDENCE),
             PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
-            "age": ("<f4", {"long_name": "time since the pixel was looked at", "units": "days"}),
         }
         if goes_on:
             images |= {"changed": ("<f4", CHANGED), OLD_CLASS: ("|u1", old_class_flags(legend))}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, UnknownRule, draw_field
-from flows.tasks.field_prior_map import FieldPriorMap, prior_map_lies, whole_pixels
 from flows.tasks.field_work import region_params
-from flows.tasks.prior_maps import ANOTHER_FIELD, PRIOR_FIGURES, TURNED, Prior
+from flows.tasks.prior_maps import PRIOR_FIGURES, Prior
 from flows.tasks.stage import Product, Report, Wanted, stage
 from flows.tasks.stages.attention import READING, PatchGains
 from models.reading.prior_map import TemporalAgreement, changed_fractions
 from models.weights.files import ReaderPart
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import PosedField, areas_by_number
 from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
-from pipeline.rectify.registration.alignment import FieldShift
 from storage.archive.keys import StageRef
 from storage.archive.manifests import write_table
 from storage.arrays.class_maps import (
@@ -31,7 +29,6 @@ from storage.arrays.class_maps import (
     ProbabilityStore,
     create_class_map,
     create_probabilities,
-    drop_changes,
     load_class_map,
     with_unknown,
     write_changes,
@@ -42,7 +39,6 @@ from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic
 
 CLASS_MAP = Product("segment", version=26, files=(MAP, PROBABILITIES), by_weights=True)
 OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
-MOST_TURN_PX = 12.0  # greatest offset of the corners by rotation, at which a prior map is used
 
 
 @stage("segment", "class map", CLASS_MAP)
@@ -67,19 +63,12 @@ def segment(
     work = gains.work
 
     def build(path: Path) -> None:
-        """Write class map and class probabilities; again without the prior map if it does not agree."""
-        lies = FieldShift() if prior is None else prior_map_lies(prior.scan_passes, mosaic)
-        stored = None if prior is None else field_prior_map(prior, lies, grid)
-        names = create_maps(path, gains, unknown, goes_on=stored is not None)
-        drawing = Drawing(work.weights, mosaic, attention, gains.capture, stored, gains.zones.left_out, unknown, part)
+        """Write class map and class probabilities, and the figures of the prior map."""
+        names = create_maps(path, gains, unknown, goes_on=prior is not None)
+        drawing = Drawing(work.weights, mosaic, attention, gains.capture, prior, gains.zones.left_out, unknown, part)
         drawn = draw_field(work, drawing, path, least_gain, report)
-        if prior is not None:
-            figures = _prior_map_figures(prior, reader, names, lies, drawn.comparison)
-            before = drawing.chosen if drawn.reading is None else np.flatnonzero(drawn.reading.read)
-            write_table(path / PRIOR_FIGURES, figures | {"patches_read": len(before)})
-            if figures["put_aside"] is not None and drawn.comparison is not None:
-                drop_changes(path / PROBABILITIES)
-                drawn = draw_field(work, replace(drawing, prior_map=None), path, least_gain, report)
+        if prior is not None and drawn.comparison is not None:
+            write_table(path / PRIOR_FIGURES, _prior_map_figures(prior, reader, names, drawn.comparison))
         if drawn.reading is not None:
             write_attention(path / READING, attention_of(drawn.reading, gains.policy))
         if drawn.unread_px:
@@ -91,7 +80,6 @@ def segment(
     params["least_gain"] = least_gain
     if prior is not None:
         params |= {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
-        params["shifts"] = [list(one.shift_px) for one in prior.scan_passes]
         params["reader"] = None if reader is None else reader.key
     return Wanted(build, params, [mosaic, attention, *([] if prior is None else prior.stores)])
 
@@ -129,69 +117,46 @@ def attention_of(reading: FullReading, policy: str) -> Attention:
     return Attention(reading.gain, rank.reshape(reading.gain.shape), policy, reading.changed)
 
 
-def field_prior_map(prior: Prior, lies: FieldShift, grid: SceneGrid) -> FieldPriorMap | None:
-    """Return the prior map with its shift; None where the field is rotated too far."""
-    if lies.edge_px((grid.height, grid.width)) > MOST_TURN_PX:
-        return None
-    last = prior.scan_passes[0].mosaic
-    return FieldPriorMap(prior.probabilities, last, prior.days, prior.day_of_year, prior.classes, whole_pixels(lies))
-
-
 def _prior_map_figures(
-    prior: Prior,
-    reader: ReaderPart | None,
-    names: Sequence[str],
-    lies: FieldShift,
-    comparison: TemporalAgreement | None,
+    prior: Prior, reader: ReaderPart | None, names: Sequence[str], comparison: TemporalAgreement
 ) -> dict[str, Any]:
     """Return the figures of a prior map: agreement with this visit, and pixels that changed from class to class.
 
     Changed pixels exceed the expected difference of two maps of the same ground; all differing pixels are counted too.
-    One that is put aside has no counts but the compared pixels.
     """
-    put_aside = TURNED if comparison is None else ANOTHER_FIELD if comparison.is_of_another_field else None
-    counts: dict[str, int | None] = dict.fromkeys(("differing_px", "expected_differing_px", "changed_px"))
-    compared = 0 if comparison is None else int(comparison.changed.sum())
-    pairs: list[tuple[int, int, str, str]] = []
-    if comparison is not None and put_aside is None:
-        beyond = comparison.beyond
-        pairs = [
-            (int(beyond[old, new]), int(comparison.changed[old, new]), names[old], names[new])
-            for old, new in np.argwhere(beyond)
-        ]
-        counts["differing_px"] = compared - int(np.trace(comparison.changed))
-        counts["expected_differing_px"] = round(float(comparison.expected.sum() - np.trace(comparison.expected)))
-        counts["changed_px"] = sum(one for one, _, _, _ in pairs)
+    beyond = comparison.beyond
+    pairs = [
+        (int(beyond[old, new]), int(comparison.changed[old, new]), names[old], names[new])
+        for old, new in np.argwhere(beyond)
+    ]
+    compared = int(comparison.changed.sum())
     return {
         "run": prior.run,
         "days": prior.days,
         "reader": "none" if reader is None else reader.key,
-        "agreement": None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement,
-        "put_aside": put_aside,
-        "shift_px": list(whole_pixels(lies)),
-        "turned_deg": lies.turned_deg,
+        "agreement": None if np.isnan(comparison.agreement) else comparison.agreement,
         "compared_px": compared,
-        **counts,
+        "differing_px": compared - int(np.trace(comparison.changed)),
+        "expected_differing_px": round(float(comparison.expected.sum() - np.trace(comparison.expected))),
+        "changed_px": sum(one for one, _, _, _ in pairs),
         "changes": [list(pair) for pair in sorted(pairs, reverse=True)],
     }
 
 
 STORE = "ground_map.zarr"
-GROUND = Product("ground", version=5, files=(STORE,))
+GROUND = Product("ground", version=7, files=(STORE,))
 
 
 @stage("ground", "map in a projected CRS", GROUND)
 def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, report: Report) -> Wanted:
-    """Project class map, ages, changes and picture to the ground, by the pose of the rig."""
+    """Project class map, changes and picture to the ground, by the pose of the rig."""
 
     def build(path: Path) -> None:
         """Write the map in blocks, then the area of each class."""
         found = load_class_map(class_map.path / "class_map.zarr")
-        probabilities = ProbabilityStore(class_map.path / "class_probabilities.zarr")
+        changes = ProbabilityStore(class_map.path / "class_probabilities.zarr").changes()
         colours = colours_of(mosaic)
         unsure = np.isnan(found.confidence)
-        age_days = probabilities.age()
-        changes = probabilities.changes()
 
         def shown(pixels: NDArray[np.float64]) -> dict[str, NDArray[np.generic]]:
             """Return the images of a block by name, at places (row, column, 2); nodata is 255, NaN and 0.
@@ -204,7 +169,6 @@ def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, re
                 "classes": nearest_at(found.classes, pixels, UNLABELLED),
                 "confidence": confidence,
                 "picture": np.nan_to_num(np.rint(image_at(colours, pixels))).astype(np.uint8),
-                "age": nearest_at(age_days, pixels, np.nan),
             }
             if changes is not None:
                 images["changed"] = nearest_at(changes.fraction, pixels, np.nan, factor=changes.patch_px)

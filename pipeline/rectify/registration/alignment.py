@@ -1,15 +1,9 @@
-"""Find shifts between images, and correct sweeps, by least squares over their overlaps, and whole fields by them.
-
-The shift and rotation of a field since an earlier visit come from windows of two coarse images. Crops grow, shadows
-move and leaves fall between two visits, so single windows may be wrong. The result is what most windows agree on.
-"""
+"""Find shifts between images, and correct sweeps, by least squares over their overlaps."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
 from typing import Literal
 
 import numpy as np
@@ -21,7 +15,6 @@ from pipeline.rectify.kernels import kernel_taps
 
 Status = Literal["found", "undecidable", "flat", "empty"]
 Floats = NDArray[np.float64]
-Pairs = list[tuple[Floats, Floats]]  # middle of a window, and its shift
 
 LEAST_FRACTION = 0.25  # of the largest common area; below it a chance correlation can exceed that of the true shift
 LEAST_SIDE_PX = 12  # of the pixels compared
@@ -49,15 +42,6 @@ OUTLIER_ERRORS = 2.0  # the influence of a window is limited beyond
 WRONG_ERRORS = 10.0  # a window is left out beyond
 DRIFT_PRIOR_PX = 10.0  # over half a sweep; separates drift from offset if there is one window alone
 OFFSET_PRIOR_PX = 1e4  # affects only the mean of sweeps that are not tied to the reference
-WINDOWS = 3  # along either side of a field
-LEAST_WINDOW_PX = 24  # on a side; a smaller field is one window
-WINDOW_REACH_PX = 8.0  # largest difference of a window's shift from that of the field
-AGREE_PX, LOOSELY_PX = 0.5, 1.5  # largest differences of windows that agree, and agree loosely
-LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # least loose estimates that count: growth causes smaller ones
-TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # rotations that are tried if windows show nothing without one
-LEAST_WINDOWS = 4  # that have to agree
-LEAST_AGREEING = 0.6  # fraction of all windows that has to agree
-TRIALS = 200
 
 
 @dataclass(frozen=True)
@@ -393,79 +377,3 @@ def _robust(system: Floats, measured: Floats, error: Floats) -> Floats:
         lambda x: whole @ x - wanted, start, jac=lambda x: whole, loss="soft_l1", f_scale=OUTLIER_ERRORS, method="trf"
     )
     return np.asarray(solved.x)
-
-
-@dataclass(frozen=True)
-class FieldShift:
-    """Motion of an earlier image to a later one: ``shift`` rows and columns [px], then a rotation about the middle."""
-
-    shift: tuple[float, float] = (0.0, 0.0)
-    turned_deg: float = 0.0
-
-    def edge_px(self, shape: tuple[int, ...]) -> float:
-        """Return how far the corners of a field of (y, x) ``shape`` move by the rotation alone."""
-        return math.radians(abs(self.turned_deg)) * math.hypot(*shape[:2]) / 2
-
-
-def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reach_px: float) -> FieldShift:
-    """Find the motion of ``before`` onto ``now``, two (y, x) broad-band images of one field with NaN for no value.
-
-    Offsets are searched up to ``reach_px``. The result is no motion if the windows do not agree: for fields without
-    texture, or with changes everywhere.
-    """
-    divided = min(now.shape) >= WINDOWS * LEAST_WINDOW_PX
-    there = _of_windows(now, before) if divided else []
-    count, lies = _agreed(there, np.zeros(2), now.shape, AGREE_PX)
-    if count == WINDOWS**2:  # no other start can convince more windows
-        return lies
-    whole = pair_shift(now, before, prior_px=reach_px)
-    if not divided:
-        return FieldShift((float(whole.shift[0]), float(whole.shift[1]))) if whole.status == "found" else FieldShift()
-    start = np.rint(whole.shift) if whole.status == "found" else np.zeros(2)
-    found = _of_windows(now, scipy.ndimage.shift(before, start, order=0, cval=np.nan)) if start.any() else []
-    for within in (AGREE_PX, LOOSELY_PX):
-        both = (_agreed(pairs, at, now.shape, within) for pairs, at in ((there, np.zeros(2)), (found, start)))
-        count, lies = max(both, key=lambda one: one[0])
-        far = math.hypot(*lies.shift) >= LOOSE_SHIFT_PX or lies.edge_px(now.shape) >= LOOSE_EDGE_PX
-        if count:
-            return lies if far or within == AGREE_PX else FieldShift()
-    for turn in TRIED_DEG:
-        turned = scipy.ndimage.rotate(before, turn, reshape=False, order=1, cval=np.nan)
-        count, lies = _agreed(_of_windows(now, turned), np.zeros(2), now.shape, LOOSELY_PX)
-        if count:
-            return replace(lies, turned_deg=lies.turned_deg + turn)
-    return FieldShift()
-
-
-def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pairs:
-    """Return the middles and shifts of the windows with a shift."""
-    edges = [np.linspace(0, size, WINDOWS + 1).astype(int).tolist() for size in now.shape]
-    pairs: Pairs = []
-    for (top, bottom), (left, right) in product(pairwise(edges[0]), pairwise(edges[1])):
-        window = np.s_[top:bottom, left:right]
-        found = pair_shift(now[window], before[window], prior_px=WINDOW_REACH_PX)
-        if found.status == "found":
-            pairs.append((np.array([(top + bottom) / 2, (left + right) / 2]), found.shift))
-    return pairs
-
-
-def _agreed(
-    pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...], within_px: float
-) -> tuple[int, FieldShift]:
-    """Return how many windows agree, and on which motion; 0 and no motion if too few do."""
-    if len(pairs) < LEAST_WINDOWS:
-        return 0, FieldShift()
-    places = np.array([place for place, _ in pairs]) - np.array(shape[:2]) / 2
-    model, inliers = skimage.measure.ransac(  # type: ignore[no-untyped-call]
-        (places, places + np.array([shift for _, shift in pairs])),
-        skimage.transform.EuclideanTransform,
-        min_samples=2,
-        residual_threshold=within_px,
-        max_trials=TRIALS,
-        rng=0,
-    )
-    count = 0 if inliers is None else int(inliers.sum())
-    if model is None or count < max(LEAST_WINDOWS, LEAST_AGREEING * len(pairs)):
-        return 0, FieldShift()
-    down, across = (model.translation + start).tolist()
-    return count, FieldShift((float(down), float(across)), math.degrees(model.rotation))

@@ -1,4 +1,4 @@
-"""Exports of a field with a prior map: ages and changes, on field pixels and on the ground, by other readers."""
+"""Exports of a field with a prior map: changes, on field pixels and on the ground, by other readers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.storage.readers.test_label_grids import write
 
 SHAPE = (96, 128)
 PATCH = 8
-MEMORY = ("age", "changed", "changed_from")
+MEMORY = ("changed", "changed_from")
 VISITS = ("2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z")
 
 
@@ -68,25 +68,19 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     ]
 
 
-def test_a_first_visit_exports_ages_alone(visited: list[Exported]) -> None:
-    """All valid pixels have age 0, and there are no images of changes."""
-    assert set(MEMORY) & set(visited[0].answer["files"]) == {"age"}
-    found = visited[0].image("age")
-    assert set(np.unique(found[np.isfinite(found)]).tolist()) == {0.0}
+def test_a_first_visit_exports_no_changes(visited: list[Exported]) -> None:
+    """There are no images of changes."""
+    assert not set(MEMORY) & set(visited[0].answer["files"])
 
 
 def test_images_have_the_values_of_the_store(visited: list[Exported]) -> None:
-    """Ages are in days, NaN where unknown; old classes have names; all images are cloud-optimised."""
+    """Old classes have names; all images are cloud-optimised."""
     later = visited[1]
     store = later.store("ground_map" if "ground_map" in later.receipt["products"] else "class_probabilities")
     for key in MEMORY:
         assert is_cog(later.file(key))
         np.testing.assert_array_equal(later.image(key), store[key].values)
-    assert {0.0, 3.0} == set(np.unique(store["age"].values[np.isfinite(store["age"].values)]).tolist())
     assert (store["changed_from"].values != 255).any()
-    with rasterio.open(later.file("age")) as file:
-        assert np.isnan(file.nodata)
-        assert file.dtypes == ("float32",)
     with rasterio.open(later.file("changed_from")) as file:
         names = store.attrs["class_names"]
         assert [file.tags(1)[f"CLASS_{number}"] for number in range(len(names))] == names
@@ -99,7 +93,7 @@ def test_images_have_the_grid_of_the_class_map(visited: list[Exported]) -> None:
         with rasterio.open(visited[1].file(key)) as file:
             grids[key] = file.crs, file.transform, file.shape
     crs, transform, shape = grids["class_map"]
-    assert grids["age"] == grids["changed_from"] == grids["class_map"]
+    assert grids["changed_from"] == grids["class_map"]
     size = PATCH if shape == SHAPE else 1
     there = rasterio.Affine(*(number * (size if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
     assert grids["changed"][0] == crs
@@ -107,15 +101,14 @@ def test_images_have_the_grid_of_the_class_map(visited: list[Exported]) -> None:
 
 
 def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
-    """With a place they are the area of changed or old pixels, as plain xarray reads them."""
+    """With a place they are the area of changed pixels, as plain xarray reads them."""
     first, later = (run.receipt for run in visited)
     assert "changes_ha" not in first["ground"]
-    assert set(first["ground"]["older_ha"].values()) == {0.0}
     posed = "ground_map" in later["products"]
     store = visited[1].store("ground_map" if posed else "class_probabilities")
     pixel_ha = store.attrs["spatial:transform"][0] ** 2 / 1e4
     slack = 0.05 if posed else 1e-3  # footprints' borders
-    changes, older = later["ground"]["changes_ha"], later["ground"]["older_ha"]
+    changes = later["ground"]["changes_ha"]
     names = store.attrs["class_names"]
     drawn = visited[1].store("ground_map" if posed else "class_map")["classes"].values
     there = store["changed_from"].values.astype(int) * 1000 + drawn
@@ -125,8 +118,5 @@ def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:
     }  # beyond the difference of two maps of the same ground
     assert wanted
     assert {(old, new): area for area, old, new in changes} == pytest.approx(wanted, rel=slack)
-    assert older["1"] == pytest.approx((store["age"].values > 1).sum() * pixel_ha, rel=slack)
-    assert older["7"] == 0
     page = (visited[1].archive / "runs" / visited[1].id / "report.html").read_text(encoding="utf-8")
-    assert re.search("changed [0-9.]+ .*: class \\d to class \\d", page)
-    assert "captured longer ago than 1 day" in page
+    assert re.search(r"class \d to class \d [0-9.]+", page)

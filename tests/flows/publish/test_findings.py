@@ -1,4 +1,4 @@
-"""Findings of a run: changes and ages on the ground, and the score that a map expects of itself."""
+"""Findings of a run: changes on the ground, and the score that a map expects of itself."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.publish.findings import changed_hectares, older_hectares
+from flows.publish.findings import changed_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.weights.files import MAP_SCORES
@@ -27,13 +27,6 @@ BIAS = np.array([-0.4, 0.1, 0.0])
 SCORES = MapScores((1,), (50.0, 100.0), np.stack([[0 * BIAS, BIAS]]), np.array([[0.02, 0.01]]), 4)
 
 
-def test_older_hectares_exclude_the_exact_age() -> None:
-    """A pixel of exactly 1 or 7 days is not older than that; pixels without an age do not count."""
-    age = np.array([[0.0, 1.0, 1.125, 7.0], [7.125, 30.0, 400.0, np.nan]], np.float32)
-    found = older_hectares(PLACE, age)
-    np.testing.assert_allclose([found[days] for days in ("1", "7", "30")], [0.05, 0.03, 0.01])
-
-
 def test_changed_hectares_are_listed_by_pair_of_classes() -> None:
     """Largest ones come first, scaled by the part beyond chance; pixels without a class today are left out."""
     now = np.array([[0, 0, 1, 1], [2, UNLABELLED, 2, 2]], np.uint8)
@@ -45,8 +38,8 @@ def test_changed_hectares_are_listed_by_pair_of_classes() -> None:
     assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
 
 
-def test_findings_have_hectares_changes_and_ages() -> None:
-    """Classes of no area are left out; changes name both classes, and ages have hectares."""
+def test_findings_have_hectares_and_changes() -> None:
+    """Classes of no area are left out; changes name both classes."""
     areas = {"px": {"bare_soil": 30}, "ha": {"bare_soil": 0.3, "crop": 0.1, "weed": 0.0}}
     assert finding_rows({"areas": areas}) == [("classes", "bare soil 0.3 ha, crop 0.1 ha")]
     later = {"changes_ha": [[0.5, "crop", "bare_soil"], [0.0004, "weed", "crop"]]}

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field
-from flows.tasks.field_prior_map import FieldPriorMap
+from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
 from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
 from flows.tasks.patch_budget import SHARD
+from flows.tasks.prior_maps import Prior
 from flows.tasks.run import SurveyRun, open_run
 from models.network.sizes import CELL_PX
 from models.reading.regions import plan_regions
@@ -167,35 +167,15 @@ def test_keys_contain_regions_for_divided_fields_only(size: tuple[int, int]) -> 
     assert bool(region_params(SceneGrid(*size, 16))) == (max(size) > 640)
 
 
-@pytest.mark.parametrize("shift", [(0, 0), (8, -20), (-500, 3), (-3, 500)])
-def test_a_shifted_prior_map_is_nodata_at_its_old_place(surveyed: Surveyed, shift: tuple[int, int]) -> None:
-    """Values move by ``shift`` in fine and coarse pixels alike; pixels without a source are NaN."""
-    run, stages = surveyed
-    (region,) = plan_regions(run.grid, SHARD)
-    given = (_store(stages, "segment"), _mosaics(stages)[0], 1.0, None, tuple(range(len(run.weights.class_names))))
-    still = FieldPriorMap(*given).of(region, run.weights)
-    moved = FieldPriorMap(*given, shift).of(region, run.weights)
-    coarse = tuple(round(by / CELL_PX) for by in shift)
-    pairs = [
-        (still.probabilities.log_probability, moved.probabilities.log_probability, shift),
-        (still.probabilities.age_days, moved.probabilities.age_days, shift),
-        (still.coarse, moved.coarse, coarse),
-    ]
-    for before, now, by in pairs:
-        expected = np.full_like(before, np.nan)
-        there = [slice(max(one, 0), max(size + min(one, 0), 0)) for one, size in zip(by, before.shape, strict=False)]
-        here = [slice(max(-one, 0), max(size - max(one, 0), 0)) for one, size in zip(by, before.shape, strict=False)]
-        expected[tuple(there)] = before[tuple(here)]
-        np.testing.assert_array_equal(now, expected)
-
-
-def test_a_shifted_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
+def test_a_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
     """Features come from outside of a region's halo, as far as the field has them."""
     run, stages = surveyed
     classes = tuple(range(len(run.weights.class_names)))
-    before = FieldPriorMap(_store(stages, "segment"), _mosaics(stages)[0], 1.0, None, classes, (40, -8))
+    before = Prior("a run", _store(stages, "segment"), _mosaics(stages)[0], 1.0, None, classes)
     (field,) = plan_regions(run.grid, SHARD)
-    whole = before.of(field, run.weights).coarse
+    whole = prior_map_of(before, field, run.weights).coarse
+    assert whole is not None
     for region in plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=16):
         here = region.read.over(CELL_PX)
-        np.testing.assert_array_equal(before.of(region, run.weights).coarse, whole[here.rows, here.columns])
+        found = prior_map_of(before, region, run.weights).coarse
+        np.testing.assert_array_equal(found, whole[here.rows, here.columns])

@@ -105,7 +105,7 @@ def image(ref: StageRef, name: str) -> np.ndarray:
 
 
 def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: Stores, tmp_path: Path) -> None:
-    """Single unknown pixels get no confidence or age from their neighbours."""
+    """Single unknown pixels get no confidence from their neighbours."""
     classes = np.zeros(SHAPE, np.uint8)
     classes[40:70:3, 50:90:3] = 1
     confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
@@ -115,8 +115,7 @@ def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: S
     ref = draw(run, (StageRef("segment", "s", tmp_path / "out_of_range"), stores[1]))
     found = image(ref, "classes")
     assert (found == 1).sum() > 50
-    for name in ("confidence", "age"):
-        np.testing.assert_array_equal(np.isnan(image(ref, name)), found != 0)
+    np.testing.assert_array_equal(np.isnan(image(ref, "confidence")), found != 0)
 
 
 def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores) -> None:
@@ -151,35 +150,26 @@ def field_pixels(run: Run, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarr
     return seen, np.floor(places[seen] + 0.5).astype(int).T
 
 
-def test_age_and_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, tmp_path: Path) -> None:
-    """Days, changed fraction and old class are not interpolated; outside of the field they are nodata."""
+def test_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, tmp_path: Path) -> None:
+    """Changed fraction and old class are not interpolated; outside of the field they are nodata."""
     rng = np.random.default_rng(3)
-    age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
-    age[rng.random(SHAPE) < 0.1] = np.nan
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
     write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
-    believe(tmp_path / "later", age, old.astype(np.uint8))
+    believe(tmp_path / "later", np.zeros(SHAPE, np.float32), old.astype(np.uint8))
     ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
-    age_days, changed, old_class = (image(ref, name) for name in ("age", "changed", "changed_from"))
-    seen, (row, column) = field_pixels(run, age_days.shape)
-    np.testing.assert_array_equal(age_days[seen], age[row, column])
+    changed, old_class = (image(ref, name) for name in ("changed", "changed_from"))
+    seen, (row, column) = field_pixels(run, changed.shape)
     np.testing.assert_array_equal(old_class[seen], old[row, column])
     np.testing.assert_array_equal(changed[seen], patch_fractions(old)[row // 8, column // 8])
-    assert np.isnan(age_days[~seen]).all()
     assert np.isnan(changed[~seen]).all()
     assert (old_class[~seen] == UNLABELLED).all()
 
 
-def test_a_first_visit_has_ages_and_no_changes(run: Run, stores: Stores) -> None:
-    """Every pixel of the field has age 0; the store has no variable for changes."""
+def test_a_first_visit_has_no_changes(run: Run, stores: Stores) -> None:
+    """The store has no variable for changes."""
     ref = draw(run, stores)
-    age_days = image(ref, "age")
-    seen, _ = field_pixels(run, age_days.shape)
-    assert (age_days[seen] == 0).all()
-    assert np.isnan(age_days[~seen]).all()
     with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
         assert not {"changed", "changed_from"} & set(content)
-        assert content["age"].attrs["units"] == "days"
 
 
 def test_the_store_has_areas_pose_and_crs(run: Run, stores: Stores) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,29 +13,24 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
-from PIL import Image
 from rich.console import Console
 
-from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import run_reprocess
-from flows.settings.load import load_settings
 from flows.tasks import extent_choice
 from flows.tasks.drawing import Drawing
 from flows.tasks.extent_choice import ExtentGains
 from flows.tasks.patch_budget import SHARD
-from flows.tasks.prior_maps import TURNED
 from flows.tasks.run import SurveyRun
 from models.network.sizes import MultiplyAdds, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.reading.expected_errors import PatchExpectedErrors
 from models.reading.prior_map import ClassProbabilities, PriorMap, carried
 from models.reading.regions import plan_regions
-from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsError
+from pipeline.errors import BudgetError, PipelineError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.uniform_scans import ScanPerformance
 from storage.archive.records import read_run
-from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene
-from tests.flows.conftest import CommandLine
+from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.prior_work import without_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -96,7 +90,6 @@ def test_a_partial_scan_maps_the_rest_from_the_prior_map(visits: tuple[Path, Any
     before, now = (product(out, one, "class_map").classes.values for one in (first, part))
     assert (now != 255).all()
     assert (now == before)[age > 0].mean() > 0.95  # ageing may flip two classes nearly as likely
-    assert part.receipt["prior_map"]["put_aside"] is None
 
 
 def test_receipt_and_page_describe_the_captured_part(visits: tuple[Path, Any, Any]) -> None:
@@ -134,7 +127,7 @@ def test_reprocessing_a_partial_scan_uses_stored_lines(visited: Path, visits: An
 def test_partial_scan_without_prior_map_scans_everything(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """A message says so, and the seconds pay for a uniform scan."""
     text = io.StringIO()
-    flags = {**PART, "seconds": "5", "weights": str(recorded), "max_age": "14", "skip_below_error": "0.02"}
+    flags = {**PART, "seconds": "5", "weights": str(recorded), "max_age": "14"}
     first = survey_png(tmp_path / "archive", console=Console(file=text, width=300), **flags)
     assert "there is no prior map: the whole field is captured" in text.getvalue()
     assert "extent" not in first.receipt
@@ -168,31 +161,6 @@ def test_patches_without_data_are_never_due(survey_png: Survey, recorded: Path, 
     for flags, day in ((WHOLE, "2026-06-01"), ({**PART, "max_age": "30"}, "2026-06-02")):
         found = survey_png(tmp_path / "archive", **flags, **given, visit=day)
     assert found.receipt["extent"]["due"] == 0
-
-
-def test_a_visit_below_the_expected_error_is_skipped(
-    visited: Path, survey_png: Survey, recorded: Path, scene_files: Path, command_line: CommandLine
-) -> None:
-    """Nothing is captured or published, and the message names the run whose map remains; plan still gives lines."""
-    runs = sorted(visited.glob("runs/*"))
-    flags = {**PART, "visit": LAST, "weights": str(recorded)}
-    asked = {
-        **{name: value for name, value in flags.items() if value},
-        **{"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(visited)},
-        **{"engine": "plain", "skip_below_error": "0.5"},
-    }
-    with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} remains"):
-        survey_png(visited, **{**flags, "skip_below_error": "0.5"})
-    assert sorted(visited.glob("runs/*")) == runs
-    words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    told = command_line("survey", *words, "--json")
-    assert told.code == 0
-    assert json.loads(told.out) == {"captured": False, "run": runs[-1].name, "why": told.err.strip().splitlines()[-1]}
-    planned = plan_content(load_settings(None, asked))
-    assert planned["to_make"] > 0
-    assert any("a survey would skip this visit: the prior map's expected error is" in note for note in planned["notes"])
-    surveyed = survey_png(visited, **{**flags, "skip_below_error": "0.001"})
-    assert surveyed.receipt["settings"]["skip_below_error"] == 0.001
 
 
 def test_lines_that_cover_a_field_capture_its_border(recorded: Path) -> None:
@@ -246,19 +214,6 @@ def test_due_patches_have_the_highest_expected_gain() -> None:
     assert np.argsort(nobody.expected_gain(np.zeros(4))).tolist() == [0, 1, 2, 3]
 
 
-def test_pixels_without_a_source_are_nodata(visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
-    """The prior map of another field is put aside, so pixels outside of the captured part are nodata."""
-    values, labels = patchy_scene((96, 128), 3, seed=77)
-    Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")
-    Image.fromarray(labels).save(tmp_path / "labels.png")
-    scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
-    other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
-    assert other.receipt["prior_map"]["put_aside"] == "another field"
-    assert "the rest is unchanged" not in (other.folder / "report.html").read_text(encoding="utf-8")
-    classes = product(visited, other, "class_map").classes.values
-    assert 1 - other.receipt["extent"]["patches_touched"] <= (classes == 255).mean() < 1
-
-
 @pytest.mark.parametrize(
     ("flags", "error", "told"),
     [
@@ -292,14 +247,13 @@ def test_impossible_partial_scans_are_refused(
 
 
 def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
-    """The choice reads a quarter of the prior map's pixels; a turned prior map is not read for the map."""
+    """The choice reads a quarter of the prior map's pixels."""
     reader = SimpleNamespace(sizes=TemporalSizes(2, 4))
     costs = SimpleNamespace(of_map=lambda index: MultiplyAdds(5, 0, 7))
     facts = {"prior": "there", "reader": reader, "grid": SceneGrid(95, 63, 4), "least_gain": None, "chooses": False}
     run: Any = SimpleNamespace(costs=costs, **facts)
     map_px, choice_px = 95 * 63, 48 * 32
-    cases = (None, None, map_px), ("chosen", None, map_px + choice_px), ("chosen", TURNED, choice_px), (None, TURNED, 0)
-    for extent, aside, pixels in cases:
+    for extent, pixels in ((None, map_px), ("chosen", map_px + choice_px)):
         run.extent = extent
-        done = SurveyRun.work_done(run, np.arange(3), {"put_aside": aside}).detail
+        done = SurveyRun.work_done(run, np.arange(3)).detail
         assert done == 7 + reader.sizes.multiply_adds(pixels)

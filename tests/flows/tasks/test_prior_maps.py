@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import shutil
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,17 +15,12 @@ import pytest
 import torch
 import xarray as xr
 from affine import Affine
-from hypothesis import given
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
-from scipy.ndimage import gaussian_filter, rotate
 
 import flows.tasks.prior_maps as memory
 from flows.archive.reprocess_command import run_reprocess
 from flows.settings.load import load_settings
-from flows.tasks.field_prior_map import laid_together, shifted
 from models.network.sizes import TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.weights.files import add_reader, load_weights
@@ -90,12 +83,12 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
     """Receipt, page and manifest name the earlier run; its age is the days between the visits."""
     out, first, later = twice
     memory = later.receipt["prior_map"]
-    assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, None)
+    assert (memory["run"], memory["days"]) == (first.folder.name, 3.0)
     assert later.receipt["settings"]["prior"] == first.folder.name
     assert memory["agreement"] > 0.9  # it is the same picture
     page = (later.folder / "report.html").read_text(encoding="utf-8")
     assert first.folder.name in page
-    assert re.search("(?s)3.0 days earlier; .*the same class at [0-9.]+ %", page)
+    assert "3.0 days earlier" in page
     assert "Captured and differing" in page
     store = out / later.receipt["products"]["class_probabilities"]
     manifest = json.loads((store.parent / "manifest.json").read_text())
@@ -163,7 +156,7 @@ def test_a_map_of_another_size_is_no_prior_map(visited: Path, survey_png: Survey
     Image.fromarray(patchy_scene((64, 96), 3, seed=1)[0].astype(np.uint8)).save(tmp_path / "small.png")
     flags = {"scene": str(tmp_path / "small.png"), "labels": None, "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
     words, published = words_of(visited, survey_png, **flags)
-    assert "cannot be the prior map: it has 128 x 96 px, this field has 96 x 64" in words
+    assert "cannot be the prior map: it has another grid than this field: 128 x 96 px and not 96 x 64" in words
     assert "north has no prior map" in words
     assert "prior_map" not in published.receipt
 
@@ -172,9 +165,9 @@ def test_a_map_of_another_size_is_no_prior_map(visited: Path, survey_png: Survey
     ("east_m", "epsg", "why"),
     [
         (0.0, 32632, None),
-        (40.0, 32632, None),
-        (1000.0, 32632, "it shows another place: its corner lies 100 px"),
-        (0.0, 32633, "it has another coordinate system, pixel size or direction"),
+        (0.1, 32632, None),  # rounded coordinates
+        (40.0, 32632, "it has another grid than this field: its corner lies 4 px away"),
+        (0.0, 32633, "it has another grid than this field: another coordinate system, pixel size or direction"),
     ],
 )
 def test_a_map_of_another_place_is_no_prior_map(
@@ -189,26 +182,6 @@ def test_a_map_of_another_place_is_no_prior_map(
     words, run = words_of(visited, survey_png, **flags, scene=str(tmp_path / "there.tif"), visit=LATER)
     assert ("prior_map" in run.receipt) == (why is None)
     assert why is None or why in words
-
-
-def test_a_prior_map_of_another_field_is_put_aside(visited: Path, survey_png: Survey, tmp_path: Path) -> None:
-    """The map equals that of a survey without prior map, and receipt and terminal give the reason."""
-    Image.fromarray(patchy_scene((96, 128), 3, seed=77)[0].astype(np.uint8)).save(tmp_path / "other.png")
-    flags = {"scene": str(tmp_path / "other.png"), "labels": None, "visit": "2026-06-07T10:00:00Z"}
-    words, wrong = words_of(visited, survey_png, **flags, prior="latest")
-    alone = survey_png(tmp_path / "alone", **{**RASTER, **flags})
-    assert wrong.receipt["prior_map"]["put_aside"] == "another field"
-    assert {wrong.receipt["prior_map"][name] for name in ("differing_px", "changed_px")} == {None}
-    assert "differing" not in words
-    assert "not used: another field" in words
-    cost, once = (run.receipt["savings"]["multiply_adds"] for run in (wrong, alone))  # the map was computed twice
-    assert cost["overview"] == 2 * once["overview"]
-    patches = once["detail"] / alone.receipt["savings"]["patches"]["done"]
-    assert cost["detail"] == pytest.approx(once["detail"] + wrong.receipt["prior_map"]["patches_read"] * patches)
-    np.testing.assert_array_equal(class_map(visited, wrong), class_map(tmp_path / "alone", alone))
-    probabilities = xr.open_zarr(visited / wrong.receipt["products"]["class_probabilities"], consolidated=False)
-    assert float(probabilities.age.max()) == 0.0
-    assert not {"changed", "changed_from"} & set(probabilities)
 
 
 def test_cleared_prior_maps_are_skipped(visited: Path, twice: Any, survey_png: Survey) -> None:
@@ -266,41 +239,6 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
         survey_png(visited, **flags)
 
 
-def test_a_rig_moved_between_two_partial_visits_is_detected(survey_png: Survey, tmp_path: Path) -> None:
-    """Without a common part, today's lines are registered to the visit before the last."""
-    out = tmp_path / "archive"
-    values, _ = patchy_scene((160, 192), 3, seed=5)
-    flags = {**RASTER, "labels": None, "prior": "latest", "source": "sim", "scan_step": "2"}
-    before, now = ({**flags, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
-    for one, part in ((before, np.s_[12:140, 0:160]), (now, np.s_[0:128, 20:180])):  # 12 px lower, 20 further left
-        Image.fromarray(values[part].astype(np.uint8)).save(one["scene"])
-    survey_png(out, **before, visit=FIRST)
-    middle = survey_png(out, **before, visit=LATER, extent="0:0-20")
-    words, later = words_of(out, survey_png, **now, visit="2026-06-07T10:00:00Z", extent="0:40-64")
-    assert "shifted by 23 px" in words
-    assert later.receipt["prior_map"]["run"] == middle.folder.name
-    assert later.receipt["prior_map"]["shift_px"] == [12, -20]
-    back = survey_png(out, **before, visit="2026-06-08T10:00:00Z", extent="0:16-46")  # the first visit covers most
-    assert back.receipt["prior_map"]["run"] == later.folder.name
-    assert back.receipt["prior_map"]["shift_px"] == pytest.approx([-12, 20], abs=1)
-
-
-def test_a_rig_turned_by_four_degrees_is_detected(survey_png: Survey, tmp_path: Path) -> None:
-    """The prior map is put aside; receipt and terminal give the angle."""
-    values, _ = patchy_scene((300, 320), 3, seed=6)
-    soft = gaussian_filter(values, (1.5, 1.5, 0))
-    there = np.s_[2:290, 8:312]
-    images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
-    for name, image in images.items():
-        Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
-    survey_png(tmp_path / "a", **RASTER, labels=None, scene=str(tmp_path / "before.png"), visit=FIRST)
-    now = {"labels": None, "scene": str(tmp_path / "now.png"), "visit": LATER, "prior": "latest"}
-    words, later = words_of(tmp_path / "a", survey_png, **now)
-    assert later.receipt["prior_map"]["put_aside"] == "turned"
-    assert abs(later.receipt["prior_map"]["turned_deg"]) == pytest.approx(4.0, abs=0.3)
-    assert re.search("turned by -?(3.9|4|4.0)[0-9]* degrees; not used: turned", words)
-
-
 def test_finding_a_prior_map_reads_the_newest_runs(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With 70 more visits, only the newest runs of this field are read."""
     _, first, later = twice
@@ -323,44 +261,3 @@ def test_two_simultaneous_visits_are_both_published(visited: Path, twice: Any, s
     assert both[0].receipt["prior_map"]["run"] == twice[2].folder.name
     assert both[1].receipt["prior_map"]["run"] in {twice[2].folder.name, both[0].folder.name}
     assert not problems(visited)
-
-
-def _image(seed: int, told: float) -> NDArray[np.float32]:
-    """Return an image (y, x, column) of which about a fraction has values; the rest is NaN."""
-    rng = np.random.default_rng(seed)
-    image = rng.normal(size=(6, 8, 2)).astype(np.float32)
-    image[rng.random((6, 8)) > told] = np.nan
-    return image
-
-
-@given(seed=st.integers(0, 99), count=st.integers(1, 4))
-def test_merged_images_take_each_pixel_from_the_newest(seed: int, count: int) -> None:
-    """Each pixel comes from the first image with a value there, and is NaN if no image has one."""
-    images = [_image(seed + number, told=0.4) for number in range(count)]
-    whole = laid_together(iter(images))
-    for y, x in np.ndindex(6, 8):
-        telling = [image[y, x] for image in images if np.isfinite(image[y, x]).all()]
-        np.testing.assert_array_equal(whole[y, x], telling[0] if telling else [np.nan, np.nan])
-
-
-def test_older_images_are_not_read_when_the_newest_is_complete() -> None:
-    """A field that was captured as a whole costs one image, however many visits there are."""
-    whole = _image(0, told=1.0)
-
-    def images() -> Iterator[NDArray[np.float32]]:
-        yield whole
-        yield whole + 1
-        raise AssertionError("read although nothing was missing")
-
-    np.testing.assert_array_equal(laid_together(images()), whole)
-
-
-@given(down=st.integers(-9, 9), across=st.integers(-9, 9), seed=st.integers(0, 9))
-def test_shifting_there_and_back_loses_the_edge_alone(down: int, across: int, seed: int) -> None:
-    """Pixels that stayed within the image keep their place; the others are NaN."""
-    image = _image(seed, told=1.0)
-    back = shifted(shifted(image, (down, across)), (-down, -across))
-    stayed = np.zeros((6, 8), bool)
-    stayed[max(-down, 0) : max(6 - max(down, 0), 0), max(-across, 0) : max(8 - max(across, 0), 0)] = True
-    np.testing.assert_array_equal(back[stayed], image[stayed])
-    assert np.isnan(back[~stayed]).all()

@@ -219,29 +219,6 @@ def test_a_removed_class_leaves_the_others_uncertain() -> None:
     np.testing.assert_allclose(np.exp(prior_map.in_classes(before, (2, 1, 0, -1)))[0, 0, 3], 0.25 / 1.25, atol=1e-6)
 
 
-def test_another_field_is_detected_by_its_agreement() -> None:
-    """A field agrees with itself, not with classes drawn anew; with no common pixel nothing is detected."""
-    rng = np.random.default_rng(11)
-    memory = a_prior_map(rng)
-    same = CurrentVisit(memory.probabilities.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
-    whole = np.s_[:, :]
-    found = prior_map.compare(memory, same, memory.probabilities, whole)
-    assert found.agreement == 1.0
-    assert not found.is_of_another_field
-    assert prior_map.compare(memory, an_observation(rng), memory.probabilities, whole).is_of_another_field
-    unseen = prior_map.compare(memory, replace(same, seen=np.zeros(SHAPE, np.bool_)), memory.probabilities, whole)
-    assert math.isnan(unseen.agreement)
-    assert not unseen.is_of_another_field
-
-
-def test_a_field_of_one_class_is_not_another_field() -> None:
-    """Chance would agree as well if prior map and visit have one class everywhere, but they do agree."""
-    told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
-    coarse_pass = CurrentVisit(told, np.ones(SHAPE, np.bool_), np.zeros((12, 10, COLUMNS), np.float32), 1.0, 1)
-    memory = PriorMap(first_probabilities(coarse_pass), None, 1.0)
-    assert not prior_map.compare(memory, coarse_pass, memory.probabilities, np.s_[:, :]).is_of_another_field
-
-
 def sure_of(classes: NDArray[np.integer], how: float) -> CurrentVisit:
     """Return a visit in detail that gives every pixel of (y, x) its class with the same probability."""
     told = np.full((*classes.shape, CLASSES), (1 - how) / (CLASSES - 1), np.float32)
@@ -259,7 +236,6 @@ def test_a_harvest_overnight_is_detected() -> None:
     after = fuse(memory, today, None)
     assert not after.classes()[0].any()
     found = prior_map.compare(memory, today, after, np.s_[:, :])
-    assert not found.is_of_another_field  # soil between the rows did not change
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
     fractions = prior_map.changed_fractions(prior_map.changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5))
     np.testing.assert_array_equal(fractions, np.float32(0.4))
@@ -303,16 +279,6 @@ def test_change_is_reported_beyond_expected_differences() -> None:
     found = two_maps(2, (ground, felled), 0.45)
     assert 0.8 * found.changed[0, 1] < found.beyond[0, 1] <= found.changed[0, 1]
     assert found.beyond.sum() == found.beyond[0, 1]
-
-
-def test_a_field_under_snow_counts_as_another_field() -> None:
-    """The visit is sure of a class that the prior map has nowhere, so the prior map would only do harm."""
-    rows = np.arange(SHAPE[1]) % 5 < 2
-    before, snow = sure_of(np.broadcast_to(rows, SHAPE), 0.99), sure_of(np.full(SHAPE, 2), 0.9)
-    memory = PriorMap(first_probabilities(before), before.coarse, 1.0)
-    found = prior_map.compare(memory, snow, fuse(memory, snow, None), np.s_[:, :])
-    assert found.agreement == 0
-    assert found.is_of_another_field
 
 
 def test_changed_fraction_counts_confident_pixels_only() -> None:

@@ -1,4 +1,4 @@
-"""Registration of two images of one overlap, crop rows included, of all sweeps, and of a field on an earlier visit."""
+"""Registration of two images of one overlap, crop rows included, and of all sweeps."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, rotate
+from scipy.ndimage import gaussian_filter1d
 
-from pipeline.rectify.registration.alignment import (
-    FieldShift,
-    SweepShift,
-    WindowShift,
-    field_shift,
-    pair_shift,
-    solve_sweeps,
-)
+from pipeline.rectify.registration.alignment import SweepShift, WindowShift, pair_shift, solve_sweeps
 from tests.pipeline.rectify.made_views import row_views, wave_views
 
 SIZE = (120, 150)
@@ -171,58 +163,3 @@ def test_one_window_gives_an_offset_without_drift():
     window = WindowShift(0, 1, (499.5, 499.5), np.stack([np.eye(2)] * 2), np.array([7.0, -3.0]), np.full(2, 0.02))
     found = solve_sweeps([window], ("a", "b"), (1000, 1000), reference=0)
     np.testing.assert_allclose(found.shifts[1].of_lines(1000), [[7.0, -3.0]] * 1000, atol=1e-3)
-
-
-def textured(seed: int, shape: tuple[int, int] = (180, 210)) -> NDArray[np.float64]:
-    """Return a field with structure over some pixels, larger than the compared part."""
-    field: NDArray[np.float64] = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
-    return field
-
-
-def cut(field: NDArray[np.float64], down: int = 0, across: int = 0) -> NDArray[np.float64]:
-    """Return the middle of a field, moved up by ``down`` and to the left by ``across`` px."""
-    return field[30 - down : 150 - down, 30 - across : 180 - across]
-
-
-@settings(max_examples=4)
-@given(seed=st.integers(0, 1000), down=st.integers(-11, 11), across=st.integers(-11, 11))
-def test_field_shift_finds_a_moved_field(seed: int, down: int, across: int) -> None:
-    """The shift is right to a tenth of a pixel, and there is no rotation."""
-    field = textured(seed)
-    found = field_shift(cut(field, down, across), cut(field), reach_px=REACH)
-    np.testing.assert_allclose(found.shift, (down, across), atol=0.1)
-    assert found.edge_px(SIZE) < 0.3
-
-
-@pytest.mark.parametrize(("seed", "degrees"), [(0, -5.0), (2, 1.0), (1, 5.0)])
-def test_field_shift_finds_a_rotated_field(seed: int, degrees: float) -> None:
-    """The rotation about the centre is right to a fifth of a degree."""
-    field = textured(seed, (180, 210))
-    found = field_shift(cut(rotate(field, degrees, reshape=False, order=3)), cut(field), reach_px=REACH)
-    assert abs(found.turned_deg) == pytest.approx(abs(degrees), abs=0.2)
-    assert np.hypot(*found.shift) < 1.0
-
-
-@pytest.mark.parametrize("seed", [3, 4])
-def test_local_changes_do_not_move_the_field(seed: int) -> None:
-    """A third of the field is replaced by another one, and there is noise everywhere."""
-    field = textured(seed)
-    now = cut(field).copy()
-    now[:, :50] = cut(textured(seed + 50))[:, :50]
-    now += np.random.default_rng(seed).normal(0, 0.1 * now.std(), now.shape)
-    found = field_shift(now, cut(field), reach_px=REACH)
-    assert max(np.hypot(*found.shift) / 0.3, found.edge_px(SIZE) / 0.5) < 1
-
-
-def test_field_shift_follows_the_majority_of_windows() -> None:
-    """Four of nine windows, which are faint, did not move."""
-    still = (np.indices((240, 240)) < 160).all(axis=0)
-    now = gaussian_filter(np.random.default_rng(0).normal(size=still.shape), 2) * np.where(still, 0.2, 1)
-    before = np.where(still, now, np.roll(now, -24, axis=1))
-    np.testing.assert_allclose(field_shift(now, before, reach_px=32).shift, (0, 24), atol=0.1)
-
-
-@pytest.mark.parametrize("now", [np.full(SIZE, np.nan), np.ones(SIZE), cut(textured(8))])
-def test_a_field_without_common_structure_has_no_shift(now: NDArray[np.float64]) -> None:
-    """The image is NaN, is constant, or shows another field than the earlier one."""
-    assert field_shift(now, cut(textured(6)), reach_px=REACH) == FieldShift()

@@ -40,14 +40,14 @@ def begin(path: Path, shape: tuple[int, int] = (100, 90), *, goes_on: bool = Fal
 
 
 def block(shape: tuple[int, int], *, goes_on: bool = False) -> dict[str, np.ndarray]:
-    """Return images with some pixels unclassified: classes, confidence, picture, age; for a later visit changes too."""
+    """Return images with some pixels unclassified: classes, confidence, picture; for a later visit changes too."""
     rng = np.random.default_rng(0)
     classes, old = rng.choice(np.array([0, 1, UNLABELLED], np.uint8), (2, *shape))
-    confidence, age, changed = (
-        np.where(classes == UNLABELLED, np.nan, most * rng.random(shape)).astype(np.float32) for most in (1, 90, 1)
+    confidence, changed = (
+        np.where(classes == UNLABELLED, np.nan, rng.random(shape)).astype(np.float32) for _ in range(2)
     )
     picture = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
-    images = {"classes": classes, "confidence": confidence, "picture": picture, "age": age}
+    images = {"classes": classes, "confidence": confidence, "picture": picture}
     return images | {"changed": changed, "changed_from": old} if goes_on else images
 
 
@@ -95,11 +95,10 @@ def test_xarray_reads_flags_areas_and_grid_of_a_map(tmp_path: Path) -> None:
         assert set(content.attrs["areas"]) == set(LEGEND.names)
         assert (content.classes[64:].values == content.classes.attrs["nodata"]).all()
         assert np.isnan(content.confidence[64:].values).all()
-        for name, units in (("age", "days"), ("changed", "1")):
-            np.testing.assert_array_equal(content[name][:64].values, images[name])
-            assert np.isnan(content[name][64:].values).all()
-            assert content[name].attrs["units"] == units
-            assert content[name].odc.geobox == content.classes.odc.geobox
+        np.testing.assert_array_equal(content.changed[:64].values, images["changed"])
+        assert np.isnan(content.changed[64:].values).all()
+        assert content.changed.attrs["units"] == "1"
+        assert content.changed.odc.geobox == content.classes.odc.geobox
         assert content.changed_from.attrs["flag_meanings"] == "sugar_beet bare_soil"
         assert (content.changed_from[64:].values == 255).all()
 
@@ -118,7 +117,7 @@ def test_a_class_without_a_name_is_refused(tmp_path: Path) -> None:
 def test_a_block_must_have_the_images_of_its_map(tmp_path: Path, goes_on: bool) -> None:
     """A first visit's map refuses changes, a later one requires them; the error lists the expected images."""
     writer = begin(tmp_path / "a.zarr", goes_on=goes_on)
-    with pytest.raises(ShapeError, match="give classes, confidence, picture, age" + (", changed" if goes_on else "")):
+    with pytest.raises(ShapeError, match="give classes, confidence, picture" + (", changed" if goes_on else "")):
         writer.write_block(slice(0, 64), slice(0, 90), block((64, 90), goes_on=not goes_on))
 
 
