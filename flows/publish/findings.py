@@ -1,4 +1,4 @@
-"""Compute the findings of a run: areas, changes, zones, plots, unknown pixels, expected score."""
+"""Compute the findings of a run: areas, changes, zones, plots, likeness to the training data, expected score."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.run import SurveyRun
 from flows.tasks.scores import MOST_ERROR
-from flows.tasks.stages.maps import OUT_OF_RANGE
+from flows.tasks.stages.maps import SPECTRA
 from flows.terminal.figures import format_points
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED, cuts
@@ -164,20 +164,17 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
 
 
 def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
-    """Return ``unknown``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
+    """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
     found: dict[str, Any] = {}
     unclassed = drawn.classes == UNLABELLED
-    fraction = 0.0
-    if (rate := run.settings.unknown_rate) is not None and run.ood_detector is not None:
-        count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
-        classified = int(np.count_nonzero(~unclassed))
-        fraction = count / classified if classified else 0.0
-        found["unknown"] = {"pixels": count, "fraction": fraction, "rate": rate}
+    spectra = read_table(ref.path / SPECTRA)
+    if fraction := spectra["unlike_patches"] / max(spectra["captured_patches"], 1):
+        found["unlike"] = {"fraction": fraction}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
-        "px_no_reading": read_table(path)["px"] if (path := ref.path / OUT_OF_RANGE).is_file() else 0,
+        "px_no_reading": spectra["out_of_range_px"],
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):

@@ -49,11 +49,8 @@ SMALL_RUN = 2_000_000  # bytes kept, most of which do not depend on the field
 MOST_NAMED = 4  # changes of class in a row
 LEADING_CLASSES = 3  # of a plot
 LEAST_LOSS = 0.0005  # of expected mIoU, below which it rounds to 0.0 points
-FOREIGN = 0.2  # fraction of unknown pixels above which the weights do not fit the field
-FOREIGN_WORDS = (
-    "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or leave "
-    "the class out with --unknown off"
-)
+FOREIGN = 0.2  # fraction of patches unlike the training data above which the weights do not fit the field
+FOREIGN_WORDS = "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET)"
 
 
 def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -114,7 +111,8 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         full = "" if alone else f"; the full network on every patch gives {format_points(accuracy['all']['miou'])}"
         return f"{score}{full}. {format_worst_class(accuracy, alone=alone)}".rstrip()
     if is_foreign(receipt):
-        return f"Unknown: {format_percent(receipt['unknown']['fraction'])} of the map. {FOREIGN_WORDS}."
+        unlike = format_percent(receipt["unlike"]["fraction"])
+        return f"{unlike} of the field is unlike the training data. {FOREIGN_WORDS}."
     expected = receipt.get("expected") or {}
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
         return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities."
@@ -223,8 +221,8 @@ def format_total(total: Mapping[str, Any]) -> Sequence[str]:
 
 
 def is_foreign(found: Mapping[str, Any]) -> bool:
-    """Return whether so many pixels are unknown that the weights do not fit the field."""
-    return ((found.get("unknown") or {}).get("fraction") or 0.0) > FOREIGN
+    """Return whether so much of the field is unlike the training data that the weights do not fit it."""
+    return ((found.get("unlike") or {}).get("fraction") or 0.0) > FOREIGN
 
 
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -312,7 +310,7 @@ _SHOWN: Mapping[str, tuple[str, str]] = {
     "full network": ("kept", "patches multiply_adds"),
     "prior map": ("prior_map", "run days changed_px changes"),
     COMPARISON: ("prior_map", "agreement compared_px differing_px expected_differing_px"),
-    "unknown": ("unknown", "fraction rate"),
+    "training": ("unlike", "fraction"),
     "expected mIoU": ("expected", "miou error not_predicted"),
     "uniform scans": ("scans", "taken best_in_time reference"),
     "classes": ("areas", "ha"),
@@ -320,7 +318,7 @@ _SHOWN: Mapping[str, tuple[str, str]] = {
     "on the ground": ("ground", "crs resolution_m changes_ha"),
 }
 _OF_POINTING = "sweeps residual_rms_px not_found too_narrow partly_seen"
-_FRACTIONS = ("patches_touched", "expected_wrong", "agreement", "rate")
+_FRACTIONS = ("patches_touched", "expected_wrong", "agreement")
 _UNITS: Mapping[str, Callable[[Any], str]] = {
     "px": lambda value: f"{format_count(value) if isinstance(value, int) else f'{value:.2f}'} px",
     "s": format_seconds,
@@ -332,7 +330,7 @@ _FORMATS: Mapping[str, Callable[[Any], str]] = {
     **dict.fromkeys(("run", "crs", "reason", "not_predicted"), str),
     "days": format_days,
     "hectares": format_area,
-    "fraction": lambda fraction: f"{format_percent(fraction)} of the pixels are unlike the training data",
+    "fraction": lambda fraction: f"{format_percent(fraction)} of the field is unlike the training data of the weights",
     "saturated": lambda fraction: (
         f"{format_percent(fraction)} of the spectra have saturated bands; a shorter exposure avoids them"
     ),

@@ -126,7 +126,7 @@ TABLES = {
 OF_THE_PLAN = ("zoom", *UNIFORM, *OF_TWO_PASSES, "macs", "scan_exposure_ms", "extent")
 OF_THE_RUN = (
     *("camera", "cost", "rig", "pose", "zones", "resampling", "pointing_px", "seed", "sky", "weights"),
-    *("unknown", "expected_loss", "signal"),
+    *("expected_loss", "signal"),
 )
 BUILT_IN_WEIGHTS = "farm"
 FLAGS = {  # of settings in tables; other keys of tables have none

@@ -14,8 +14,6 @@ from pydantic import PlainValidator
 
 from flows.settings.values import (
     EXTENT_WHOLE,
-    UNKNOWN_AUTO,
-    UNKNOWN_OFF,
     Bands,
     Budget,
     Compute,
@@ -26,13 +24,11 @@ from flows.settings.values import (
     Scheduler,
     Size,
     Tolerance,
-    Unknown,
     VisitName,
     Wavelengths,
     parse_tolerance,
 )
 from models.network.machine import PROCESSOR, Device
-from models.network.ood import RATE
 from models.policies.policies import Policy
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
@@ -243,11 +239,6 @@ class Settings:
         "Model weights (.safetensors); farm: the built-in weights, the default for built-in scenes",
         example="weights.safetensors",
     )
-    unknown: Unknown = stated(
-        "auto",
-        "Label out-of-distribution pixels `unknown`: auto (false-alarm rate 0.1% if the weights have a detector; off"
-        " in a zoomed survey and for rasters), off, or a false-alarm rate: 0.5%",
-    )
     seed: int = stated(0, "Random seed of built-in scenes and of all noise", "", 0, 2**63 - 1)
     effects: Effects = stated(
         "auto",
@@ -347,16 +338,6 @@ class Settings:
     def is_map(self) -> bool:
         """Return whether the scene is a raster whose pixels are used as they are, without a camera."""
         return self.source == RASTER
-
-    @property
-    def unknown_rate(self) -> float | None:
-        """Return the false-alarm rate of the class unknown; None where it is off.
-
-        Detectors do not know merged passes: their false-alarm rate is 13 to 20 times the asked one there. Nor do they
-        know pixels without a camera, of rasters, which are rougher than those of the simulated rig.
-        """
-        usual = {UNKNOWN_AUTO: None if self.zooms or self.is_map else RATE, UNKNOWN_OFF: None}
-        return usual[self.unknown] if self.unknown in usual else float(self.unknown.removesuffix("%")) / 100
 
     @property
     def pool(self) -> WorkerPool:

@@ -27,8 +27,6 @@ from storage.parallel.pool import WorkerPool
 LEAST_MEMORY = 256 * 1024**2
 EXTENT_WHOLE, EXTENT_PART = "whole", "part"
 KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
-UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
-LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
 _BYTES = TypeAdapter(ByteSize)
 _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d(?!\d)")
 
@@ -209,20 +207,6 @@ def format_extent(runs: Iterable[LineRun]) -> str:
     return ",".join(f"{sweep}:{first}-{stop}" for sweep, first, stop in runs)
 
 
-def parse_unknown(value: object) -> str:
-    """Return ``auto``, ``off``, or a false-alarm rate such as 0.5%."""
-    word = str(value).strip().lower()
-    if word in (UNKNOWN_AUTO, UNKNOWN_OFF):
-        return word
-    percent = _amount(value, {"%": 1.0})
-    if percent is None or not LEAST_UNKNOWN <= percent <= MOST_UNKNOWN:
-        raise ValueError(
-            f"must be auto, off, or a false-alarm rate of {LEAST_UNKNOWN:g}% to {MOST_UNKNOWN:g}%, such as 0.5%; got"
-            f" {value!r}"
-        )
-    return f"{percent:g}%"
-
-
 def _items(value: object) -> list[object]:
     """Return the items of a list or tuple, the parts of text between commas, or the value itself."""
     if isinstance(value, str):
@@ -259,7 +243,6 @@ def to_whole(value: object) -> int | None:
 Name = Annotated[str, PlainValidator(parse_name)]
 VisitName = Annotated[str, PlainValidator(parse_visit)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
-Unknown = Annotated[str, PlainValidator(parse_unknown)]
 Compute = Annotated[str, PlainValidator(parse_compute)]
 Memory = Annotated[int, PlainValidator(parse_memory)]
 Scheduler = Annotated[str, PlainValidator(lambda value: WorkerPool(parse_text(value)).scheduler)]

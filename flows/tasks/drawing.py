@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse_region, overview_file, seen_patches
 from flows.tasks.prior_maps import Prior
-from models.network.ood import OodDetector
-from models.network.spectral import LineSpec
+from models.network.spectral import LineSpec, unlike_training
 from models.policies.policies import class_errors, gain_of
 from models.reading.inference import CoarsePass, CoarsePrediction, load_overview, read_coarse_prediction, segment
 from models.reading.prior_map import (
@@ -64,7 +63,6 @@ class Drawing:
     capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
     prior: Prior | None = None  # prior map of the field
     left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn
-    unknown: UnknownRule | None = None  # which pixels are called unknown
     part: bool = False  # whether the scan covers a part of the field; the rest is that of the prior map
     choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
 
@@ -98,11 +96,6 @@ class Drawing:
         if seen.out_of_range is not None:
             shown &= ~seen.out_of_range
         assert drawn.log_probability is not None
-        unknown = None
-        if self.unknown is not None:
-            unknown = self.unknown.pixels(self.weights.load_ood(), seen, len(mosaic.wavelength_nm))
-            unknown &= (drawn.classes != UNLABELLED) & shown
-            drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         observation = self._observation(region, drawn.log_probability, shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison = None
@@ -114,15 +107,10 @@ class Drawing:
         else:
             local = prior_map_of(self.prior, region, weights)
             after = fuse(local, observation, self.weights.load_reader())
-            if unknown is not None:  # the classes say nothing of them
-                after.log_probability[unknown], after.light[unknown] = np.nan, 0
             classes, confidence = after.classes()
             comparison = compare(local, observation, after, region.kept_here)
             old = changed_from(local, after)
             after = as_captured(local, after)
-        if self.unknown is not None and unknown is not None:
-            classes[unknown], confidence[unknown] = self.unknown.number, np.nan
-            after.log_probability[unknown], after.age_days[unknown] = np.nan, 0  # they are captured
         reading = None if self.choice is None else FullReading.of(region, predicted, drawn.classes, gain, patch_index)
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return DrawnRegion(
@@ -132,8 +120,16 @@ class Drawing:
             region.crop(after.age_days),
             region.crop(after.light),
             None if old is None else region.crop(old),
-            Drawn(unread, comparison, reading),
+            Drawn(unread, *self._unlike(region, shown, seen), comparison, reading),
         )
+
+    def _unlike(self, region: Region, shown: NDArray[np.bool_], seen: CoarsePass) -> tuple[int, int]:
+        """Return the kept patches that were captured and are unlike the training data, and all captured ones."""
+        if self.left_out is not None:
+            shown = shown & ~self.left_out[region.read.rows, region.read.columns]
+        captured = np.asarray(patch_pixels(region.grid, shown).any(axis=(1, 2)), np.bool_)
+        unlike = captured & unlike_training(seen.columns, region.grid.patch).ravel()
+        return int(region.crop_patches(unlike).sum()), int(region.crop_patches(captured).sum())
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
@@ -192,25 +188,6 @@ class GainChoice:
 
 
 @dataclass(frozen=True)
-class UnknownRule:
-    """Rule for the class unknown: its number and the false-alarm rate."""
-
-    number: int  # of the class, after those of the weights
-    rate: float  # false-alarm rate
-    detector: str  # its key
-
-    def pixels(self, ood_detector: OodDetector, seen: CoarsePass, bands: int) -> NDArray[np.bool_]:
-        """Return the unknown pixels of a region, (y, x), each by its own capture."""
-        found = np.zeros(seen.grid.padded_shape, np.bool_)
-        for spec in seen.capture.specs:
-            here = seen.capture.where(spec)
-            found[... if here is None else here] = ood_detector.unknown(
-                seen.columns if here is None else seen.columns[here], rate=self.rate, capture=spec, bands=bands
-            )
-        return found[: seen.grid.height, : seen.grid.width]
-
-
-@dataclass(frozen=True)
 class FullReading:
     """Patches and the full network, (patch_y, patch_x) each."""
 
@@ -241,6 +218,8 @@ class Drawn:
     """Result of segmenting a region, or a field."""
 
     unread_px: int  # captured pixels with values out of range
+    unlike: int  # captured patches that are unlike the training data
+    captured: int  # patches
     comparison: TemporalAgreement | None  # with the prior map; None without one
     reading: FullReading | None = None  # None where patches were chosen before
 
@@ -302,4 +281,7 @@ def draw_field(
         for region, part in zip(field.regions, parts, strict=True):
             for name, whole in vars(reading).items():
                 whole[region.kept_patches.rows, region.kept_patches.columns] = getattr(part.reading, name)
-    return Drawn(sum(part.unread_px for part in parts), reduce(add, compared) if compared else None, reading)
+    unread, unlike, captured = (
+        sum(getattr(part, name) for part in parts) for name in ("unread_px", "unlike", "captured")
+    )
+    return Drawn(unread, unlike, captured, reduce(add, compared) if compared else None, reading)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from flows.tasks.patch_budget import SHARD
 from models.network.machine import PROCESSOR, give_back_freed_memory
-from models.network.ood import OodDetector
 from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from models.policies.placement import classes_by
 from models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
@@ -32,7 +31,7 @@ from models.reading.inference import (
 )
 from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
 from models.weights.checksummed_files import SEAL
-from models.weights.files import Weights, describe_weights, load_ood, load_reader, load_weights
+from models.weights.files import Weights, describe_weights, load_reader, load_weights
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.region import free_tiles
@@ -71,12 +70,6 @@ class WeightsFile:
         """Read the temporal reader; None where the weights have none."""
         self._check()
         return None if describe_weights(self.path).reader is None else load_reader(self.path)
-
-    @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
-    def load_ood(self) -> OodDetector:
-        """Read the out-of-distribution detector."""
-        self._check()
-        return load_ood(self.path)
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import RECORDED, RIG, Settings
 from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from flows.tasks.capture_plan import CapturePlan, PassLayout, ScanChoice, choose_uniform_scan, lay_out_passes
-from flows.tasks.drawing import UnknownRule
 from flows.tasks.extent_choice import ExtentChoice, choose_extent
 from flows.tasks.field_work import FieldWork, WeightsFile
 from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
@@ -48,7 +47,7 @@ from models.policies.placement import CascadeTable
 from models.reading.prior_map import EVERY_PX
 from models.reading.regions import plan_regions
 from models.weights.checksummed_files import SEAL
-from models.weights.files import CASCADE, Description, OodPart, ReaderPart, Weights
+from models.weights.files import CASCADE, Description, ReaderPart, Weights
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
@@ -167,7 +166,6 @@ class SurveyRun(CaptureRun):
     budget: PatchBudget | None = None  # None: no limit of multiply-adds
     extent: ExtentChoice | None = None  # of a partial scan
     prior: Prior | None = None  # prior map
-    ood_detector: OodPart | None = None  # None: no class unknown
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine cannot run a survey that is only planned
     outside: bool = False  # of the conditions of the training
@@ -185,7 +183,7 @@ class SurveyRun(CaptureRun):
     @property
     def map_scores(self) -> MapScores | None:
         """Return the calibration of expected scores; None where the weights have none, or outside of their training."""
-        return None if self.outside or self.described.ood_detector is None else self.described.ood_detector.map_scores
+        return None if self.outside else self.described.map_scores
 
     @property
     def model_key(self) -> dict[str, Any]:
@@ -295,14 +293,6 @@ class SurveyRun(CaptureRun):
         return all_seen(self.grid, self.plan.coarse if self.plan.plain else (), self.camera, part=self.part)
 
     @property
-    def unknown(self) -> UnknownRule | None:
-        """Return the rule for unknown pixels; None without a detector, or where the settings turn it off."""
-        rate = self.settings.unknown_rate
-        if self.ood_detector is None or rate is None:
-            return None
-        return UnknownRule(self.described.config.classes, rate, self.ood_detector.key)
-
-    @property
     def ground_grid(self) -> GroundGrid:
         """Return the grid of the map on the ground; the survey has a pose."""
         assert isinstance(self.zones.place, PosedField)
@@ -364,7 +354,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
-    model = SurveyModel.open(weights_path(settings), settings.device, settings.unknown, planning=planning)
+    model = SurveyModel.open(weights_path(settings), settings.device, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
@@ -373,7 +363,6 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     grid = SceneGrid(*scene.shape, described.config.patch)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, model.path)
-    ood_detector = model.asked_ood(settings.unknown)
     name = settings.name or Path(scene.name).stem
     found = None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
@@ -417,7 +406,6 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         budget=budget,
         extent=planned.extent,
         prior=prior,
-        ood_detector=ood_detector,
         notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
         refused=refused,
         outside=bool(outside),

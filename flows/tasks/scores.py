@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from flows.terminal.figures import format_count, format_points, known_number, spaced
-from storage.arrays.class_maps import unknown_name
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
 MAPS = {"this survey": None, "small network": "none", "full network": "all"}  # name: key in a receipt's accuracy
@@ -66,8 +65,7 @@ def error_matrix(accuracy: Mapping[str, Any]) -> dict[str, list[Any]] | None:
     if not (counts := accuracy.get("confusion")):
         return None
     size = len(counts)
-    known = list(_by_class(accuracy))
-    names = [*known, unknown_name(known)][:size]
+    names = list(_by_class(accuracy))
     label, mapped = [sum(row) for row in counts], [sum(row[one] for row in counts) for one in range(size)]
     columns = [one for one in range(size) if label[one]]
     rows = [

@@ -12,21 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
 from models.network.spectral import project
 from models.weights.files import (
     TRAINED_ON,
     Description,
-    OodPart,
     TrainedOn,
     Weights,
     describe_weights,
-    load_ood,
     load_reader,
     load_weights,
 )
-from pipeline.errors import SettingsError, WeightsError
+from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import median_footprint_m
 from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
@@ -45,7 +42,7 @@ class SurveyModel:
     load: Once[Weights]
 
     @staticmethod
-    def open(path: Path, device: str, unknown: str, *, planning: bool) -> SurveyModel:
+    def open(path: Path, device: str, *, planning: bool) -> SurveyModel:
         """Open the weights of a file; all tensors are read unless for ``planning``.
 
         Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
@@ -56,25 +53,13 @@ class SurveyModel:
             load()
             if described.reader is not None:
                 load_reader(path)
-            if described.ood_detector is not None and unknown != UNKNOWN_OFF:
-                load_ood(path)
         return SurveyModel(path, described, load)
 
     @property
     def trained_on(self) -> TrainedOn | None:
         """Return the record of the training data; None where the weights have none."""
-        if TRAINED_ON in self.described.record:
-            return TrainedOn.read(self.described.record[TRAINED_ON])
-        return None if self.described.ood_detector is None else self.described.ood_detector.trained_on
-
-    def asked_ood(self, unknown: str) -> OodPart | None:
-        """Return the out-of-distribution detector if ``unknown`` requests one. Raises WeightsError: it is missing."""
-        if unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.ood_detector is None:
-            raise WeightsError(
-                f"--unknown {unknown}: {self.path.name} has no out-of-distribution detector; train weights with "
-                "validation scenes (spectralzoom train DATASET -o my.safetensors --validation 3), or leave it out"
-            )
-        return None if unknown == UNKNOWN_OFF else self.described.ood_detector
+        known = self.described.record.get(TRAINED_ON)
+        return None if known is None else TrainedOn.read(known)
 
 
 def weights_path(settings: Settings) -> Path:

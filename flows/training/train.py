@@ -31,23 +31,21 @@ from models.network.spectral import Normalisation
 from models.policies.placement import CascadeTable
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
-from models.training.ood_fit import fit_ood
 from models.training.train import PIXELS, LabelledPixels, linear_classifier, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
     CASCADE,
-    MAP_SCORES,
     TRAINED_ON,
     TrainedOn,
     Weights,
-    add_ood,
+    add_map_scores,
     load_encoder,
     load_weights,
     save_weights,
     with_record,
 )
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.built_in import built_in_laws
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
@@ -104,20 +102,8 @@ def train_weights(
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
-    about = {"command": request.command, **({} if scans is None else {MAP_SCORES: scans[1].as_dict()})}
-    try:
-        ood_detector = fit_ood(
-            scenes.train.examples,
-            scenes.validation.examples,
-            weights.normalisation,
-            min_exposure_ms=trained.exposure_ms[0],
-            bands=trained.bands,
-            seed=settings.seed,
-            report=lambda done: report("fitting the out-of-distribution detector", done, ""),
-        )
-        add_ood(request.out, ood_detector, trained, about)
-    except SceneError as error:
-        record["familiar"] = f"no pixel will be classified as unknown: {error}"
+    if scans is not None:
+        add_map_scores(request.out, scans[1])
     checkpoint.unlink(missing_ok=True)
     return record
 
@@ -252,8 +238,6 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     out = request.out
     steps = record["training"]["steps"]
     console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
-    if "familiar" in record:
-        console.print(record["familiar"], markup=False, soft_wrap=True)
     readings = record["readings"]
     of_readings, of_baselines = (
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())

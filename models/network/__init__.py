@@ -1,1 +1,1 @@
-"""The segmenter: overview and full network, how they read a scene, and what that costs; unknown spectra."""
+"""The segmenter: overview and full network, how they read a scene, and what that costs."""

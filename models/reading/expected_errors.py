@@ -63,8 +63,7 @@ class PatchExpectedErrors:
             patch_number = down[:, None] * grid.patch_shape[1] + across  # of each pixel, from the first of the strip
             here = slice(first, first + math.ceil(len(probabilities) / grid.patch))
             known = ~np.isnan(probabilities).all(axis=-1)
-            captured = np.isfinite(age)  # and without probabilities of no class: another capture would gain nothing
-            wrong = np.where(known, come_true, np.where(captured, 0.0, 1.0)) * expected_error_of(probabilities)
+            wrong = np.where(known, come_true, 1.0) * expected_error_of(probabilities)
             step = np.minimum(np.searchsorted(edges, wrong), STEPS - 1)
             place = np.where(known, np.nan_to_num(probabilities, nan=-np.inf).argmax(axis=-1), classes) * STEPS + step
             asked = np.True_ if left_out is None else ~left_out[top : top + len(probabilities)]
@@ -73,7 +72,7 @@ class PatchExpectedErrors:
             place = place + patch_number * sums.size
             pixels[here] = np.bincount(place[counts], minlength=pixels[here].size).reshape(pixels[here].shape)
             np.maximum.at(
-                ages[here].reshape(-1), patch_number.ravel(), np.where(asked & captured, age, -np.inf).ravel()
+                ages[here].reshape(-1), patch_number.ravel(), np.where(asked & np.isfinite(age), age, -np.inf).ravel()
             )
             top += len(probabilities)
         age_days = np.where(ages < 0, np.inf, ages).ravel()

@@ -1,7 +1,6 @@
 """Read and write weights: one checksummed file with tensors, spectral basis, classes and the record of the training.
 
-The file may also hold an out-of-distribution detector and a temporal reader. Each has a description and tensors of its
-own, and does not change the key of the weights.
+The file may also hold a temporal reader and the calibration of expected scores, which do not change its key.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.evaluation.expected_scores import MapScores
-from models.network.ood import Limits, OodDetector
 from models.network.sizes import SegmenterConfig, TemporalSizes
 from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
@@ -33,16 +31,14 @@ else:
     segmenter = deferred("models.network.segmenter")
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/5"
+FORMAT = "spectralzoom-weights/6"
 ENCODER = "spectralzoom-encoder/1"
-OF_COMPONENTS = ("centres", "covariance", "shot", "read")
-OF_LIMITS = ("rates", "light", "fine")
 COLOURS = "class_colours"
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
 CALIBRATION = "calibration"  # of a record: calibration error and temperature
-OOD, READER = "familiar", "memory"  # entries in the description, prefixes of tensor names
+READER = "memory"  # entry in the description, prefix of tensor names
 TRAINED_ON = "trained_on"  # entry in a record
-MAP_SCORES = "map_scores"  # of a record: corrections of expected scores
+MAP_SCORES = "map_scores"  # entry in the description: corrections of expected scores
 MOST_WIDTH = 1024
 
 Range = tuple[float, float]
@@ -74,31 +70,6 @@ class TrainedOn:
 
 
 @dataclass(frozen=True)
-class OodPart:
-    """Description of the out-of-distribution detector."""
-
-    key: str  # hash
-    trained_on: TrainedOn
-    steps: tuple[int, ...]
-    bands: int
-    record: Mapping[str, Any]  # command, scenes, calibration, map scores
-
-    @staticmethod
-    def read(key: str, about: Mapping[str, Any]) -> OodPart:
-        """Read an entry of a description. Raises KeyError, TypeError or ValueError for an invalid one."""
-        trained_on = TrainedOn.read(about[TRAINED_ON])
-        found = OodPart(key, trained_on, tuple(map(int, about["steps"])), int(about["bands"]), about["record"])
-        _ = found.map_scores  # raises for invalid ones
-        return found
-
-    @property
-    def map_scores(self) -> MapScores | None:
-        """Return the corrections of expected scores; None for weights of a single exposure."""
-        scores = self.record.get(MAP_SCORES)
-        return None if scores is None else MapScores.read(scores)
-
-
-@dataclass(frozen=True)
 class ReaderPart:
     """Description of the temporal reader."""
 
@@ -126,7 +97,7 @@ class Description:
     class_names: tuple[str, ...]
     record: dict[str, Any]
     key: str = ""  # hash of the weights
-    ood_detector: OodPart | None = None
+    map_scores: MapScores | None = None  # None without validation scenes, and for a single exposure
     reader: ReaderPart | None = None
     about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # complete, with hashes
 
@@ -204,21 +175,16 @@ def save_weights(weights: Weights, path: Path) -> None:
     write_checksummed(path, {**about, "format": FORMAT, "keys": {"weights": key_of(about, tensors)}}, tensors)
 
 
-def add_ood(weights: Path, ood_detector: OodDetector, trained_on: TrainedOn, record: Mapping[str, Any]) -> None:
-    """Add an out-of-distribution detector to a file of weights.
+def add_map_scores(weights: Path, map_scores: MapScores) -> None:
+    """Add the calibration of expected scores to a file of weights.
 
     Raises WeightsError: the file cannot be read or written.
     """
-    limits = ood_detector.limits
-    arrays = {name: getattr(ood_detector, name) for name in OF_COMPONENTS}
-    arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
-    about = {"bands": ood_detector.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
-    _add_part(weights, weights, OOD, {**about, "record": dict(record)}, tensors)
+    _add_part(weights, weights, MAP_SCORES, map_scores.as_dict(), {})
 
 
 def add_reader(weights: Path, out: Path, reader: temporal_reader.TemporalReader, record: Mapping[str, Any]) -> None:
-    """Write the weights of a file with a temporal reader to ``out``. Raises as `add_ood`."""
+    """Write the weights of a file with a temporal reader to ``out``. Raises as `add_map_scores`."""
     _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
 
 
@@ -228,23 +194,6 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
     added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
     keys = {**described.about["keys"], part: key_of(about, tensors)}
     write_checksummed(out, {**described.about, "keys": keys, part: about}, kept | added)
-
-
-def load_ood(weights: Path) -> OodDetector:
-    """Read the out-of-distribution detector of weights. WeightsError: their file has none, or it is damaged."""
-    described = describe_weights(weights)
-    if (about := described.ood_detector) is None:
-        raise WeightsError(
-            f"{weights} has no out-of-distribution detector; train weights with validation scenes: spectralzoom train "
-            "DATASET --validation 3"
-        )
-    tensors = _read_part(weights, described, OOD)
-    with refusing(weights):
-        arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
-        limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"])
-        found = OodDetector(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
-        found.lit(float(limits.light[0]))  # raises for an invalid covariance
-    return found
 
 
 def load_reader(weights: Path) -> temporal_reader.TemporalReader:
@@ -257,18 +206,11 @@ def load_reader(weights: Path) -> temporal_reader.TemporalReader:
         )
     with torch.device("meta"):
         reader = temporal_reader.TemporalReader(described.reader.sizes)
-    tensors = _read_part(weights, described, READER)
+    tensors = read_tensors(weights, described.about, lambda name: name.startswith(f"{READER}."))
     with refusing(weights):
-        reader.load_state_dict(tensors, assign=True)
-    return reader.eval()
-
-
-def _read_part(path: Path, described: Description, part: str) -> dict[str, Tensor]:
-    """Read the tensors of a part by their own names. Raises WeightsError for a damaged one."""
-    tensors = read_tensors(path, described.about, lambda name: name.startswith(f"{part}."))
-    with refusing(path):
         _check_numbers(tensors)
-    return {name.removeprefix(f"{part}."): tensor for name, tensor in tensors.items()}
+        reader.load_state_dict({name.removeprefix(f"{READER}."): one for name, one in tensors.items()}, assign=True)
+    return reader.eval()
 
 
 def load_weights(path: Path) -> Weights:
@@ -281,7 +223,7 @@ def load_weights(path: Path) -> Weights:
     config = described.config
     with torch.device("meta"):
         network = segmenter.Segmenter(config)
-    tensors = read_tensors(path, described.about, lambda name: not name.startswith((f"{OOD}.", f"{READER}.")))
+    tensors = read_tensors(path, described.about, lambda name: not name.startswith(f"{READER}."))
     with refusing(path):
         _check_numbers(tensors)
         normalisation = Normalisation(*(tensors.pop(f"normalisation.{name}").numpy() for name in NORMALISATION))
@@ -325,11 +267,11 @@ def describe_weights(path: Path) -> Description:
                 f"{config.columns} of them between ascending wavelengths"
             )
         keys = about["keys"]
-        ood_detector = OodPart.read(keys[OOD], about[OOD]) if OOD in about else None
+        map_scores = MapScores.read(about[MAP_SCORES]) if MAP_SCORES in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None
         if len(names) != config.classes:
             raise ValueError(f"it names {len(names)} classes, its segmenter has {config.classes}")
-        return Description(config, basis, names, record, str(keys["weights"]), ood_detector, reader, about)
+        return Description(config, basis, names, record, str(keys["weights"]), map_scores, reader, about)
 
 
 def with_record(weights: Weights, **entries: Any) -> Weights:

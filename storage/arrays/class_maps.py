@@ -65,21 +65,6 @@ class ClassNames:
     colours: NDArray[np.uint8]  # (class, 3)
 
 
-UNKNOWN = "unknown"
-UNKNOWN_COLOUR = (200, 0, 200)
-
-
-def unknown_name(names: Sequence[str]) -> str:
-    """Return the name of the class of out-of-distribution pixels, which none of the other classes has."""
-    return UNKNOWN if UNKNOWN not in names else f"{UNKNOWN}_spectrum"
-
-
-def with_unknown(legend: ClassNames) -> ClassNames:
-    """Return the classes and one more, for out-of-distribution pixels."""
-    colours = np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)])
-    return ClassNames((*legend.names, unknown_name(legend.names)), colours)
-
-
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:

@@ -120,7 +120,7 @@ def known(inside: NDArray[np.bool_]) -> Iterator[None]:
 def asked(seed: int, light: float, swaths: int, seconds: float, zoom: str, out: str) -> Settings:
     """Return the settings of a survey."""
     flags = {"scene": "farm", "seed": seed, "size": SIZE, "seconds": f"{seconds:.1f}", "engine": "plain", "zoom": zoom}
-    flags |= {"sky.light_fraction": light, "camera.samples": int(SIZE.split("x")[0]) // swaths, "unknown": "off"}
+    flags |= {"sky.light_fraction": light, "camera.samples": int(SIZE.split("x")[0]) // swaths}
     return load_settings(None, {name: str(one) for name, one in flags.items()} | {"out": out})
 
 

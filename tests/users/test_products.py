@@ -55,7 +55,6 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """Return a small farm with a pose, at a height that gives pixels of about a metre, with all of its products."""
     archive, out = tmp_path_factory.mktemp("products") / "field", tmp_path_factory.mktemp("maps").resolve()
     given = {"size": "192x128", "bands": BANDS, "budget": "0.9", "engine": "plain", "seed": "1"}
-    given["unknown"] = "off"  # with these bands the 270-band weights call many pixels unknown
     settings = load_settings(None, {**given, "out": str(archive)})
     with without_effects():
         published = run_survey(replace(settings, pose=POSE), QUIET)

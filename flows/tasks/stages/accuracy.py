@@ -57,15 +57,14 @@ def evaluate(
         drawn = load_class_map(class_map.path / "class_map.zarr")
         names = gains.work.weights.load().class_names
         judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # only pixels with a class
-        counts = confusion(judged, drawn.classes, len(drawn.names))  # includes the class unknown
+        counts = confusion(judged, drawn.classes, len(names))
         result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
         if controls:
             overview, full = gains.work.readings(mosaic, gains.capture, report)
             fractions, grid = gains.zones.fractions, gains.frame.grid
             kept = np.ones(len(grid.every_patch()), np.bool_) if fractions is None else fractions > 0
             for name, reading in {"none": overview, "all": mixed(overview, full, kept, grid)}.items():
-                classes = np.where(drawn.classes == len(names), drawn.classes, reading)  # unknown in all
-                result[name] = map_figures(names, confusion(judged, classes, len(drawn.names)))
+                result[name] = map_figures(names, confusion(judged, reading, len(names)))
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
     params = {**model_key, "labels": array_digest(labels), "controls": controls, **source_key}
@@ -93,16 +92,14 @@ def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axi
 
 def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, Any]:
     """Return the figures of a map from its confusion matrix."""
-    known = len(names)
-    false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
+    false = zip(names, false_pixels(counts).tolist(), strict=True)
     return {
         **agreement(counts),
         "average_accuracy": average_accuracy(counts),
         "kappa": kappa(counts),
         "pixels": int(counts.sum()),
-        "per_class_iou": dict(zip(names, iou_per_class(counts)[:known].tolist(), strict=True)),
+        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
         "false_classes": {name: pixels for name, pixels in false if pixels},
-        **({} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}),
     }
 
 

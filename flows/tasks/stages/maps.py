@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, UnknownRule, draw_field
+from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, draw_field
 from flows.tasks.field_work import region_params
 from flows.tasks.prior_maps import PRIOR_FIGURES, Prior
 from flows.tasks.stage import Product, Report, Wanted, stage
@@ -30,15 +30,14 @@ from storage.arrays.class_maps import (
     create_class_map,
     create_probabilities,
     load_class_map,
-    with_unknown,
     write_changes,
 )
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
 
-CLASS_MAP = Product("segment", version=26, files=(MAP, PROBABILITIES), by_weights=True)
-OUT_OF_RANGE = "out_of_range.json"  # beside a map with values out of range
+CLASS_MAP = Product("segment", version=27, files=(MAP, PROBABILITIES), by_weights=True)
+SPECTRA = "spectra.json"  # beside a map: pixels out of range, and patches unlike the training data
 
 
 @stage("segment", "class map", CLASS_MAP)
@@ -49,7 +48,6 @@ def segment(
     gains: PatchGains,
     prior: Prior | None,
     reader: ReaderPart | None,
-    unknown: UnknownRule | None,
     part: bool,
     least_gain: float | None,
     model_key: dict[str, Any],
@@ -64,19 +62,23 @@ def segment(
 
     def build(path: Path) -> None:
         """Write class map and class probabilities, and the figures of the prior map."""
-        names = create_maps(path, gains, unknown, goes_on=prior is not None)
-        drawing = Drawing(work.weights, mosaic, attention, gains.capture, prior, gains.zones.left_out, unknown, part)
+        names = create_maps(path, gains, goes_on=prior is not None)
+        drawing = Drawing(work.weights, mosaic, attention, gains.capture, prior, gains.zones.left_out, part)
         drawn = draw_field(work, drawing, path, least_gain, report)
         if prior is not None and drawn.comparison is not None:
             write_table(path / PRIOR_FIGURES, _prior_map_figures(prior, reader, names, drawn.comparison))
         if drawn.reading is not None:
             write_attention(path / READING, attention_of(drawn.reading, gains.policy))
-        if drawn.unread_px:
-            write_table(path / OUT_OF_RANGE, {"px": drawn.unread_px})
+        counts = {
+            "out_of_range_px": drawn.unread_px,
+            "unlike_patches": drawn.unlike,
+            "captured_patches": drawn.captured,
+        }
+        write_table(path / SPECTRA, counts)
         finish_maps(path, gains, compared=drawn.comparison is not None)
 
     params = {**model_key, "grid": asdict(grid), **region_params(grid), **gains.frame.key, **gains.zones.key}
-    params |= {"capture": list(gains.capture), "part": part, "unknown": None if unknown is None else asdict(unknown)}
+    params |= {"capture": list(gains.capture), "part": part}
     params["least_gain"] = least_gain
     if prior is not None:
         params |= {"days": prior.days, "day_of_year": prior.day_of_year, "classes": list(prior.classes)}
@@ -84,13 +86,13 @@ def segment(
     return Wanted(build, params, [mosaic, attention, *([] if prior is None else prior.stores)])
 
 
-def create_maps(path: Path, gains: PatchGains, unknown: UnknownRule | None, *, goes_on: bool) -> tuple[str, ...]:
+def create_maps(path: Path, gains: PatchGains, *, goes_on: bool) -> tuple[str, ...]:
     """Create empty stores of class map and class probabilities; return the names of the classes."""
     frame = gains.frame
     shape = (frame.grid.height, frame.grid.width)
     weights = gains.work.weights.load()
     legend = ClassNames(weights.class_names, weights.class_colours)
-    create_class_map(path / MAP, shape, legend if unknown is None else with_unknown(legend), grid=frame.angular_grid())
+    create_class_map(path / MAP, shape, legend, grid=frame.angular_grid())
     create_probabilities(path / PROBABILITIES, shape, legend, grid=frame.angular_grid(), goes_on=goes_on)
     return legend.names
 
@@ -164,7 +166,7 @@ def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, re
             Confidence and picture are interpolated, other images have the nearest pixel.
             """
             confidence = image_at(found.confidence[..., None], pixels)[..., 0]
-            confidence[nearest_at(unsure, pixels, False)] = np.nan  # class unknown
+            confidence[nearest_at(unsure, pixels, False)] = np.nan  # beside nodata
             images: dict[str, NDArray[np.generic]] = {
                 "classes": nearest_at(found.classes, pixels, UNLABELLED),
                 "confidence": confidence,

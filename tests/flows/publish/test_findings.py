@@ -13,13 +13,13 @@ import xarray as xr
 from flows.publish.findings import changed_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
-from models.weights.files import MAP_SCORES
+from models.weights.files import MAP_SCORES, TRAINED_ON, _add_part, load_weights, save_weights, with_record
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import NoPlace
 from storage.arrays.class_maps import ClassMap
 from tests.conftest import CLASSES, Survey
-from tests.flows.tasks.test_unknown import add_judgement
+from tests.flows.tasks.test_unlike_training import SEEN, of_other_scenes
 
 PLACE = NoPlace((2, 4), pixel_m=10.0)  # a pixel is a hundredth of a hectare
 GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12}
@@ -31,11 +31,11 @@ def test_changed_hectares_are_listed_by_pair_of_classes() -> None:
     """Largest ones come first, scaled by the part beyond chance; pixels without a class today are left out."""
     now = np.array([[0, 0, 1, 1], [2, UNLABELLED, 2, 2]], np.uint8)
     old = np.array([[1, 255, 0, 0], [0, 0, 255, 255]], np.uint8)
-    names = "soil", "crop", "unknown", *(f"class_{number}" for number in range(3, 16))  # one pair has the number 255
+    names = "soil", "crop", "weed", *(f"class_{number}" for number in range(3, 16))  # one pair has the number 255
     legend = names, np.zeros((16, 3), np.uint8)
-    beyond = {("soil", "crop"): 1.0, ("soil", "unknown"): 0.5}
+    beyond = {("soil", "crop"): 1.0, ("soil", "weed"): 0.5}
     found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend), beyond)
-    assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "unknown")]
+    assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "weed")]
 
 
 def test_findings_have_hectares_and_changes() -> None:
@@ -50,9 +50,13 @@ def test_findings_have_hectares_and_changes() -> None:
     assert words == f"{first}; {changed}"
 
 
-def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
+def _judged(weights: Path, folder: Path, content: dict[str, Any], *, unlike: bool = False) -> Path:
     """Write a copy of the tiny weights with the calibration of their expected scores, and return its path."""
-    return add_judgement(weights, folder / "judged.safetensors", limit, {MAP_SCORES: content})
+    path = folder / "judged.safetensors"
+    known = with_record(load_weights(weights), **{TRAINED_ON: SEEN.as_dict()})
+    save_weights(of_other_scenes(known) if unlike else known, path)
+    _add_part(path, path, MAP_SCORES, content, {})
+    return path
 
 
 def test_a_uniform_scan_has_the_expected_score_of_its_map(survey_png: Survey, weights: Path, tmp_path: Path):
@@ -81,18 +85,18 @@ def test_an_uncertain_expected_score_is_left_out(survey_png: Survey, weights: Pa
 
 
 @pytest.mark.parametrize(
-    ("spread", "unknown", "words"),
+    ("spread", "unlike", "words"),
     [
         (0.038, 0.0, "every line, 25 ms, 9.0 s, expected mIoU 92.7 ± 3.8"),
         (0.371, 0.0, "every line, 25 ms, 9.0 s$"),
         (0.038, 1.0, "every line, 25 ms, 9.0 s$"),
     ],
-    ids=["known", "spread too wide", "all of it unknown"],
+    ids=["known", "spread too wide", "all of it unlike"],
 )
-def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unknown: float, words: str) -> None:
+def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unlike: float, words: str) -> None:
     """It is left out if scenes differ too much, or if the weights do not know the field."""
     scan = {"step": 1, "exposure_ms": 25.0, "seconds": 9.0, "expected_miou": 0.927, "expected_spread": spread}
-    found = {"scans": {"taken": scan, "reference": scan}, "unknown": {"pixels": 1, "fraction": unknown, "rate": 0.01}}
+    found = {"scans": {"taken": scan, "reference": scan}, "unlike": {"fraction": unlike}}
     assert re.search(f"cheapest near the best: {words}", dict(finding_rows(found))["uniform scans"])
 
 
@@ -107,23 +111,23 @@ def test_changes_from_a_prior_map_exceed_the_expected_difference() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limit", "flags"),
+    ("unlike", "flags"),
     [
-        (1e6, {"scan_step": "2"}),
-        (1e6, {"scan_step": "1", "macs": "80%"}),
-        (1e6, {"scan_step": "1", "wavelengths": "690,700,710"}),
-        (0.2, {"scan_step": "1"}),
+        (False, {"scan_step": "2"}),
+        (False, {"scan_step": "1", "macs": "80%"}),
+        (False, {"scan_step": "1", "wavelengths": "690,700,710"}),
+        (True, {"scan_step": "1"}),
     ],
-    ids=["another step", "read in part", "other bands", "much unknown"],
+    ids=["another step", "read in part", "other bands", "other spectra"],
 )
 def test_maps_outside_of_the_calibration_have_no_expected_score(
-    survey_png: Survey, weights: Path, tmp_path: Path, limit: float, flags: dict[str, str]
+    survey_png: Survey, weights: Path, tmp_path: Path, unlike: bool, flags: dict[str, str]
 ) -> None:
     """It covers full readings of scans of one step, with the training's bands and known spectra."""
-    path = _judged(weights, tmp_path, SCORES.as_dict(), limit)
+    path = _judged(weights, tmp_path, SCORES.as_dict(), unlike=unlike)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, **flags).receipt
     assert "expected" not in receipt
-    assert limit > 1 or 0.2 < receipt["unknown"]["fraction"] < 1
+    assert not unlike or receipt["unlike"]["fraction"] == 1
     beyond = any("outside of the training data" in note for note in receipt["settings"]["notes"])
     assert beyond == ("wavelengths" in flags)
 

@@ -104,20 +104,6 @@ def image(ref: StageRef, name: str) -> np.ndarray:
     return read_array(open_group(ref.path / STORE), name)
 
 
-def test_unknown_pixels_have_no_confidence_on_the_ground_map(run: Run, stores: Stores, tmp_path: Path) -> None:
-    """Single unknown pixels get no confidence from their neighbours."""
-    classes = np.zeros(SHAPE, np.uint8)
-    classes[40:70:3, 50:90:3] = 1
-    confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
-    legend = (("crop", "unknown"), np.array([[0, 255, 0], [255, 0, 255]], np.uint8))
-    write_class_map(tmp_path / "out_of_range" / "class_map.zarr", class_maps.ClassMap(classes, confidence, *legend))
-    believe(tmp_path / "out_of_range", np.where(classes == 1, np.nan, 0).astype(np.float32))
-    ref = draw(run, (StageRef("segment", "s", tmp_path / "out_of_range"), stores[1]))
-    found = image(ref, "classes")
-    assert (found == 1).sum() > 50
-    np.testing.assert_array_equal(np.isnan(image(ref, "confidence")), found != 0)
-
-
 def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores) -> None:
     """Each scene pixel's class is at the end of its ray; the picture brightens towards the rig, as the mosaic does."""
     ref = draw(run, stores)

@@ -75,17 +75,14 @@ def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path:
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
 
 
-def test_new_weights_have_a_training_record_and_an_ood_detector(out: Path, tmp_path: Path):
-    """Validation scenes fit the detector; without such scenes the weights have none, and a note says so."""
+def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
+    """It has the ranges of the training data, and the calibration by validation scenes."""
     field = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004"))
     record = train_weights(_request(field, out, validation=1))
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
-    part = describe_weights(out).ood_detector
-    assert part.trained_on == told
-    assert "no scene was kept" in train_weights(_request(field, out, validation=0))["familiar"]
-    assert describe_weights(out).ood_detector is None
+    assert describe_weights(out).map_scores is None  # of a single exposure
 
 
 @pytest.mark.parametrize("sizes", [{"patch": 24}, {"tokens": {"dim": 18}}])
@@ -261,7 +258,7 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
     tables = [scans["miou"], *scans["per_class_iou"].values()]
     assert all(np.shape(table) == (4, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
     assert np.shape(scans["spread"]) == (4, 5)
-    scores = describe_weights(out).ood_detector.map_scores
+    scores = describe_weights(out).map_scores
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2, 4, 8), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
 

@@ -60,17 +60,6 @@ def test_unknown_pixels_belong_to_no_class() -> None:
     assert gain[2:] == pytest.approx((2 / 3 - 0.03) / 6, rel=1e-5)
 
 
-def test_a_captured_pixel_without_a_class_has_no_gain() -> None:
-    """A pond that was captured a week ago would look the same again. It ages like the rest."""
-    probabilities = believed(0.8)
-    probabilities[:4, :4] = np.nan
-    errors = PatchExpectedErrors.of([(probabilities, np.full((8, 12), 7.0))], GRID, 3)
-    gain = errors.expected_gain(np.zeros(3))
-    assert gain[0] == 0
-    assert (gain[1:] > 0).all()
-    assert (errors.age_days == 7).all()
-
-
 def test_a_certain_pixel_is_known() -> None:
     """The probability of another class may be too small for a float32."""
     probabilities = believed(1 - 1e-7, kind=1)

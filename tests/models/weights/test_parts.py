@@ -1,22 +1,20 @@
-"""Parts of a weights file, detector and reader: added parts are read; damaged or unfit ones are refused."""
+"""Parts of a weights file, reader and calibration: added parts are read; damaged or unfit ones are refused."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from models.network.ood import OodDetector
+from models.evaluation.expected_scores import MapScores
 from models.network.sizes import TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.weights import files
 from pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
-from tests.models.network.test_ood import some_limits
 
 SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
 
@@ -26,14 +24,6 @@ def path(tmp_path: Path) -> Path:
     """Return the path of a file of small weights."""
     files.save_weights(make_weights(), tmp_path / "own.safetensors")
     return tmp_path / "own.safetensors"
-
-
-def with_ood(path: Path) -> None:
-    """Add an out-of-distribution detector to the weights."""
-    columns = files.describe_weights(path).config.columns
-    one = np.eye(columns)
-    measured = OodDetector(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
-    files.add_ood(path, measured, SEEN, {"scenes": 48})
 
 
 def with_reader(path: Path, **changed: int) -> None:
@@ -47,26 +37,20 @@ def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
     """Both parts are read in any order; each has a key of its own, which adding it again does not change."""
     bare = files.describe_weights(path)
     weights = files.load_weights(path)
-    assert (bare.ood_detector, bare.reader) == (None, None)
-    for add in (with_ood, with_reader, with_ood):
-        add(path)
+    assert (bare.map_scores, bare.reader) == (None, None)
+    scores = MapScores((1,), (100.0,), np.zeros((1, 1, 3)), np.zeros((1, 1)), 4)
+    files.add_map_scores(path, scores)
+    with_reader(path)
+    files.add_map_scores(path, scores)
     told = files.describe_weights(path)
     assert told.key == bare.key
-    assert (told.ood_detector.trained_on, told.ood_detector.record) == (SEEN, {"scenes": 48})
+    assert told.map_scores.as_dict() == scores.as_dict()
     assert told.reader.record == {"seed": 1}
     files.add_reader(path, path, files.load_reader(path), {"seed": 1})
     again = files.describe_weights(path)
-    assert (again.reader.key, again.ood_detector) == (told.reader.key, told.ood_detector)
-    assert files.load_ood(path).limits.steps == (1, 2)
+    assert again.reader.key == told.reader.key
     for name, tensor in files.load_weights(path).segmenter.state_dict().items():
         torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(("load", "words"), [(files.load_ood, "--validation"), (files.load_reader, "--train-temporal")])
-def test_the_error_of_a_missing_part_names_the_command(path: Path, load: Callable[[Path], object], words: str) -> None:
-    """The error names the file and the command that makes the part."""
-    with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):
-        load(path)
 
 
 def test_training_description_round_trips() -> None:
@@ -75,16 +59,21 @@ def test_training_description_round_trips() -> None:
     assert [files.TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
 
 
-@pytest.mark.parametrize(("add", "load"), [(with_ood, files.load_ood), (with_reader, files.load_reader)])
-def test_every_flipped_bit_is_found(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
+def test_a_missing_reader_names_the_command(path: Path) -> None:
+    """The error names the file and the command that makes the reader."""
+    with pytest.raises(WeightsError, match=r"own\.safetensors.*spectralzoom train DATASET --train-temporal"):
+        files.load_reader(path)
+
+
+def test_every_flipped_bit_is_found(path: Path) -> None:
     """The bits are drawn from the part's own tensors and from the description; the error names the file."""
-    add(path)
+    with_reader(path)
     whole = path.read_bytes()
     rng = np.random.default_rng(0)
     size = 8 + int.from_bytes(whole[:8], "little")
     header = json.loads(whole[8:size])
     told = header.pop("__metadata__")["about"]
-    own = [one["data_offsets"] for name, one in header.items() if name.startswith(("familiar.", "memory."))]
+    own = [one["data_offsets"] for name, one in header.items() if name.startswith("memory.")]
     start = whole.index(b'{\\"')
     places = [*(size + rng.integers(*ends) for ends in own * 3), *(start + rng.integers(0, len(told), 40))]
     for place in places:
@@ -92,7 +81,7 @@ def test_every_flipped_bit_is_found(path: Path, add: Callable[[Path], None], loa
         damaged[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
         with pytest.raises(WeightsError, match=r"cannot read .*own\.safetensors"):
-            load(path)
+            files.load_reader(path)
 
 
 @pytest.mark.parametrize(
@@ -118,16 +107,13 @@ def test_a_reader_with_nan_is_refused(path: Path) -> None:
 
 
 def test_loaded_weights_survive_overwriting_the_file(path: Path) -> None:
-    """During a survey another file may be copied onto it: weights, reader and limits stay those that were checked."""
-    with_ood(path)
+    """During a survey another file may be copied onto it: weights and reader stay those that were checked."""
     with_reader(path)
     weights = files.load_weights(path)
-    told = files.load_ood(path)
     numbers = files.load_reader(path).state_dict()
-    kept = told.read.copy(), weights.normalisation.whitening.copy()
+    kept = weights.normalisation.whitening.copy()
     before = {name: one.clone() for name, one in numbers.items()}
     with path.open("r+b") as opened:
         opened.write(bytes(path.stat().st_size))
-    np.testing.assert_array_equal(told.read, kept[0])
-    np.testing.assert_array_equal(weights.normalisation.whitening, kept[1])
+    np.testing.assert_array_equal(weights.normalisation.whitening, kept)
     assert all(torch.equal(numbers[name], one) for name, one in before.items())
