@@ -82,14 +82,6 @@ class EmptySceneError(SceneError):
     """A scene has no valid value."""
 
 
-class SeriesError(SceneError):
-    """A file holds several time steps, and none is selected."""
-
-    def __init__(self, message: str, steps: int) -> None:
-        super().__init__(message)
-        self.steps = steps
-
-
 class ShapeError(PipelineError, ValueError):
     """Arrays whose shapes do not fit each other."""
 

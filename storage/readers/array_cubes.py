@@ -1,13 +1,13 @@
 """Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy, .npz and .mat.
 
-Axes are found by their names, else by the number of wavelengths. Values follow from scale, offset and fill value, the
-place on the earth from a grid mapping.
+Axes are found by their names; without names they are y, x and band. Values follow from scale, offset and fill value,
+the place on the earth from a grid mapping.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, SeriesError
+from pipeline.errors import SceneError
 from pipeline.lazy import GeoBox
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
@@ -35,7 +35,6 @@ ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "dow
 _ACROSS = ("crosstrack", "across_track")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
-TIMES = ("time", "t", "date", "dates", "step", "visit")
 WAVELENGTHS = (
     *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
     *("wl", "lambda", "nm"),
@@ -98,28 +97,23 @@ class ArrayCube:
     name: str
     array: FileArray
     order: tuple[int, ...]
-    moment: tuple[int, int] | None  # axis of time, and the step on it
     notes: tuple[str, ...] = ()
 
     @property
     def dims(self) -> list[str]:
         """Return names of all axes, or those of their order if they have none."""
-        return self.array.dims or (["y", "x", "band"] if self.moment is None else ["time", "y", "x", "band"])
+        return self.array.dims or ["y", "x", "band"]
 
 
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
-    """Return the array that is named, or the only one with three axes, or the only one with wavelengths.
+    """Return the array that is named, or the only one with three axes (of ``labels``: with two), else with two.
 
-    For ``labels`` the only one with two axes comes first. ``variable`` may end in a step of time (``values:3``), or be
-    one. Only names, shapes and attributes are read. Raises SceneError: there is no such array, there are several, or
-    the axes are not y, x and band.
+    Only names, shapes and attributes are read. Raises SceneError: there is no such array, there are several, or the
+    axes are not y, x and band.
     """
-    named, step = _split_step(variable, arrays)
-    name, notes = _chosen(arrays, named, path, _AXES[labels, step is not None])
-    series = arrays[name].ndim == 4 or (labels and step is not None and arrays[name].ndim == 3)
-    moment = _moment(arrays[name], step, f"{path}:{name}" if name else str(path), unnamed=series)
-    order, more = _axes(arrays, name, path, moment)
-    return ArrayCube(name, arrays[name], order, moment, (*notes, *more))
+    name, notes = _chosen(arrays, variable, path, (2, 3) if labels else (3, 2))
+    order, more = _axes(arrays, name, path)
+    return ArrayCube(name, arrays[name], order, (*notes, *more))
 
 
 def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any], guard: Guard) -> CubeSource:
@@ -128,11 +122,8 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
     Lines of an array with scale or offset are float32, NaN where there is no value. So are whole numbers with a valid
     range but no fill value. Raises SceneError: the cube claims more than its file or the memory can hold.
     """
-    array, order, moment = cube.array, cube.order, cube.moment
-    part = [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)]
-    if moment is not None:
-        part[moment[0]] = 1
-    array.check(part)
+    array, order = cube.array, cube.order
+    array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
     unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
     stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
@@ -148,14 +139,10 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
-        selection: list[slice | int] = [slice(None)] * array.ndim
+        selection = [slice(None)] * array.ndim
         selection[order[0]] = slice(start, stop)
-        left = order
-        if moment is not None:
-            selection[moment[0]] = moment[1]
-            left = tuple(axis - (axis > moment[0]) for axis in order)
         with guard():
-            block = np.transpose(np.asarray(array[tuple(selection)]), left)
+            block = np.transpose(np.asarray(array[tuple(selection)]), order)
         native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
         native = (native[..., None] if native.ndim == 2 else native).view(stored)
         out = (native < low) | (native > high) | np.isin(native, missing[1:]) if checked else np.False_
@@ -209,22 +196,11 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
     return Bands(centres * scale, widths, f"wavelengths from the array {found}, {source}")
 
 
-_AXES = {(False, False): (3, 4, 2), (True, False): (2, 3), (False, True): (4,), (True, True): (3, 4)}
-
-
-def _split_step(variable: str | None, names: Container[str]) -> tuple[str | None, int | None]:
-    """Return name and step of ``cube``, ``cube:3`` or the step ``3`` alone."""
-    if variable is None or variable in names:
-        return variable, None
-    name, colon, step = variable.rpartition(":")
-    return (name if colon else None, int(step)) if step.isdecimal() else (variable, None)
-
-
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
     """Return the name of the array to read, and notes; numbers of ``axes`` are tried in their order."""
     if list(arrays) == [""]:
         if variable is not None:
-            raise SceneError(f"{path} holds one array, which has no name; only a step of time can be named: {path}:0")
+            raise SceneError(f"{path} holds one array, which has no name; leave :{variable} out")
         return "", ()
     tables = {name: f"{name} {array.shape}" for name, array in arrays.items() if array.ndim > 1}
     listing = f"it has {', '.join(tables.values()) or 'none'}"
@@ -236,76 +212,38 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int
         return fitting[0], ()
     for count in axes:
         fitting = [name for name, one in arrays.items() if one.ndim == count and one.dtype.kind in "buifc"]
-        fitting = [name for name in fitting if min(arrays[name].shape) > 1] or fitting  # vectors come last
-        fitting = [name for name in fitting if math.prod(arrays[name].shape) > 1]
-        own = [name for name in fitting if name == "values"]
-        spectra = [name for name in fitting if _spectral_axes(arrays, arrays[name])]
-        for chosen, why in ((own, ""), (fitting, ""), (spectra, ", the only one with wavelengths")):
-            if len(chosen) == 1:
-                others = [text for name, text in tables.items() if name != chosen[0]]
-                note = f"array {chosen[0]} of the file{why}, which also has {', '.join(others[:_SHOWN])}"
-                return chosen[0], (note,) if others else ()
+        fitting = [name for name in fitting if min(arrays[name].shape) > 1] or fitting  # vectors of .mat come last
+        if len(fitting) == 1:
+            others = [text for name, text in tables.items() if name != fitting[0]]
+            note = f"array {fitting[0]} of the file, which also has {', '.join(others[:_SHOWN])}"
+            return fitting[0], (note,) if others else ()
         if fitting:
             raise SceneError(f"{path} has several arrays with {count} axes; {listing}; name one: {path.name}:ARRAY")
     raise SceneError(f"{path} has no array of numbers with the axes y, x and band; {listing}")
 
 
-def _moment(array: FileArray, step: int | None, address: str, *, unnamed: bool) -> tuple[int, int] | None:
-    """Return axis and step of an array with an axis of time; the first of ``unnamed`` axes is time.
-
-    Raises SceneError: the array has several steps and none is named, or it lacks the step or the axis.
-    """
-    words = [_word(dim) for dim in array.dims]
-    known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
-    first = 0 if unnamed and not any(words) else None
-    axis = next((at for at, word in enumerate(words) if known and word in TIMES), first)
-    if axis is None:
-        if step is not None:
-            raise SceneError(f"{address} has the shape {array.shape} and no axis of time; leave :{step} out")
-        return None
-    steps = array.shape[axis]
-    if step is None and steps > 1:
-        raise SeriesError(
-            f"{address} has the shape {array.shape} and {steps} steps of time; name one, {address}:0 to "
-            f"{address}:{steps - 1}",
-            steps,
-        )
-    if step is not None and step >= steps:
-        raise SceneError(f"{address} has {steps} steps of time, counted from 0; got :{step}")
-    return axis, step or 0
-
-
-def _axes(
-    arrays: Arrays, name: str, path: Path, moment: tuple[int, int] | None
-) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the axes of rows, columns and (if there are some) bands; and notes."""
+def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the axes of rows, columns and (if there are some) bands, by their names or in this order; and notes."""
     array = arrays[name]
     named = array.dims
-    own = [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
-    if len(own) not in (2, 3):
+    if array.ndim not in (2, 3):
         raise SceneError(
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
         )
-    if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS, *TIMES) or dim in arrays for dim in named):
-        spectral = [axis for axis in _spectral_axes(arrays, array) if axis in own]
-        if len(own) == 2 or len(spectral) != 1 or spectral == own[-1:]:
-            return tuple(own), (UNNAMED,)
-        rest = [axis for axis in own if axis not in spectral]
-        return (*rest, *spectral), (f"dims have no names, read as y, x and band: axis {spectral[0]} (from 0) is band",)
-    words = {axis: _word(named[axis]) for axis in own}
-    found = [[at for at, word in words.items() if word in known] for known in (ROWS, COLUMNS, BANDS)]
-    found[2] = found[2] or [at for at in words if _is_spectral(arrays.get(named[at]))]
-    if any(len(places) != 1 for places in found[: len(own)]) or (len(own) == 2 and found[2]):
+    if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS) or dim in arrays for dim in named):
+        counts = {math.prod(one.shape) for key, one in arrays.items() if one.ndim and _word(key) in WAVELENGTHS}
+        if array.ndim == 3 and counts & set(array.shape[:2]) and array.shape[2] not in counts:
+            raise SceneError(
+                f"{path} holds shape {array.shape} without names of its axes and {max(counts)} wavelengths; expected"
+                " (y, x, band): store it in this order, or name the axes"
+            )
+        return tuple(range(array.ndim)), (UNNAMED,)
+    words = [_word(dim) for dim in named]
+    found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
+    found[2] = found[2] or [at for at, dim in enumerate(named) if _is_spectral(arrays.get(dim))]
+    if any(len(places) != 1 for places in found[: array.ndim]) or (array.ndim == 2 and found[2]):
         raise SceneError(f"{path} has dims {', '.join(named)}; expected y, x, band (or band, y, x); rename them")
-    return tuple(places[0] for places in found[: len(own)]), ()
-
-
-def _spectral_axes(arrays: Arrays, array: FileArray) -> list[int]:
-    """Return the axes that are named by a spectral coordinate, else those as long as the wavelengths."""
-    known = [arrays[name].shape for name in arrays if _word(name) in WAVELENGTHS]
-    lengths = {max(shape) for shape in known if shape and max(shape) == math.prod(shape)}
-    by_name = [axis for axis, dim in enumerate(array.dims) if _is_spectral(arrays.get(dim))]
-    return by_name or [axis for axis, size in enumerate(array.shape) if size in lengths]
+    return tuple(places[0] for places in found[: array.ndim]), ()
 
 
 def _is_spectral(coordinate: FileArray | None) -> bool:

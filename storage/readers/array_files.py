@@ -1,11 +1,8 @@
-"""List the arrays of .npy, .npz, .mat, NetCDF and HDF5 files, with the products of EMIT, PRISMA and NEON.
+"""List the arrays of .npy, .npz, .mat, NetCDF and HDF5 files.
 
 Files are listed by their headers, and only the array wanted is read. Python objects, cells and structures are not read,
-nor links and virtual arrays of HDF5, which may lead to any file.
-
-EMIT's files follow CF, except for wavelengths and good bands, which lie in a group of their own. NEON has its own names
-for scale, no-data value and place. PRISMA has a cube for each of its two spectrometers, and scale, wavelengths and
-place as attributes of the file. The layouts are those that the providers publish; no such file was at hand.
+nor links and virtual arrays of HDF5, which may lead to any file. EMIT's files follow CF, except for wavelengths and
+good bands, which lie in a group of their own.
 """
 
 from __future__ import annotations
@@ -14,20 +11,19 @@ import importlib
 import mmap
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from affine import Affine
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import GeoBox, h5py, odc_geobox
-from storage.readers.array_cubes import ArrayCube, Arrays, FileArray, place_or_note
-from storage.readers.cube_sources import BLOCK_LINES, DEFLATE_RATIO, Bands, CubeSource, Guard, read_by_chunks, unpacked
+from pipeline.lazy import h5py
+from storage.readers.array_cubes import Arrays, FileArray
+from storage.readers.cube_sources import DEFLATE_RATIO
 
 ARRAY_ENDINGS = (".npy", ".npz", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
@@ -37,8 +33,6 @@ _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
-_PRISMA = "HDFEOS/SWATHS/PRS_L2{}_HCO/Data Fields/{}_Cube"
-_PRISMA_TOP = 65535  # the number of the greatest value
 
 
 def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
@@ -156,13 +150,14 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     stored = path.stat().st_size
 
     def visit(name: str, item: Any) -> None:
-        """Add an array of numbers, or a single text such as NEON's map info."""
+        """Add an array of numbers, or a single text such as GDAL's grid mapping."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
         about = _plain(item.attrs)
         is_text = item.dtype.kind in "SO" and not item.ndim
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
-            attributes = {**about, **_as_cf(about, item)}
+            dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
+            attributes = {**about, "_ARRAY_DIMENSIONS": dims} if any(dims) else about
             chunks = item.chunks or (1,) * item.ndim
             read = partial(_read, path, name)
             arrays[name] = FileArray(f"{path}:{name}", item.shape, item.dtype, attributes, read, chunks, stored)
@@ -175,20 +170,6 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
     with h5py.File(path, "r") as file:
         return np.asarray(file[name][part])
-
-
-def _as_cf(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
-    """Return names of axes, and NEON's scale, no-data value and unit, as attributes of CF."""
-    dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
-    scale = about.get("Scale_Factor") or about.get("Scale Factor")  # a divisor, unlike CF's scale_factor
-    void = about.get("Data_Ignore_Value", about.get("data ignore value"))
-    known = {
-        "_ARRAY_DIMENSIONS": dims if any(dims) else None,
-        "scale_factor": None if scale is None else 1 / float(scale),
-        "_FillValue": None if void is None else float(void),
-        "units": about.get("units", about.get("Units")),
-    }
-    return {name: value for name, value in known.items() if value is not None}
 
 
 def _plain(attributes: Any) -> dict[str, Any]:
@@ -224,96 +205,3 @@ def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:
         if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
             return tuple(np.flatnonzero(array[...] == 0).tolist())
     return ()
-
-
-def other_place(arrays: Arrays, cube: ArrayCube, shape: tuple[int, int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid by NEON's map info and EPSG code, else a note on a place that is not read."""
-    folder = f"{cube.name.rpartition('/')[0]}/Metadata/Coordinate_System"
-    if f"{folder}/Map_Info" in arrays and f"{folder}/EPSG Code" in arrays:
-        texts = [arrays[f"{folder}/{name}"][()] for name in ("Map_Info", "EPSG Code")]
-        info, code = (str(np.asarray(text).astype(np.str_).reshape(-1)[0]) for text in texts)
-        return place_or_note(lambda: _place_of_neon(info, code, shape[:2]))
-    if "glt_x" in {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}:
-        return None, (
-            "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
-            " orthorectified by its geolocation grids (glt_x, glt_y) first",
-        )
-    return None, ()
-
-
-def _place_of_neon(info: str, code: str, shape: tuple[int, int]) -> GeoBox:
-    fields = [field.strip() for field in info.split(",")]
-    x, y, east, north, wide, high = map(float, fields[1:7])
-    if any(field.lower().startswith("rotation") and float(field.partition("=")[2]) for field in fields):
-        raise ValueError(f"map info {info!r} is turned")
-    corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
-    return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(code)}")
-
-
-def prisma_cube(
-    path: Path, arrays: Arrays, about: Mapping[str, Any], variable: str | None, guard: Guard
-) -> CubeSource | None:
-    """Return both cubes (y, band, x) of a PRISMA product as one, its used bands by ascending wavelength.
-
-    Pixels that are 0 in every band lie outside the swath. None if the file is of another kind. Raises SceneError: the
-    product has another level, or one of its arrays was named.
-    """
-    if not any(name.startswith("HDFEOS/SWATHS/PRS_") for name in arrays):
-        return None
-    level = next((one for one in "DCB" if _PRISMA.format(one, "VNIR") in arrays), None)
-    if level is None or variable is not None:
-        raise SceneError(
-            f"{path} is no PRISMA product of level 2B, 2C or 2D, or one of its arrays was named; give such a product by"
-            " its name alone, and --bands for some of its bands"
-        )
-    parts = [(part, arrays[_PRISMA.format(level, part.upper())]) for part in ("Vnir", "Swir")]
-    lines, _, samples = parts[0][1].shape
-    known = [np.stack([np.ravel(about[f"List_{kind}_{part}"]) for kind in ("Cw", "Fwhm")]) for part, _ in parts]
-    if any(array.shape != (lines, nm.shape[1], samples) for (_, array), nm in zip(parts, known, strict=True)):
-        raise SceneError(
-            f"{path} has cubes {[array.shape for _, array in parts]} (y, band, x), expected one size (y, x) and "
-            f"{[len(nm[0]) for nm in known]} bands, as it has wavelengths; copy the file again"
-        )
-    lows, highs = ([float(about[f"L2Scale{part}{end}"]) for part, _ in parts] for end in ("Min", "Max"))
-    scales = [(high - low) / _PRISMA_TOP for low, high in zip(lows, highs, strict=True)]
-    for _, array in parts:
-        array.check((BLOCK_LINES, *array.shape[1:]))
-    centres, widths = np.concatenate(known, axis=1).astype(np.float64)
-    used = np.flatnonzero(centres > 0)
-    order = used[np.argsort(centres[used], kind="stable")]
-
-    def read(start: int, stop: int) -> NDArray[Any]:
-        """Return some lines (line, sample, band)."""
-        with guard():
-            raw = [np.moveaxis(array[start:stop], 1, 2) for _, array in parts]
-        values = [unpacked(block, scale, low, None) for block, scale, low in zip(raw, scales, lows, strict=True)]
-        found = np.concatenate(values, axis=2)[..., order]
-        found[np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])] = np.nan
-        return found
-
-    geobox, notes = (
-        place_or_note(lambda: _place_of_prisma(about, (lines, samples)))
-        if level == "D"
-        else (None, ("it has no map grid",))
-    )
-    unused = len(centres) - len(order)
-    return CubeSource(
-        name=path.name,
-        shape=(lines, samples, len(order)),
-        dtype=np.dtype(np.float32),
-        read=read_by_chunks(read, lines, max(array.chunks[0] for _, array in parts)),
-        files=(path,),
-        bands=Bands(centres[order], widths[order], "wavelengths from List_Cw of the file"),
-        geobox=geobox,
-        notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
-    )
-
-
-def _place_of_prisma(about: Mapping[str, Any], shape: tuple[int, int]) -> GeoBox:
-    """Return the grid between the centres of the upper left and the lower right pixel."""
-    (west, north), (east, south) = (
-        [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")] for corner in ("UL", "LR")
-    )
-    wide, high = (east - west) / (shape[1] - 1), (north - south) / (shape[0] - 1)
-    corner = Affine(wide, 0, west - wide / 2, 0, -high, north + high / 2)
-    return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(about['Epsg_Code'])}")

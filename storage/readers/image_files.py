@@ -1,6 +1,6 @@
 """Open images as cubes through rasterio: GeoTIFF and JPEG 2000 some rows at a time, PNG, JPEG and BMP whole.
 
-Several images of one size in a TIFF are its bands, in their order. Transparent and masked pixels have no value. Places,
+A TIFF with several images is refused. Transparent and masked pixels have no value. Places,
 wavelengths and bad bands are read from the tags of GDAL's ENVI and GeoTIFF drivers, and from band names.
 """
 
@@ -69,10 +69,15 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     driver = _DRIVERS[path.suffix.lower()]
     with _opened(path) as file:
-        pages, notes = _pages(path, file)
+        if len(file.subdatasets) > 1:
+            raise SceneError(
+                f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
+                " one (rio stack), or give the image alone in a file"
+            )
+        notes: list[str] = []
         block = max(file.block_shapes)
         item = max(np.dtype(one).itemsize for one in file.dtypes)
-        claimed = (file.height, file.width, file.count * len(pages))
+        claimed = (file.height, file.width, file.count)
         _check_size(path, driver, claimed, item, math.prod(block) * file.count)
         kinds = [kind.name for kind in file.colorinterp]
         if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
@@ -83,31 +88,28 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
-        one = len(pages) == 1
-        known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path) if one else (Bands(), ())
+        known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path)
         notes = [*notes, *([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
-        scale, offset = (np.tile([of[band] for band in keep], len(pages)) for of in (file.scales, file.offsets))
+        scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
         def read_rows(first: int, last: int) -> NDArray[Any]:
             """Return some rows, (y, x, band) (SceneError: they are damaged)."""
-            planes = []
-            for page in pages:
-                with _opened(path, page) as opened:
-                    planes.append(opened.read([band + 1 for band in keep], window=((first, last), (0, width))))
-            return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
+            with _opened(path) as opened:
+                planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
+            return np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
 
         bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
-            shape=(height, width, len(keep) * len(pages)),
+            shape=(height, width, len(keep)),
             dtype=kind,
             read=read_by_chunks(read_rows, height, at_once),
             files=(path,),
             bands=known,
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
-            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad) if one else (),
+            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad),
             void=_void(file, alpha),
             notes=tuple(notes),
         )
@@ -161,29 +163,17 @@ def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.
 
 
 @contextmanager
-def _opened(path: Path, image: str = "") -> Iterator[Any]:
-    """Open the first or another image of a file (SceneError: it is damaged, or of another kind)."""
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a file (SceneError: it is damaged, or of another kind)."""
     rasterio = importlib.import_module("rasterio")
     driver = _DRIVERS[path.suffix.lower()]
     with warnings.catch_warnings(), rasterio.Env(**_STRICT):
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         with (
             reading(path, _CALLED.get(driver, path.suffix.lower()), "Copy it again, or save it as PNG or TIFF"),
-            rasterio.open(image or path, driver=driver) as file,
+            rasterio.open(path, driver=driver) as file,
         ):
             yield file
-
-
-def _pages(path: Path, first: Any) -> tuple[list[str], list[str]]:
-    """Return names of the images that are bands of one cube, and notes; only the first if others differ."""
-    names = list(first.subdatasets)
-    if len(names) < 2:
-        return [""], []
-    for name in names:
-        with _opened(path, name) as other:
-            if (other.shape, other.dtypes) != (first.shape, first.dtypes):
-                return [""], [f"the first of {len(names)} images in the file, which are of several kinds"]
-    return names, [f"{len(names)} images of one size in the file are taken as its bands"]
 
 
 def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import colorsys
-import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import skimage
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
@@ -40,40 +39,12 @@ _EIGHT_COLOURS = (
     (90, 90, 90),
 )
 
-# and hues, from which the most different one is taken
+# and hues, far from the one before
 DEFAULT_COLOURS: tuple[Colour, ...] = _EIGHT_COLOURS + tuple(
     (round(255 * red), round(255 * green), round(255 * blue))
     for saturation, value in ((0.8, 0.95), (0.5, 0.95), (0.8, 0.6), (0.5, 0.6))
-    for red, green, blue in (colorsys.hsv_to_rgb(turn / 24, saturation, value) for turn in range(24))
+    for red, green, blue in (colorsys.hsv_to_rgb(turn * 7 % 24 / 24, saturation, value) for turn in range(24))
 )
-ALIKE, DISTINCT = 10.0, 25.0  # distances in CIELAB
-
-# Usual colours of land cover on maps; the words of one row are synonyms.
-_COLOURS_OF_WORDS: dict[str, Colour] = {
-    word: colour
-    for words, colour in (
-        ("water river lake sea", (33, 102, 172)),
-        ("soil bare ground earth", (140, 94, 60)),
-        ("forest tree trees wood woods woodland", (0, 90, 50)),
-        ("grass grassland meadow pasture lawn", (120, 198, 80)),
-        ("crop crops cropland", (217, 178, 60)),
-        ("wheat barley rye oats grain", (240, 210, 110)),
-        ("maize corn", (255, 165, 0)),
-        ("rapeseed rape canola", (250, 235, 50)),
-        ("weed weeds", (200, 30, 90)),
-        ("road roads asphalt street track tracks", (110, 110, 110)),
-        ("building buildings roof roofs urban town", (180, 60, 50)),
-        ("sand beach", (230, 205, 150)),
-        ("snow ice", (235, 245, 255)),
-        ("shadow shadows", (45, 45, 55)),
-        ("cloud clouds", (205, 215, 225)),
-    )
-    for word in words.split()
-}
-
-
-class MixedLabelsError(SceneError):
-    """A label file has too many values for classes."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +210,7 @@ def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, whe
     found = [int(code) for code in np.unique(codes) if code != none and code >= 0]
     if len(found) > MOST_FOUND_CLASSES:
         what = "colours" if is_colour else "numbers"
-        raise MixedLabelsError(
+        raise SceneError(
             f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes: "
             f"{MIXED}"
         )
@@ -279,27 +250,8 @@ def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
 
 
 def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour] | None = None) -> NDArray[np.uint8]:
-    """Return a colour (class, 3) for each class: as stated, as in the label file, by a word of its name, or a default.
-
-    If several classes share a word, the shortest name gets its colour (`woods` before `grass_trees`), then the first.
-    """
-    words = {name: re.findall(r"[a-z]+", name.lower()) for name in classes}
+    """Return a colour (class, 3) for each class: as stated, as in the label file, or the next default one."""
     found = {name: value for name, value in classes.items() if isinstance(value, tuple)} | dict(stated or {})
-    for name in sorted(set(classes) - set(found), key=lambda name: (len(words[name]), list(classes).index(name))):
-        known = [_COLOURS_OF_WORDS[word] for word in words[name] if word in _COLOURS_OF_WORDS]
-        apart = dict(zip(known, _apart(known, found.values()), strict=True))
-        if usual := next((colour for colour in known if apart[colour] >= ALIKE), None):
-            found[name] = usual
-    for name in (name for name in classes if name not in found):
-        apart_by = _apart(DEFAULT_COLOURS, found.values())
-        distinct = np.flatnonzero(apart_by[: len(_EIGHT_COLOURS)] >= DISTINCT)
-        found[name] = DEFAULT_COLOURS[int(distinct[0] if distinct.size else np.argmax(apart_by))]
-    return np.array([found[name] for name in classes], np.uint8).reshape(-1, 3)
-
-
-def _apart(colours: Sequence[Colour], others: Iterable[Colour]) -> NDArray[np.float64]:
-    """Return the distance in CIELAB of each colour to the nearest of others; infinite without one."""
-    lab, beside = (
-        skimage.color.rgb2lab(np.array([*some], np.uint8).reshape(-1, 1, 3))[:, 0] for some in (colours, others)
-    )
-    return np.asarray(np.linalg.norm(lab[:, None] - beside[None], axis=-1).min(axis=1, initial=np.inf))
+    free = cycle([colour for colour in DEFAULT_COLOURS if colour not in found.values()] or DEFAULT_COLOURS)
+    colours = [found[name] if name in found else next(free) for name in classes]
+    return np.array(colours, np.uint8).reshape(-1, 3)

@@ -22,8 +22,6 @@ from storage.readers.array_files import (
     list_arrays,
     load_npy,
     marked_bands,
-    other_place,
-    prisma_cube,
 )
 from storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
 from storage.readers.envi_files import (
@@ -41,14 +39,14 @@ from storage.readers.zarr_files import find_zarr_store, zarr_arrays
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 _WITH_VARIABLE = re.compile(
-    r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+(?::\d+)?)$"
-    r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+(?::\d+)?)$",
+    r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+)$"
+    r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+)$",
     re.IGNORECASE | re.DOTALL,
 )
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """Return path and variable of ``scene.mat:cube``, the latter with its step of time (``cube:3``)."""
+    """Return path and variable of ``scene.mat:cube``."""
     found = _WITH_VARIABLE.match(str(address))
     if found is None:
         return Path(address), None
@@ -78,7 +76,7 @@ def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image
 def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
     """Open a cube; only headers, and coordinates of arrays, are read.
 
-    ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. A Headwall folder's reference frames are
+    ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
     averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred. Raises
     SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
     """
@@ -118,27 +116,22 @@ def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
 def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource:
     """Open an array of a file or Zarr store as a cube; only attributes and coordinates are read.
 
-    ``variable`` is its name, alone or with its groups (``SERC/Reflectance/Reflectance_Data``), and may end in a step of
-    time (``values:3`` or ``3``). Raises SceneError: the file is damaged, or claims far more than it can hold; it has no
-    such array or several; or the axes are not y, x and band.
+    ``variable`` is its name, alone or with its groups (``SERC/Reflectance/Reflectance_Data``). Raises SceneError: the
+    file is damaged, or claims far more than it can hold; it has no such array or several; or the axes are not y, x and
+    band.
     """
     ending = path.suffix.lower()
     guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
     with guard():
         arrays, about = zarr_arrays(path) if path.is_dir() else list_arrays(path)
-        if (prisma := prisma_cube(path, arrays, about, variable, guard)) is not None:
-            return prisma
         cube = find_cube(arrays, variable, path, labels=labels)
         near = in_scope(arrays, cube.name)
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
         notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
         notes += [f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else []
-        geobox, where = (source.geobox, ()) if source.geobox is not None else other_place(near, cube, source.shape)
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
-        source = replace(
-            source, bad_bands=marked_bands(near, source.shape[2]), geobox=geobox, notes=(*notes, *plain, *where)
-        )
+        source = replace(source, bad_bands=marked_bands(near, source.shape[2]), notes=(*notes, *plain))
         if path.is_dir():
             source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
         return source

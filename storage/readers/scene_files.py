@@ -73,14 +73,14 @@ def open_scene_file(
 ) -> SceneFile:
     """Open a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
 
-    ``address`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
-    are y, x, band; two axes are one band. All values are read once for gaps; only with ``keep``, and of images, .mat
-    and .npz, they stay in memory. Arguments take precedence over the ``scene.toml`` beside the file, and that over the
-    file. ``labels`` are class numbers or colours on the same pixels, or polygons; others are found by their names.
-    ``bands`` count from 0; ``wavelengths`` [nm] are one for each band used or for each of the file. ``classes`` replace
-    those of a scene.toml that has none. Labels found by their names that cannot be used are left out with a note unless
-    ``labels_needed``. Raises SceneError: a file is missing, damaged, or of a kind or shape that cannot be used, or the
-    labels do not fit; WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
+    ``address`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``. Axes are y, x, band; two axes are one band. All
+    values are read once for gaps; only with ``keep``, and of images, .mat and .npz, they stay in memory. Arguments take
+    precedence over the ``scene.toml`` beside the file, and that over the file. ``labels`` are class numbers or colours
+    on the same pixels, or polygons; others are found by their names. ``bands`` count from 0; ``wavelengths`` [nm] are
+    one for each band used or for each of the file. ``classes`` replace those of a scene.toml that has none. Labels
+    found by their names that cannot be used are left out with a note unless ``labels_needed``. Raises SceneError: a
+    file is missing, damaged, or of a kind or shape that cannot be used, or the labels do not fit; WavelengthError:
+    wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(address)
     source = open_cube(address)

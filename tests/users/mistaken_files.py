@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 import rasterio
 import scipy.io
-import xarray as xr
 import zarr
 from PIL import Image
 
@@ -72,7 +71,6 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         np.save(here / f"{name}.npy", values)
     np.save(here / "objects.npy", np.array([{"soil": 1}], object), allow_pickle=True)
     np.savez(here / "two.npz", north=cube, south=cube)
-    np.savez(here / "series.npz", visits=np.stack([cube, cube + 1]), days=np.arange(2))
 
 
 def _containers(here: Path, cube: np.ndarray) -> None:
@@ -94,8 +92,6 @@ def _containers(here: Path, cube: np.ndarray) -> None:
         here / "geo.tif", "w", "GTiff", 16, 12, 5, "EPSG:25832", rasterio.Affine(1, 0, 5e5, 0, -1, 5e6), "float32"
     ) as file:
         file.write(np.moveaxis(cube, 2, 0))
-    stack = np.stack([cube, cube + 1])
-    xr.Dataset({"values": (("time", "y", "x", "band"), stack)}).to_zarr(here / "series.zarr", consolidated=False)
     old = zarr.create_group(here / "old.zarr", zarr_format=2)
     old.create_array("0", data=cube)
     zarr.create_group(here / "hollow.zarr")

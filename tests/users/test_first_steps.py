@@ -102,31 +102,6 @@ def test_the_advised_evaluation_command_works(tiles: Path, tmp_path: Path, comma
 # --- init -------------------------------------------------------------------------------------------------------------
 
 
-def test_init_uses_a_land_cover_file_as_labels_of_all_dates(tmp_path: Path, command_line: Any) -> None:
-    """Five dates and LULC.npy are five images with one label file, and the advised training runs."""
-    np.save(tmp_path / "LULC.npy", CLASSES)
-    for month in range(5, 10):
-        np.save(tmp_path / f"2024-{month:02d}-01.npy", image().astype(np.float32))
-    ended = command_line("init", tmp_path)
-    assert "5 images, 5 with labels; the first has 32 x 32 px, 3 bands" in ended.out
-    toml = (tmp_path / "scene.toml").read_text()
-    assert 'labels = "LULC.npy"' in toml
-    (tmp_path / "scene.toml").write_text("wavelengths_nm = [460, 550, 640]\n" + toml)
-    assert f"then: spectralzoom train {tmp_path} " in ended.out
-    trained = command_line("train", tmp_path, "-o", tmp_path / "w.safetensors", *SMALL)
-    assert trained.code == 0, trained.err
-
-
-def test_init_finds_the_dates_of_a_series(tmp_path: Path, command_line: Any) -> None:
-    """An array of five dates beside LULC.npy is a series with labels; the advised command uses its first date."""
-    np.save(tmp_path / "LULC.npy", CLASSES)
-    np.save(tmp_path / "series.npy", np.stack([image() for _ in range(5)]).astype(np.float32))
-    ended = command_line("init", tmp_path)
-    series = tmp_path / "series.npy"
-    assert f"note: {series} has 5 steps of time; each is a scene, {series}:0 to {series}:4" in ended.out
-    assert f"then: spectralzoom train {series}:0 " in ended.out
-
-
 @pytest.mark.parametrize("way", ["list", "file"])
 def test_init_names_the_wavelengths_that_its_next_command_needs(
     tmp_path: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch, way: str
@@ -137,9 +112,7 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
     np.save(tmp_path / "field_labels.npy", CLASSES)
     told = json.loads(command_line("init", ".", "--json").out)
     toml = tmp_path / "scene.toml"
-    assert (
-        told["first"] == "write the 3 wavelengths into scene.toml: wavelengths_nm or wavelengths_file, as its lines say"
-    )
+    assert told["first"] == "write the 3 wavelengths into scene.toml, as its lines say"
     line = "# wavelengths_nm = []" if way == "list" else '# wavelengths_file = "bands.txt"'
     assert line in toml.read_text()
     toml.write_text(toml.read_text().replace(line, line.removeprefix("# ").replace("[]", "[460, 550, 640]")))

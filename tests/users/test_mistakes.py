@@ -7,7 +7,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
@@ -60,9 +59,7 @@ CASES = {
     "several arrays": (1, SURVEY + "two.npz" + BANDS, r"north \(12, 16, 5\), south.*name one: two.npz:ARRAY"),
     "no such variable": (1, SURVEY + "two_cubes.mat:west" + BANDS, r"no array west; it has north \(12, 16, 5\)"),
     "a table as a scene": (1, SURVEY + "table.npy --wavelengths 550", "table of 198 x 10000"),
-    "series without a step": (1, SURVEY + "series.npy" + BANDS, "3 steps of time.*series.npy:0 to .*series.npy:2"),
-    "step that is not there": (1, SURVEY + "series.npy:3" + BANDS, "3 steps of time, counted from 0; got :3"),
-    "step of what is no series": (1, SURVEY + "cube.npy:0" + BANDS, "no axis of time"),
+    "series": (1, SURVEY + "series.npy" + BANDS, r"shape \(3, 12, 16, 5\); expected \(y, x, band\).* store one time"),
     "name in an array file": (1, SURVEY + "cube.npy:red" + BANDS, "one array, which has no name"),
     # wavelengths and bands
     "no wavelengths": (1, SURVEY + "cube.npy", "nothing says their wavelengths; .* or give survey --wavelengths"),
@@ -119,7 +116,6 @@ CASES = {
     "init of nothing": (1, "init none", "no file or folder none"),
     "init of a broken picture": (1, "init text.png", "text.png cannot be read"),
     "init of a folder of dates": (1, "init season", "in its folders 2024-05-01, 2024-06-01: name one"),
-    "init of soft labels": (1, "init soft", "768 different colours.* hard edges"),
     "init twice": (2, "init bad_key", "bad_key/scene.toml exists.*--force"),
     # archives
     "folder that is no archive": (1, "export apart -o maps", "apart"),
@@ -156,8 +152,6 @@ WORKS = {  # address, wavelengths, shape (y, x, band), and the expected note
     "nm beside it": ("with_nm.mat", None, (12, 16, 5), "the array wavelengths, without a unit, read by their size"),
     "MATLAB 7.3": ("seven.mat", NM, (12, 16, 5), ""),
     "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
-    "step of a series": ("series.npy:1", NM, (12, 16, 5), ""),
-    "step of a named array": ("series.npz:visits:0", NM, (12, 16, 5), ""),
     "Zarr v2 of another tool": ("old.zarr", NM, (12, 16, 5), "dims have no names"),
     "micrometres in a header": ("micro.hdr", None, (12, 16, 5), "micrometre|micro"),
     "GeoTIFF": ("geo.tif", NM, (12, 16, 5), ""),
@@ -172,14 +166,6 @@ def test_unusual_but_valid_files_are_read(case: str, files: Path) -> None:
     scene = load_scene_file(f"{files}/{address}", wavelengths=nm)
     assert scene.values.shape == shape
     assert re.search(words, "; ".join(scene.provenance))
-
-
-def test_a_time_step_is_read_by_its_number(files: Path) -> None:
-    """Steps count from 0, in .npy, .npz and Zarr."""
-    nm = [float(one) for one in NM.split(",")]
-    cube = np.load(files / "cube.npy")
-    for address, more in {"series.npy:2": 2, "series.npz:1": 1, "series.zarr:1": 1}.items():
-        np.testing.assert_array_equal(load_scene_file(f"{files}/{address}", wavelengths=nm).values, cube + more)
 
 
 def test_a_byte_order_mark_in_a_settings_file_is_ignored(files: Path) -> None:

@@ -63,9 +63,10 @@ def test_init_keeps_an_existing_scene_toml(made: Path, command_line: Any) -> Non
     assert command_line("init", made / "bad_key", "--force").code == 0
     assert load_scene_settings(made / "bad_key" / "scene.toml").classes == {"class_0": 0, "class_1": 1}
     assert (made / "bad_key" / "scene.toml.old").read_bytes() == old
-    (made / "soft" / "scene.toml").write_text("nodata = 0\n")
-    command_line("init", made / "soft", "--force").refused(1, "different colours")
-    assert (made / "soft" / "scene.toml").read_text() == "nodata = 0\n"
+    (made / "hollow" / "labels").mkdir(parents=True)
+    (made / "hollow" / "scene.toml").write_text("nodata = 0\n")
+    command_line("init", made / "hollow", "--force").refused(1, "holds no image")
+    assert (made / "hollow" / "scene.toml").read_text() == "nodata = 0\n"
 
 
 def test_init_lists_unusable_files_and_missing_facts(made: Path, command_line: Any) -> None:
@@ -73,6 +74,7 @@ def test_init_lists_unusable_files_and_missing_facts(made: Path, command_line: A
     for folder, words in {
         "lacking": ["labels of 1 image, left out", "the image of 1 label file: 009.png"],
         "sizes": ["002.png are 9 x 32 px, the scene is 24 x 32 px"],
+        "soft": ["different colours"],
         "other_bands": ["002.png has 1 bands, the first image 3"],
         "soil": ["a second class: all labels are class_0"],
         "bare": ["label files: beside an image NAME.png"],

@@ -1,4 +1,4 @@
-"""NetCDF and HDF5 cubes: published layouts of EMIT, PRISMA and NEON, CF files of xarray, and damaged files."""
+"""NetCDF and HDF5 cubes: the published layout of EMIT, CF files of xarray, and damaged files."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def emit_file(path: Path) -> NDArray[np.float32]:
 
 
 def test_emit_reflectance_is_read(tmp_path: Path) -> None:
-    """Values, wavelengths, widths and bad bands are EMIT's; a note says that there is no map grid."""
+    """Values, wavelengths, widths and bad bands are EMIT's; pixels in the sensor's geometry have no map grid."""
     values = emit_file(tmp_path / "emit.nc")
     source = open_cube(tmp_path / "emit.nc")
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
@@ -62,79 +62,6 @@ def test_emit_reflectance_is_read(tmp_path: Path) -> None:
     assert np.isnan(scene.values[2, 3]).all()
     assert values[2, 3, 0] == -9999
     assert scene.geobox is None
-    assert any("sensor's own geometry" in note for note in scene.provenance)
-
-
-def neon_file(path: Path, **about: Any) -> None:
-    """Write NEON AOP reflectance: int16 (y, x, band) without named axes, everything else below Metadata."""
-    with h5py.File(path, "w") as file:
-        data = file.create_dataset("SERC/Reflectance/Reflectance_Data", data=CUBE, chunks=(2, 2, 5))
-        data[1, 1] = -9999
-        data.attrs.update({"Scale_Factor": 10000.0, "Data_Ignore_Value": -9999.0, **about})
-        below = file.create_group("SERC/Reflectance/Metadata")
-        spectra = below.create_group("Spectral_Data")
-        spectra.create_dataset("Wavelength", data=NM).attrs["Units"] = "nanometers"
-        spectra.create_dataset("FWHM", data=np.full(5, 5.8))
-        below.create_dataset("Ancillary_Imagery/Weather_Quality_Indicator", data=np.zeros((7, 6, 3), np.uint8))
-        info = "UTM, 1.000, 1.000, 400000.00, 5700000.0, 2.0, 2.0, 32, North, WGS-84, units=Meters, 0"
-        below.create_dataset("Coordinate_System/Map_Info", data=info)
-        below.create_dataset("Coordinate_System/EPSG Code", data="32632")
-
-
-def test_neon_reflectance_is_read(tmp_path: Path) -> None:
-    """Values are divided by their scale, no-data is NaN, and the grid comes from the map info."""
-    neon_file(tmp_path / "NEON_SERC.h5")
-    scene = load_scene_file(tmp_path / "NEON_SERC.h5")
-    expected = CUBE / 10000
-    expected[1, 1] = np.nan
-    np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
-    np.testing.assert_array_equal(scene.wavelength_nm, NM)
-    assert scene.fwhm_nm is not None
-    assert scene.geobox.crs.epsg == 32632
-    assert scene.geobox.affine[:6] == (2.0, 0.0, CORNER[0], 0.0, -2.0, CORNER[1])
-    with rasterio.open(f"HDF5:{tmp_path / 'NEON_SERC.h5'}://SERC/Reflectance/Reflectance_Data") as other:
-        assert other.count == 7  # GDAL takes the first axis for bands
-        np.testing.assert_array_equal(other.read(1)[3], CUBE[0, 3])
-
-
-def prisma_file(path: Path, level: str = "D", **about: Any) -> dict[str, NDArray[np.uint16]]:
-    """Write PRISMA L2: (y, band, x) of two spectrometers, wavelengths descending, 0 for bands that are not used."""
-    cubes = {"Vnir": RNG.integers(1, 65536, (7, 4, 6)), "Swir": RNG.integers(1, 65536, (7, 3, 6))}
-    for cube in cubes.values():
-        cube[0, :, 0] = 0  # outside the swath
-    cubes["Vnir"][3, 2, 3] = 0  # a dark reading
-    said: dict[str, Any] = {
-        "List_Cw_Vnir": np.array([0, 977.4, 660.3, 450.1], np.float32),
-        "List_Fwhm_Vnir": np.array([0, 13.0, 12.0, 11.0], np.float32),
-        "List_Cw_Swir": np.array([2490.0, 943.4, 0], np.float32),
-        "List_Fwhm_Swir": np.array([9.0, 10.0, 0], np.float32),
-        **{f"L2Scale{part}{end}": value for part in ("Vnir", "Swir") for end, value in (("Min", 0.1), ("Max", 0.9))},
-        "Epsg_Code": np.int64(32632),
-        "Product_ULcorner_easting": 400_015.0,
-        "Product_ULcorner_northing": 5_699_985.0,
-        "Product_LRcorner_easting": 400_165.0,
-        "Product_LRcorner_northing": 5_699_805.0,
-    }
-    with h5py.File(path, "w") as file:
-        for part, cube in cubes.items():
-            file[f"HDFEOS/SWATHS/PRS_L2{level}_HCO/Data Fields/{part.upper()}_Cube"] = cube.astype(np.uint16)
-        file.attrs.update(said | about)
-    return {part: cube.astype(np.uint16) for part, cube in cubes.items()}
-
-
-def test_prisma_reflectance_is_read(tmp_path: Path) -> None:
-    """Both spectrometers form one scaled cube by ascending wavelength; corners are centres of pixels of 30 m."""
-    cubes = prisma_file(tmp_path / "PRS_L2D.he5")
-    scene = load_scene_file(tmp_path / "PRS_L2D.he5")
-    np.testing.assert_allclose(scene.wavelength_nm, [450.1, 660.3, 943.4, 977.4, 2490.0], rtol=1e-6)
-    np.testing.assert_allclose(scene.fwhm_nm, [11, 12, 10, 13, 9])
-    expected = np.stack([cubes["Vnir"][:, 3], cubes["Vnir"][:, 2], cubes["Swir"][:, 1], cubes["Vnir"][:, 1]], axis=-1)
-    np.testing.assert_allclose(scene.values[1:, :, :4], 0.1 + expected[1:] / 65535 * 0.8, rtol=1e-6)
-    assert np.isnan(scene.values[0, 0]).all()
-    assert scene.values[3, 3, 1] == pytest.approx(0.1)  # 0 in one band is a value
-    assert scene.geobox.crs.epsg == 32632
-    assert scene.geobox.affine[:6] == (30.0, 0.0, 400_000.0, 0.0, -30.0, 5_700_000.0)
-    assert "a PRISMA product of level 2D; 2 bands without a wavelength are left out" in scene.provenance
 
 
 @pytest.mark.parametrize(
@@ -160,24 +87,26 @@ def test_cf_files_are_read(tmp_path: Path, dims: tuple[str, ...], unit: str, sca
     assert "values are in W m-2 sr-1 um-1" in scene.provenance
 
 
-def test_hdf5_without_dimension_names_is_read(tmp_path: Path) -> None:
-    """The axis whose length is the number of wavelengths is the band; a note says which."""
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["cube"] = np.moveaxis(CUBE, -1, 0)
-        file["wavelength"] = NM
+def test_hdf5_without_dimension_names_is_y_x_band(tmp_path: Path) -> None:
+    """A note says so; another order, seen by the number of wavelengths, is refused and not guessed."""
+    for name, values in (("a.h5", CUBE), ("b.h5", np.moveaxis(CUBE, -1, 0))):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["cube"] = values
+            file["wavelength"] = NM
     scene = load_scene_file(tmp_path / "a.h5")
     np.testing.assert_array_equal(scene.values, CUBE)
-    assert "dims have no names, read as y, x and band: axis 0 (from 0) is band" in scene.provenance
+    assert "dims have no names, read as y, x, band" in scene.provenance
+    with pytest.raises(SceneError, match=r"shape \(5, 7, 6\) without names of its axes and 5 wavelengths; expected"):
+        load_scene_file(tmp_path / "b.h5")
 
 
-def test_an_address_selects_variable_and_time_step(tmp_path: Path) -> None:
+def test_an_address_selects_a_variable(tmp_path: Path) -> None:
     """The name of the variable may be given with its groups or without."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["field/one"] = CUBE
         file["field/two"] = CUBE + 1
         file["wavelength"] = NM
-        file["series/days"] = np.stack([CUBE, CUBE + 7])
-    for name, more in (("field/one", 0), ("two", 1), ("series/days:1", 7)):
+    for name, more in (("field/one", 0), ("two", 1)):
         np.testing.assert_array_equal(load_scene_file(f"{tmp_path / 'a.h5'}:{name}").values, CUBE + more)
 
 
@@ -196,14 +125,6 @@ def hold(path: Path, name: str, value: Any) -> None:
         file[name] = value
 
 
-def lost_attribute(path: Path) -> None:
-    prisma_file(path)
-    with h5py.File(path, "r+") as file:
-        del file.attrs["L2ScaleSwirMax"]
-
-
-SHORT_LISTS = dict.fromkeys(("List_Cw_Vnir", "List_Fwhm_Vnir"), np.ones(3, np.float32))
-LEVEL_1 = "HDFEOS/SWATHS/PRS_L1_HCO/Data Fields/VNIR_Cube"
 NO_CUBE_AXES = xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))})
 
 
@@ -216,13 +137,10 @@ NO_CUBE_AXES = xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))
             r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them",
         ),
         (partial(hold, name="name", value="none"), "has no array of numbers with the axes y, x and band; it has none"),
-        (lost_attribute, "cannot be read as NetCDF or HDF5: KeyError: .*L2ScaleSwirMax"),
-        (partial(prisma_file, **SHORT_LISTS), r"expected one size \(y, x\) and \[3, 3\] bands, as it has wavelengths"),
-        (partial(hold, name=LEVEL_1, value=np.ones((7, 4, 6), "u2")), "is no PRISMA product of level 2B, 2C or 2D"),
     ],
 )
 def test_unusable_hdf_files_raise_one_error(write: Any, words: str, tmp_path: Path) -> None:
-    """The files are damaged, inconsistent, without a cube, or of another product."""
+    """The files are damaged, or without a cube."""
     write(tmp_path / "bad.h5")
     with pytest.raises((SceneError, WavelengthError), match=words):
         load_scene_file(tmp_path / "bad.h5")

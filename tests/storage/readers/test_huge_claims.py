@@ -171,24 +171,13 @@ def test_truncated_tiffs_are_refused(tmp_path: Path, compression: str | None, fr
         open_cube(tmp_path / "a.tif").read(0, 200)
 
 
-def test_tiff_pages_of_one_size_are_bands(tmp_path: Path) -> None:
-    """The pages are read by rows and as a whole; of pages of several sizes only the first is read, with a note."""
-    values = np.random.default_rng(0).integers(0, 4096, (7, 9, 5), dtype=np.uint16)
+def test_a_tiff_of_several_images_is_refused(tmp_path: Path) -> None:
+    """They may be bands, dates or thumbnails; the message says what is expected."""
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
-        for band in range(5):
-            file.write(values[..., band], contiguous=False)
-    source = open_cube(tmp_path / "a.tif")
-    np.testing.assert_array_equal(source.read(0, 7), values)
-    np.testing.assert_array_equal(source.read(3, 5), values[3:5])
-    np.testing.assert_array_equal(read_all(tmp_path / "a.tif"), values)
-    assert source.notes == ("5 images of one size in the file are taken as its bands",)
-    assert source.bands.wavelength_nm is None
-    with tifffile.TiffWriter(tmp_path / "b.tif") as file:
-        file.write(values[..., 0], contiguous=False)
-        file.write(values[:3, :4, 0], contiguous=False)
-    other = open_cube(tmp_path / "b.tif")
-    np.testing.assert_array_equal(other.read(0, 7), values[..., :1])
-    assert other.notes == ("the first of 2 images in the file, which are of several kinds",)
+        for _ in range(5):
+            file.write(np.ones((7, 9), np.uint8), contiguous=False)
+    with pytest.raises(SceneError, match=r"a\.tif holds 5 images, expected one with all bands; write them as"):
+        open_cube(tmp_path / "a.tif")
 
 
 VRT = """<VRTDataset rasterXSize="4" rasterYSize="3"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
