@@ -41,7 +41,7 @@ $(BIN)/.ok: pyproject.toml constraints.txt | $(BIN)/.pip $(if $(filter-out setup
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey $(SURVEY) --out $(ARCHIVE)
 
-# Runs a survey through a rig emulated behind a pty and sockets, and compares it with the simulated one. One minute.
+# Runs a survey through a fake rig, and compares it with the simulated one. One minute.
 survey-rig: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
 

@@ -21,12 +21,10 @@ import tempfile
 import time
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == "__main__":
@@ -38,7 +36,6 @@ import torch  # noqa: E402
 import xarray as xr  # noqa: E402
 
 import spectralzoom  # noqa: E402
-from flows.settings.load import load_settings  # noqa: E402
 from flows.settings.survey_settings import Settings  # noqa: E402
 from spectralzoom import OpenedRun  # noqa: E402
 
@@ -56,7 +53,7 @@ TWO_PASSES = {"budget": 0.8, **NAMED}
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 1400.0}
 AREA = ((9.5070913, 52.1094775), (9.5073837, 52.1095032), (9.5073562, 52.1096561), (9.5071223, 52.1096302))
 HOLE = ((9.5072089, 52.1095399), (9.5072673, 52.1095396), (9.5072677, 52.1095756), (9.5072093, 52.1095759))
-RIG = {"visit": "first", "rig": {"port": "golden", "pulses": "position", "white_reference": 0.99}}
+RIG = {"visit": "first", "rig": {"mirror_driver": "fake", "camera_driver": "fake"}}
 STORED = 3  # stages that a survey has stored when it is killed
 
 
@@ -122,30 +119,8 @@ def _write_envi(path: Path, values: xr.DataArray, dtype: str, more: Mapping[str,
 
 
 def survey_rig(out: Path) -> OpenedRun:
-    """Survey the farm through devices that see the simulated one."""
-    asked = {"source": "rig", "budget": 0.8, **RIG}
-    with devices_that_see(_flags(out, {"budget": 0.8, **RIG})):
-        return survey(out, **asked)
-
-
-@contextmanager
-def devices_that_see(simulated: Mapping[str, Any]) -> Iterator[None]:
-    """Let surveys of a rig open emulated devices, before which the scene of a simulated survey stands."""
-    from flows.tasks import rig_field
-    from flows.tasks.run import make_source
-    from flows.tasks.scene import open_scene
-    from pipeline.rig.emulator.emulated_rig import EmulatedRig
-    from tests.pipeline.rig.in_process import InProcessRig, ManualClock
-    from tests.pipeline.simulator.small_scenes import effects_on
-
-    plain = {name: value for name, value in simulated.items() if not isinstance(value, Mapping)}
-    for table, values in simulated.items():
-        plain |= {f"{table}.{name}": value for name, value in values.items()} if isinstance(values, Mapping) else {}
-    settings = load_settings(None, plain)
-    source = replace(make_source(open_scene(settings)[0], settings), chosen=effects_on(*NAMED["effects"].split(",")))
-    rig = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses)
-    with InProcessRig(rig) as lines, patch.object(rig_field, "open_devices", lines.devices_of):
-        yield
+    """Survey the farm through fake devices that see the simulated one."""
+    return survey(out, source="rig", budget=0.8, effects=NAMED["effects"], **RIG)
 
 
 def survey_area(out: Path) -> OpenedRun:

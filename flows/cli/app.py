@@ -12,7 +12,6 @@ VERBS = {  # verb: module of its function, loaded on demand
     "survey": "flows.cli.survey_verbs",
     "simulate": "flows.cli.simulate_command",
     "rig check": "flows.cli.rig_commands",
-    "rig emulate": "flows.cli.rig_commands",
     "plan": "flows.archive.plan_command",
     "ls": "flows.archive.commands",
     "explain": "flows.archive.commands",
@@ -37,7 +36,7 @@ def build_app(*, listed: bool) -> App:
         help="Survey a field with a hyperspectral line scanner: class map, receipt and report.",
         suppress_keyboard_interrupt=False,  # main reports it
     )
-    rig = App(name="rig", help="Check the hardware, or emulate it.")
+    rig = App(name="rig", help="Check the hardware.")
     app.command(rig)
     for verb, module in VERBS.items():
         group = rig if verb.startswith("rig ") else app

@@ -48,11 +48,6 @@ class SurveyFlags(_flags(name for name in _DECLARED if name not in TABLES or nam
 
 
 @Parameter(name="*")
-class RenderingFlags(_flags(_RENDERING)):  # type: ignore[misc]
-    """Flags of the simulated rig and its light."""
-
-
-@Parameter(name="*")
 class SimulationFlags(_flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))):  # type: ignore[misc]
     """Flags of a simulated scan."""
 
@@ -64,7 +59,6 @@ def by_setting(flags: Any) -> dict[str, object]:
 
 NO_FLAGS = SurveyFlags()
 NO_SIMULATION_FLAGS = SimulationFlags()
-NO_RENDERING_FLAGS = RenderingFlags()
 
 
 def check_outside(out: Path, root: Path) -> Path:

@@ -34,7 +34,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
 from pipeline.rectify.kernels import Kernel
-from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.device_settings import FAKE, SurveyRig
 from pipeline.setting_fields import stated
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
@@ -295,8 +295,8 @@ class Settings:
     signal: SignalChoice = table("Spectral compression.", SignalChoice)
     cost: CostModel = table("Time model of captures.", CostModel)
     rig: SurveyRig = table(
-        'Hardware, for source = "rig". The drivers follow the documented protocols and are tested against emulators, '
-        "never on hardware: verify values marked assumed, and record it in provenance. The scene is then the "
+        'Hardware, for source = "rig". The drivers follow the documented protocols and are tested against scripted '
+        "bytes, never on hardware: verify values marked assumed, and record it in provenance. The scene is then the "
         'reference for accuracy, or "field" with name, size and wavelengths.',
         SurveyRig,
     )
@@ -338,6 +338,11 @@ class Settings:
     def is_map(self) -> bool:
         """Return whether the scene is a raster whose pixels are used as they are, without a camera."""
         return self.source == RASTER
+
+    @property
+    def on_hardware(self) -> bool:
+        """Return whether a rig captures, of which no other survey may use the mirror meanwhile."""
+        return self.source == RIG and self.rig.mirror_driver != FAKE
 
     @property
     def pool(self) -> WorkerPool:

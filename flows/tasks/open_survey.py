@@ -143,7 +143,7 @@ class OpenSurvey:
         Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
         is one. Raises RigError: another survey uses the rig.
         """
-        if self._held is None or self._holds_rig or self.run.settings.source != "rig":
+        if self._held is None or self._holds_rig or not self.run.settings.on_hardware:
             return
         if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
             return

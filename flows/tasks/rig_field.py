@@ -6,9 +6,9 @@ import errno
 import hashlib
 import os
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,12 @@ from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing, sweep_positions
 from pipeline.rig import drivers
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.device_settings import check_times
+from pipeline.rig.device_settings import FAKE, check_times
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.rig_source import RigSource
-from pipeline.rig.transports import SYSTEM_CLOCK, Clock
+from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.archive.keys import array_digest
 from storage.arrays.spool import FetchedFiles
@@ -49,7 +50,7 @@ class RigField(FieldSource):
         )
 
     def saying(self, say: Callable[[str], None]) -> RigField:
-        return RigField(self.rig.saying(say))
+        return replace(self, rig=self.rig.saying(say))
 
     @contextmanager
     def opened(self, spool: Path) -> Iterator[Source]:
@@ -58,8 +59,21 @@ class RigField(FieldSource):
             yield source
 
 
-def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
-    """Return the rig, not connected.
+@dataclass(frozen=True)
+class SimulatedRigField(RigField):
+    """Rig with a fake camera, which sees the light of a simulated scene."""
+
+    settings: Settings
+    simulated: SimulatedSource
+    simulates = True
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
+        seen = replace(self.simulated, chosen=chosen, clock=clock)
+        return RigField(self.rig.opening(lambda: open_devices(self.settings, seen=seen)))
+
+
+def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep], simulated: SimulatedSource) -> RigField:
+    """Return the rig, not connected. A fake camera sees what ``simulated`` does, and its white reference.
 
     Raises SettingsError: the camera does not allow the exposure or frame time, or a driver cannot be imported;
     PoseError: the field exceeds the mirror's range.
@@ -71,17 +85,18 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
     if settings.rig.mounting != STRAIGHT:
         for sweep in planned:
             settings.rig.mounting.to_device(sweep_positions(sweep, settings.camera))
-    return RigField(
-        RigSource(
-            settings.camera,
-            scene.wavelength_nm,
-            scene.shape,
-            lambda: open_devices(settings),
-            KeptInMemory(),
-            rig=settings.rig,
-            vector_pairs=settings.cost.vector_pairs,
-        )
+    fake = settings.rig.camera_driver == FAKE
+    white = float(scene.white_reference.mean()) if fake else settings.rig.white_reference
+    rig = RigSource(
+        settings.camera,
+        scene.wavelength_nm,
+        scene.shape,
+        lambda: open_devices(settings),
+        KeptInMemory(),
+        rig=replace(settings.rig, white_reference=round(white, 6)),
+        vector_pairs=settings.cost.vector_pairs,
     )
+    return SimulatedRigField(rig, settings, simulated) if fake else RigField(rig)
 
 
 @contextmanager
@@ -108,6 +123,6 @@ def rig_to_oneself(port: str) -> Iterator[None]:
         yield
 
 
-def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
+def open_devices(settings: Settings, seen: SimulatedSource | None = None) -> RigDevices:
     """Connect to mirror and camera, as `pipeline.rig.drivers.open_devices` does. Nothing moves."""
-    return drivers.open_devices(settings.rig, settings.cost.vector_pairs, clock)
+    return drivers.open_devices(settings.rig, settings.cost.vector_pairs, seen=seen)

@@ -442,7 +442,7 @@ def _open_source(
     elif settings.is_map:
         source = FieldSource()
     elif settings.source == RIG:
-        source = rig_field.rig_field(scene, settings, (*plan.coarse, *plan.full))
+        source = rig_field.rig_field(scene, settings, (*plan.coarse, *plan.full), simulated)
     if pixels is None:
         check_memory(simulated, grid, plan, settings.memory, settings.pool)
         return source, simulated, None

@@ -3,7 +3,7 @@
 The journal has one record per line, a CRC-32 and a JSON object, beside the files fetched from the camera. Each line
 begins with a line end of its own, so that a damaged line takes no other with it. After a killed process the next one
 reads there which folder on the camera holds which lines, and does not capture those again. A torn or changed line
-counts as not written. A capture whose end is missing then is not continued, since the mirror may have moved.
+counts as not written.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
@@ -26,8 +24,6 @@ from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.capture_paths import CapturePath, CaptureRecord, LinePositions, capture_prefix
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
-from pipeline.rig.mirror_controller import MotionLog
-from pipeline.rig.pro_mode import Trigger
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
@@ -35,6 +31,7 @@ JOURNAL = "captures.jsonl"  # beside the files fetched from the camera
 SLACK_S = 5.0  # by which a capture may take longer than its frames
 WRITING_S = 120.0  # that a camera may keep writing what it has after a stop
 POLL_S = 0.05
+SETTLE_S = 2.0  # for the mirror to come to rest
 
 Say = Callable[[str], None]  # takes the present step in a few words
 
@@ -47,7 +44,6 @@ class CaptureJournal:
         self._taken: dict[str, CaptureRecord] = {}
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
         self._positions: dict[str, dict[str, Any]] = {}
-        self._ended: set[str] = set()  # folders
         self.references: dict[float | None, str] = {}  # folders of dark and white frames, by a sweep's own exposure
         self.damage: list[str] = []
         self._read()
@@ -61,12 +57,6 @@ class CaptureJournal:
         """Record a capture that the camera acknowledged."""
         self._write({"what": "capture", **asdict(taken)})
 
-    def record_end(self, taken: CaptureRecord) -> CaptureRecord:
-        """Record what was read from the mirror after the capture."""
-        log = None if taken.log is None else {**asdict(taken.log), "position": taken.log.position.tolist()}
-        self._write({"what": "end", "folder": taken.folder, "index_at_end": taken.index_at_end, "log": log})
-        return self._taken[taken.folder]
-
     def record_spent(self, taken: CaptureRecord, why: str) -> None:
         """Record that a capture gives no further line."""
         self._write({"what": "spent", "folder": taken.folder, "why": why})
@@ -74,12 +64,12 @@ class CaptureJournal:
     def record_positions(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Record once how a capture's lines got their positions."""
         if taken.folder not in self._positions:
-            found = {"method": how.method, "residual_px": how.residual_px, "notes": [*notes, *how.notes]}
-            self._write({"what": "tied", "folder": taken.folder, **found})
+            found = {"residual_px": how.residual_px, "notes": [*notes, *how.notes]}
+            self._write({"what": "positions", "folder": taken.folder, **found})
 
     @property
     def captures(self) -> list[dict[str, Any]]:
-        """Return every capture in order: sweep, lines, folder on the camera, method of positions, why it is spent."""
+        """Return every capture in order: sweep, lines, folder on the camera, error of positions, why it is spent."""
         return [
             {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
             | self._positions.get(one.folder, {})
@@ -112,8 +102,6 @@ class CaptureJournal:
                 self.damage.append(f"record {number} of {JOURNAL} is ignored: the one that it refers to is missing")
         if self.damage:
             LOG.warning("%s", "; ".join(self.damage))
-            for folder in self._taken.keys() - self._ended:
-                self._taken[folder] = replace(self._taken[folder], spent="its end may be in a damaged line")
 
     def _write(self, record: dict[str, Any]) -> None:
         text = json.dumps(record).encode()
@@ -125,28 +113,18 @@ class CaptureJournal:
             case "capture":
                 self._taken.pop(record["folder"], None)  # an emptied camera uses the names of its folders again
                 self._positions.pop(record["folder"], None)
-                self._ended.discard(record["folder"])
                 self._taken[record["folder"]] = CaptureRecord(
                     Sweep(**record["sweep"]),
                     record["first"],
                     record["stop"],
                     record["folder"],
-                    record["triggered"],
                     tuple(record["run_s"]),
                     tuple(record["capture_s"]),
                 )
-            case "end":
-                log = None
-                if record["log"] is not None:
-                    position = np.array(record["log"]["position"], np.float32).reshape(-1, 2)
-                    log = MotionLog(**{**record["log"], "position": position})
-                found = self._taken[record["folder"]]
-                self._taken[found.folder] = replace(found, index_at_end=record["index_at_end"], log=log)
-                self._ended.add(found.folder)
             case "spent":
                 self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
-            case "tied":
-                self._positions[record["folder"]] = {name: record[name] for name in ("method", "residual_px", "notes")}
+            case "positions":
+                self._positions[record["folder"]] = {name: record[name] for name in ("residual_px", "notes")}
             case "references":
                 self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
@@ -174,35 +152,22 @@ class CaptureRunner:
         Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are
         stopped.
         """
-        steering = self.devices.steering
-        prefix = capture_prefix(path.sweep, path.first)
-        exposed = exposing(self.camera, path.sweep)
-        self._configure(exposed)
+        steering, clock = self.devices.steering, self.devices.clock
+        self._configure(exposing(self.camera, path.sweep))
         self.say(f"path: {len(path.cells)} positions")
         steering.load_path(path.cells)
         steering.goto(*(float(place) for place in path.cells[0]))
-        steering.settle(self.rig.settle_s)
+        steering.settle(SETTLE_S)
         with self._stopped_on_error():
-            if path.triggered:
-                run_s = self._run(path)
-                capture = self.devices.camera.capture(path.lines, prefix=prefix)
-            else:
-                most_hz = (self.rig.log_samples - 1) / (exposed.scan_seconds(path.lines) + SLACK_S)
-                log_hz = min(self.rig.log_rate_hz, most_hz)  # it must hold the whole capture
-                steering.start_log(log_hz)
-                capture = self.devices.camera.capture(path.lines, prefix=prefix)
-                run_s = self._run(path)
-            at_s = (capture.sent_s, capture.acknowledged_s)
-            taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, path.triggered, run_s, at_s)
+            capture = self.devices.camera.capture(path.lines, prefix=capture_prefix(path.sweep, path.first))
+            sent_s = clock.now()
+            steering.run(path.rate_hz)
+            times_s = (sent_s, clock.now()), (capture.sent_s, capture.acknowledged_s)
+            taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, *times_s)
             self.journal.record_capture(taken)
             self.wait(taken)
-        if taken.triggered:
-            taken = replace(taken, index_at_end=steering.index())
-        else:
-            self.devices.clock.sleep(2 / log_hz)  # the log's last sample must be later than the last line
-            taken = replace(taken, log=steering.read_log())
         steering.halt()
-        return self.journal.record_end(taken)
+        return taken
 
     def wait(self, taken: CaptureRecord) -> None:
         """Wait until a capture is over; one that takes too long is stopped, and its frames count.
@@ -228,13 +193,6 @@ class CaptureRunner:
                 stopped = True
             clock.sleep(min(max(began + wanted - clock.now(), POLL_S), 1.0))
 
-    def recovered(self, taken: CaptureRecord) -> CaptureRecord:
-        """Record the end of a capture whose process was killed before it; nothing has played since."""
-        self.wait(taken)
-        if not taken.triggered or taken.index_at_end is not None:
-            return taken
-        return self.journal.record_end(replace(taken, index_at_end=self.devices.steering.index()))
-
     def capture_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
         """Take one frame with the mirror at 0; 0 (if ``white_at_rest``), and return its folder.
 
@@ -244,11 +202,11 @@ class CaptureRunner:
         self._configure(exposing(self.camera, at_rest))
         if self.rig.white_at_rest:
             self.devices.steering.goto(0.0, 0.0)
-            self.devices.steering.settle(self.rig.settle_s)
+            self.devices.steering.settle(SETTLE_S)
         with self._stopped_on_error():
             capture = self.devices.camera.capture(1, prefix=prefix)
             at = (capture.sent_s, capture.acknowledged_s)
-            self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, False, at, at))
+            self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, at, at))
         return capture.folder
 
     def _configure(self, camera: LineCamera) -> None:
@@ -257,11 +215,6 @@ class CaptureRunner:
             self._times_ms = None  # unknown if the camera does not answer
             self.devices.camera.configure(*times_ms)
         self._times_ms = times_ms
-
-    def _run(self, path: CapturePath) -> tuple[float, float]:
-        sent = self.devices.clock.now()
-        self.devices.steering.run(path.rate_hz, Trigger.RISING_EDGE if path.triggered else Trigger.OFF)
-        return sent, self.devices.clock.now()
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import Axes, Mounting
 from pipeline.geometry.scan import Ends
 from pipeline.setting_fields import assumed, stated
 
-ReadBack = Literal["none", "sampled", "all"]
-Pulses = Literal["position", "frame", "none"]
-OF_THE_LINES = (  # what the numbers and places of captured lines depend on
-    *("white_reference", "white_at_rest"),
-    *("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y"),
-)
+FAKE = "fake"  # of a driver's name
+CONTROL_PORT = 8100  # of the camera's commands; the maker's
 MOST_PAIRS = 8191  # a byte offset of 16 bits addresses the cells of the vector memory
-
-
-@dataclass(frozen=True)
-class CameraAddress:
-    """Address of the camera; the maker's by default."""
-
-    host: str = "10.0.65.50"
-    port: int = 8100
-    connect_s: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +27,7 @@ class ControlPatience:
 class FileServer:
     """The camera's FTP server and its timeouts. User and password are those of public programs."""
 
-    host: str = CameraAddress.host
+    host: str = "10.0.65.50"  # the maker's
     port: int = 21
     user: str = "ftpuser"
     password: str = "ftpuser"
@@ -84,9 +70,9 @@ class Patience:
 
 @dataclass(frozen=True)
 class SurveyRig:
-    """The table [rig] of a survey: both devices, the cable between them, and the white reference.
+    """The table [rig] of a survey: both devices, and the white reference.
 
-    The drivers follow the documented protocols and were tested against emulators; they never ran on hardware.
+    The drivers follow the documented protocols and were tested against scripted bytes; they never ran on hardware.
     ``provenance`` says which of the assumed values are confirmed.
     """
 
@@ -95,28 +81,17 @@ class SurveyRig:
     baud: int = assumed(
         115200, "Bits per second; over USB any works; the manual of a later model says 256000", "", 1200, 4_000_000
     )
-    expected_id: str = stated("", "Part of the controller's id; any by default", example="MR-E")
-    deadline_s: float = stated(
-        Patience.deadline_s, "Time for one request to the mirror, retries included", "s", 0.01, 60
-    )
-    retries: int = stated(Patience.retries, "Repetitions of a request that only reads", "", 0, 20)
-    quiet_s: float = assumed(Patience.quiet_s, "Silence after which a late answer is given up", "s", 0, 5)
-    with_crc: bool = assumed(False, "Requests carry a CRC")
-    strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit; the default is a warning")
+    with_crc: bool = assumed(False, "Requests carry a CRC, and replies whose CRC does not fit are refused")
     ends: Ends = assumed("exclusive", "Whether the mirror's index ranges include their end")  # erratum E14
-    read_back: ReadBack = stated("sampled", "Part of a path that is read back and compared")
-    log_rate_hz: float = stated(
-        10000.0, "Highest rate of measured positions; without pulses they place the lines", "Hz", 0.1, 10_000
-    )
-    log_samples: int = assumed(2000, "Samples that the controller's log holds", "", 10, 16_383)  # not published
     mirror_driver: str = stated(
         "",
-        "Driver of a mirror of another make, as module:function; by default that of the MR-E-2",
+        "Driver of another mirror: fake, or module:function of another make; by default that of the MR-E-2",
         example="lab:mirror",
     )
     camera_driver: str = stated(
         "",
-        "Driver of a camera of another make, as module:function; by default that of the Nano-Hyperspec",
+        "Driver of another camera: fake (sees the scene), or module:function of another make; by default that of the"
+        " Nano-Hyperspec",
         example="lab:camera",
     )
     mirror_axes: Axes = assumed(
@@ -130,21 +105,9 @@ class SurveyRig:
         Mounting.offset_x, "The device's X where the mirror looks straight ahead, of -1 to 1", "", -0.5, 0.5
     )
     mirror_offset_y: float = stated(Mounting.offset_y, "The device's Y there", "", -0.5, 0.5)
-    host: str = stated(CameraAddress.host, "Address of the camera; the maker's by default")
-    control_port: int = stated(CameraAddress.port, "Port of its commands", "", 1, 65_535)
-    file_port: int = stated(FileServer.port, "Port of its FTP server", "", 1, 65_535)
+    host: str = stated(FileServer.host, "Address of the camera; the maker's by default")
     user: str = stated(FileServer.user, "User of its FTP server")
     password: str = stated(FileServer.password, "Password of that user; receipts do not repeat it")
-    connect_s: float = stated(CameraAddress.connect_s, "Longest time to connect to the camera", "s", 0.1, 60)
-    stall_s: float = stated(
-        FileServer.stall_s, "Longest silence of its FTP server before a transfer is continued anew", "s", 0.1, 600
-    )
-    pulses: Pulses = assumed(
-        "none",
-        "Pulses at the mirror's trigger input: one per held position (needs a pulse generator), one per frame (steps "
-        "fine sweeps only), or none: the path then runs by the mirror's clock",
-    )
-    settle_s: float = stated(2.0, "Longest time for the mirror to come to rest", "s", 0.01, 60)
     white_reference: float = stated(1.0, "Value of the white reference", "", 1e-6, 1e6)
     white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")
     provenance: str = stated("assumed", "Person who confirmed the assumed values")
@@ -155,11 +118,6 @@ class SurveyRig:
         return Mounting(self.mirror_axes, self.mirror_clocking_deg, self.mirror_offset_x, self.mirror_offset_y)
 
     @property
-    def camera(self) -> CameraAddress:
-        """Return the address of the camera's control socket."""
-        return CameraAddress(self.host, self.control_port, self.connect_s)
-
-    @property
     def files(self) -> FileServer:
         """Return the address of the camera's files."""
-        return FileServer(self.host, self.file_port, self.user, self.password, self.stall_s)
+        return FileServer(self.host, user=self.user, password=self.password)

@@ -1,8 +1,8 @@
 """Protocols of a rig's two devices, for a mirror and a camera of any make, and the functions that open their drivers.
 
-`MirrorController` and `HeadwallCamera` implement them; the table [rig] may name the drivers of another make by their
-import path. Times are those of the clock that a driver was opened with. Every method may raise `DeviceGone` and
-`DeadlinePassed`, besides the errors that it states; all are kinds of `RigError`.
+`MirrorController` and `HeadwallCamera` implement them, and the fakes of `pipeline.rig.fakes`. The table [rig] may name
+the drivers of another make by their import path. Times are those of the clock that a driver was opened with. Every
+method may raise `DeviceGone` and `DeadlinePassed`, besides the errors that it states; all are kinds of `RigError`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.mirror_controller import MotionLog, open_mirror
-from pipeline.rig.pro_mode import Trigger
+from pipeline.rig.device_settings import FAKE, SurveyRig
+from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
+from pipeline.rig.mirror_controller import open_mirror
 from pipeline.rig.transports import SYSTEM_CLOCK, Clock
+from pipeline.simulator.simulated import SimulatedSource
 
 __all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
 LOG = logging.getLogger(__name__)
@@ -62,15 +63,8 @@ class MirrorDriver(Protocol):
         SettingsError : the device holds fewer positions.
         """
 
-    def run(self, rate_hz: float, trigger: Trigger = Trigger.OFF) -> None:
-        """Play the loaded positions once.
-
-        Parameters
-        ----------
-        rate_hz
-            Positions a second by the device's own clock, where ``trigger`` is OFF.
-        trigger
-            Which edges at the trigger input step to the next position instead; the first is taken at once.
+    def run(self, rate_hz: float) -> None:
+        """Play the loaded positions once, ``rate_hz`` a second by the device's own clock.
 
         Raises
         ------
@@ -79,20 +73,6 @@ class MirrorDriver(Protocol):
 
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is. A mirror that plays nothing is left alone."""
-
-    def index(self) -> int:
-        """Return the loaded position that plays now, or played last, counted from 0."""
-
-    def start_log(self, rate_hz: float) -> None:
-        """Start to log measured positions ``rate_hz`` times a second."""
-
-    def read_log(self) -> MotionLog:
-        """End the log and return it: positions (sample, 2), their rate, and when the first was taken.
-
-        Raises
-        ------
-        RigError : no log was started.
-        """
 
     def close(self) -> None:
         """Close the connection to the device."""
@@ -176,8 +156,10 @@ Factory = Callable[[SurveyRig, Clock], Any]
 _PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver": CameraDriver}
 
 
-def open_devices(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
-    """Connect to mirror and camera. Nothing moves.
+def open_devices(
+    rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK, seen: SimulatedSource | None = None
+) -> RigDevices:
+    """Connect to mirror and camera. Nothing moves. ``seen`` is the scene before a fake camera.
 
     Raises
     ------
@@ -186,10 +168,12 @@ def open_devices(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK)
     DeadlinePassed : nothing answers.
     RigError : another device answers.
     """
+    if rig.mirror_driver == rig.camera_driver == FAKE:
+        clock = FakeClock()
     with ExitStack() as opened:
         mirror = open_mirror_driver(rig, vector_pairs, clock)
         opened.callback(mirror.close)
-        camera = open_camera_driver(rig, clock)
+        camera = open_camera_driver(rig, clock, seen)
         opened.callback(camera.close)
         camera.is_capturing()
         opened.pop_all()
@@ -198,22 +182,28 @@ def open_devices(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK)
 
 def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK) -> MirrorDriver:
     """Connect to the mirror, as `open_devices`."""
+    if rig.mirror_driver == FAKE:
+        return FakeMirror(clock, vector_pairs)
     factory = import_factory(rig, "mirror_driver")
     if factory is None:
         return open_mirror(rig, vector_pairs, clock)
     return cast("MirrorDriver", _opened(factory, rig, "mirror_driver", clock))
 
 
-def open_camera_driver(rig: SurveyRig, clock: Clock = SYSTEM_CLOCK) -> CameraDriver:
+def open_camera_driver(
+    rig: SurveyRig, clock: Clock = SYSTEM_CLOCK, seen: SimulatedSource | None = None
+) -> CameraDriver:
     """Return the camera's driver; raises as `open_devices`. The shipped one connects at its first command."""
+    if rig.camera_driver == FAKE:
+        return FakeCamera(clock, seen)
     factory = import_factory(rig, "camera_driver")
     if factory is None:
-        return HeadwallCamera.at(rig.camera, rig.files, clock=clock)
+        return HeadwallCamera.at(rig.host, rig.files, clock=clock)
     return cast("CameraDriver", _opened(factory, rig, "camera_driver", clock))
 
 
 def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
-    """Import the function that opens a driver of another make; None where the settings name the shipped one.
+    """Import the function that opens a driver of another make; None where the settings name a shipped one.
 
     Raises
     ------
@@ -221,7 +211,7 @@ def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
     """
     name: str = getattr(rig, setting)
     try:
-        return cast("Factory", pkgutil.resolve_name(name)) if name else None
+        return cast("Factory", pkgutil.resolve_name(name)) if name not in ("", FAKE) else None
     except Exception as error:  # whatever the module of another make does as it is imported
         raise SettingsError(
             f"rig.{setting} = {name!r} cannot be imported ({type(error).__name__}: {error}). Expected module:function "

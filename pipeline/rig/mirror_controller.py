@@ -1,7 +1,7 @@
 """The mirror controller's driver: sends a mirror to a position, or along a path.
 
-It follows the documented protocol and was tested against an emulator; it never ran on hardware. Positions are those of
-a mirror mounted straight. The wire carries the device's own positions, by the mounting in the settings.
+It follows the documented protocol and was tested against scripted bytes; it never ran on hardware. Positions are those
+of a mirror mounted straight. The wire carries the device's own positions, by the mounting in the settings.
 
 A controller begins in simple mode: lines of ASCII with CR LF, at most 64 bytes, in either case. The driver reads its
 identity there, and changes to pro mode: frames, see `pro_mode`.
@@ -16,14 +16,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pipeline.errors import RigError, SettingsError, ShapeError
 from pipeline.geometry.mirror import wire_positions
 from pipeline.geometry.scan import device_range
 from pipeline.rig import pro_mode as pro
-from pipeline.rig.device_settings import Patience, ReadBack, SurveyRig
+from pipeline.rig.device_settings import Patience, SurveyRig
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
@@ -39,7 +38,7 @@ from pipeline.rig.transports import (
 )
 
 LOG = logging.getLogger(__name__)
-SAMPLED_EVERY = 10  # frames; "sampled" also reads back the ends of both channels
+SAMPLED_EVERY = 10  # frames
 KNOWN_MODEL = "MR"  # begins the ids of documented controllers
 _POLL_S = 0.01
 
@@ -90,14 +89,13 @@ def ask_line(wire: Wire, request: str, parse: Callable[[bytes, str, str], Answer
 
 @dataclass(frozen=True)
 class ProLink:
-    """Frames of pro mode over a wire. ``with_crc`` sends and checks CRCs; ``strict_crc`` refuses those that differ.
+    """Frames of pro mode over a wire. ``with_crc`` sends CRCs, and refuses replies whose CRC does not fit.
 
     Requests raise DeviceRefused, DeadlinePassed or DeviceGone, and one that moves the mirror StateUnknown.
     """
 
     wire: Wire
     with_crc: bool = False
-    strict_crc: bool = False
 
     def ask(self, frame: pro.Frame, name: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
         """Send a request that only reads and return the parsed payload; it is sent again where no answer comes."""
@@ -130,10 +128,8 @@ class ProLink:
             LOG.info("%s, while waiting for %s: bytes that form no frame: %s", port, name, found.data.hex(" "))
             return None
         if self.with_crc and not found.crc_good:
-            action = "refused" if self.strict_crc else "accepted (set strict_crc to refuse it)"
-            LOG.warning("%s: the CRC of an answer to %s does not fit; %s", port, name, action)
-            if self.strict_crc:
-                return None
+            LOG.warning("%s: the CRC of an answer to %s does not fit; it is refused", port, name)
+            return None
         try:
             if found.command == sent.command | pro.ERROR_FLAG:
                 code = pro.cell_int(found.payload)
@@ -161,18 +157,17 @@ class Identity:
         return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
 
 
-def upload(link: ProLink, cells: bytes, read_back: ReadBack) -> None:
-    """Write cells, X of all positions and then Y of all, to the vector memory, and compare what it holds then.
+def upload(link: ProLink, cells: bytes) -> None:
+    """Write cells, X of all positions and then Y of all, to the vector memory.
 
-    ``read_back`` is "none", "sampled" (every tenth frame and the ends of both channels) or "all". Raises RigError: a
-    cell holds another value.
+    Every tenth frame and the ends of both channels are read back. Raises RigError: a cell holds another value.
     """
     size = pro.VECTOR_CELLS * pro.CELL
     frames = [(at // pro.CELL, cells[at : at + size]) for at in range(0, len(cells), size)]
     for start, sent in frames:
         stop = start + len(sent) // pro.CELL
         link.set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {stop}")
-    for number in frames_to_check(len(frames), read_back):
+    for number in frames_to_check(len(frames)):
         start, sent = frames[number]
         if read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL) != sent:
             raise RigError(
@@ -181,12 +176,8 @@ def upload(link: ProLink, cells: bytes, read_back: ReadBack) -> None:
             )
 
 
-def frames_to_check(frames: int, read_back: ReadBack) -> list[int]:
+def frames_to_check(frames: int) -> list[int]:
     """Return the numbers of the frames that are read back."""
-    if read_back == "none":
-        return []
-    if read_back == "all":
-        return list(range(frames))
     half = frames // 2  # X ends and Y begins here
     ends = (0, half - 1, half, frames - 1)
     return sorted({number for number in chain(range(0, frames, SAMPLED_EVERY), ends) if 0 <= number < frames})
@@ -206,20 +197,6 @@ def _run_values(run: int) -> dict[int, pro.Value]:
     return {channel.vector(pro.VectorRegister.RUN): run for channel in (pro.X, pro.Y)}
 
 
-@dataclass(frozen=True)
-class MotionLog:
-    """Positions that the controller measured at a steady rate.
-
-    ``started_s`` is the time of the acknowledgement of the start, by the driver's clock. The log began at most
-    ``start_error_s`` earlier, the duration of the request.
-    """
-
-    position: NDArray[np.float32]  # (sample, 2) X and Y
-    rate_hz: float
-    started_s: float
-    start_error_s: float
-
-
 class MirrorController(Closing):
     """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
 
@@ -233,9 +210,8 @@ class MirrorController(Closing):
     ) -> None:
         self.rig = rig
         self.vector_pairs = vector_pairs
-        self.wire = Wire(transport, clock, Patience(rig.deadline_s, rig.retries, rig.quiet_s))
-        self._link = ProLink(self.wire, rig.with_crc, rig.strict_crc)
-        self._logging: tuple[float, float, float] | None = None  # rate; before the request and after its answer
+        self.wire = Wire(transport, clock, Patience())
+        self._link = ProLink(self.wire, rig.with_crc)
         self._pairs = 0  # positions in the vector memory
         self.identity = Identity("", "", "")
 
@@ -255,13 +231,10 @@ class MirrorController(Closing):
                 self._greet()
             found = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
             self.identity = found
-            part = self.rig.expected_id
-            good = part.lower() in found.device.lower() if part else found.device.upper().startswith(KNOWN_MODEL)
-            if not good:
-                wanted = f"whose id holds {part!r}" if part else f"whose id begins with {KNOWN_MODEL}"
+            if not found.device.upper().startswith(KNOWN_MODEL):
                 raise RigError(
-                    f"expected a controller {wanted} on {self.wire.port}, got {found.summary}; is another device at "
-                    "this port? If it is the mirror, set rig.expected_id to a part of its id"
+                    f"expected a controller whose id begins with {KNOWN_MODEL} on {self.wire.port}, got "
+                    f"{found.summary}; is another device at this port?"
                 )
             try:
                 with suppress(DeadlinePassed):  # it may have changed; the status shows
@@ -310,8 +283,8 @@ class MirrorController(Closing):
         """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Nothing moves.
 
         A path that plays is halted. Raises PoseError or ShapeError where a position is outside the disk, and
-        SettingsError where there are too many; nothing is sent then. Raises RigError: a cell that was read back, as the
-        settings say, holds another value.
+        SettingsError where there are too many; nothing is sent then. Raises RigError: a cell that was read back holds
+        another value.
         """
         cells = wire_positions(positions, self.rig.mounting)
         if len(cells) > self.vector_pairs:
@@ -320,14 +293,14 @@ class MirrorController(Closing):
             )
         self.halt()
         self._pairs = 0
-        upload(self._link, cells.T.astype(">f4").tobytes(), self.rig.read_back)
+        upload(self._link, cells.T.astype(">f4").tobytes())
         self._pairs = len(cells)
 
-    def run(self, rate_hz: float, trigger: pro.Trigger = pro.Trigger.OFF) -> None:
+    def run(self, rate_hz: float) -> None:
         """Play the loaded positions once, at ``rate_hz`` positions a second.
 
-        X plays from cell 0 on, Y from behind the X of all positions. With a ``trigger`` the edges at its input step to
-        the next position instead. Raises SettingsError: no path is loaded. Raises also as :meth:`goto`.
+        X plays from cell 0 on, Y from behind the X of all positions. Raises SettingsError: no path is loaded. Raises
+        also as :meth:`goto`.
         """
         if not self._pairs:
             raise SettingsError(f"no path is loaded on {self.wire.port}; load one first")
@@ -342,7 +315,7 @@ class MirrorController(Closing):
                     channel.vector(pro.VectorRegister.END): end,
                     channel.vector(pro.VectorRegister.FREQUENCY): float(rate_hz),
                     channel.vector(pro.VectorRegister.CYCLES): 1,
-                    channel.vector(pro.VectorRegister.TRIGGER): int(trigger),
+                    channel.vector(pro.VectorRegister.TRIGGER): pro.TRIGGER_OFF,
                 }
                 self._link.set(pro.set_values(values), f"setting up the path's {name}")
             follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
@@ -351,38 +324,6 @@ class MirrorController(Closing):
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is. Works also where motions are refused."""
         self._link.set(pro.set_values(_run_values(0)), "halting the path")
-
-    def index(self) -> int:
-        """Return the position of the loaded path that plays now: the cell of X."""
-        register = pro.X.vector(pro.VectorRegister.INDEX)
-        return self._link.ask(pro.get_value(register), "the place in the path", pro.cell_int)
-
-    def start_log(self, rate_hz: float) -> None:
-        """Start to log measured positions ``rate_hz`` times a second: X in slot 0, Y in slot 1."""
-        self._logging = None
-        self._link.set(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
-        slots = {pro.log_slot(0): pro.FEEDBACK_X, pro.log_slot(1): pro.FEEDBACK_Y}
-        self._link.set(pro.set_values({**slots, pro.LOG_RATE: float(rate_hz)}), "setting up the log")
-        before = self.wire.clock.now()
-        self._link.set(pro.set_values({pro.LOG_RUN: 1}), "starting the log")
-        self._logging = float(rate_hz), before, self.wire.clock.now()
-
-    def read_log(self) -> MotionLog:
-        """End the log and fetch the samples since its start, at most as many as the logger holds.
-
-        A shorter log ends where the device says so. Raises RigError: no log was started.
-        """
-        if self._logging is None:
-            raise RigError(f"no log was started on {self.wire.port}; start one before the path runs")
-        rate_hz, before, after = self._logging
-        samples = min(int((self.wire.clock.now() - after) * rate_hz), self.rig.log_samples)
-        self._link.set(pro.set_values({pro.LOG_RUN: 0}), "stopping the log")
-        self._logging = None
-        columns = [self._logged(slot, samples) for slot in (0, 1)]
-        held = min(map(len, columns)) // pro.CELL
-        measured = np.stack([np.frombuffer(column, ">f4", held) for column in columns], axis=-1).astype(np.float32)
-        position = self.rig.mounting.to_model(measured).astype(np.float32, copy=False)
-        return MotionLog(position, rate_hz, after, after - before)
 
     def close(self) -> None:
         """Close the port; the mirror stays where it is."""
@@ -393,18 +334,6 @@ class MirrorController(Closing):
         if (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
         self._link.move(pro.set_values(values), name)
-
-    def _logged(self, slot: int, samples: int) -> bytes:
-        cells = b""
-        for start in range(0, samples, pro.VECTOR_CELLS):
-            try:
-                cells += read_cells(self._link, pro.log_slot(slot), start, min(pro.VECTOR_CELLS, samples - start))
-            except DeviceRefused as error:
-                if error.code != pro.ErrorCode.VECTOR_INDEX:
-                    raise
-                LOG.warning("the log on %s ends at %d of %d samples", self.wire.port, start, samples)
-                break
-        return cells
 
 
 def open_mirror(rig: SurveyRig, vector_pairs: int = 1500, clock: Clock = SYSTEM_CLOCK) -> MirrorController:

@@ -33,7 +33,6 @@ class Command(IntEnum):
 
     STATUS = 0x02
     SET_MODE = 0x06
-    GET_VALUE = 0x11
     SET_VALUES = 0x12
     SET_VECTOR = 0x14
     GET_VECTOR = 0x15
@@ -159,19 +158,9 @@ def int_cell(value: int) -> bytes:
     return (value & 0xFFFFFFFF).to_bytes(CELL, "big")
 
 
-def cell_float(cell: bytes) -> float:
-    """Read a cell as a float32; ShapeError where it is no cell, here and below."""
-    return float(struct.unpack(">f", checked(cell, CELL))[0])
-
-
 def cell_int(cell: bytes) -> int:
-    """Read a cell as an unsigned integer."""
+    """Read a cell as an unsigned integer; ShapeError where it is no cell."""
     return int.from_bytes(checked(cell, CELL), "big")
-
-
-def get_value(register: int) -> Frame:
-    """Return a request for a register; the reply is its cell."""
-    return Frame(Command.GET_VALUE, register.to_bytes(2, "big"))
 
 
 def set_values(values: Mapping[int, Value]) -> Frame:
@@ -191,29 +180,6 @@ def set_vector(register: int, start: int, cells: bytes) -> Frame:
     return Frame(Command.SET_VECTOR, struct.pack(">HHB", register, start * CELL, len(cells)) + cells)
 
 
-def refuse(command: int, code: int) -> Frame:
-    """Return the device's reply that refuses a command."""
-    return Frame(command | ERROR_FLAG, int_cell(code))
-
-
-def read_registers(payload: bytes) -> dict[int, bytes]:
-    """Read the registers that a request sets, each with its cell."""
-    count = int.from_bytes(payload[:2], "big")
-    cells = checked(payload, 2 + (2 + CELL) * count)[2 + 2 * count :]
-    return {
-        int.from_bytes(payload[2 + 2 * one : 4 + 2 * one], "big"): cells[CELL * one : CELL * (one + 1)]
-        for one in range(count)
-    }
-
-
-def read_vector(payload: bytes) -> tuple[int, int, int, bytes]:
-    """Read a request for cells of a vector: register, offset and length in bytes, and the cells, if any."""
-    if len(payload) < 5:
-        raise ShapeError(f"expected a register, an offset and a length, 5 bytes or more, got {len(payload)}")
-    register, offset, length = struct.unpack(">HHB", payload[:5])
-    return register, offset, length, payload[5:]
-
-
 def checked(data: bytes, size: int) -> bytes:
     """Return bytes of that size; ShapeError where they have another."""
     if len(data) != size:
@@ -221,18 +187,9 @@ def checked(data: bytes, size: int) -> bytes:
     return data
 
 
-FEEDBACK_X, FEEDBACK_Y = 0x2302, 0x2303
-LOG_SLOTS = 6
-LOG_RUN, LOG_RATE = 0x2410, 0x2411
 VECTOR_MEMORY = 0x2600  # one vector, shared by the channels
+TRIGGER_OFF = 0  # of the trigger input: the path runs by the device's own clock
 UNIT_XY = 2  # of an input's numbers: positions on the disk
-
-
-class Trigger(IntEnum):
-    """Edges at the trigger input that step through the vector memory (1, both edges, is not used)."""
-
-    OFF = 0
-    RISING_EDGE = 2
 
 
 class Status(IntFlag):
@@ -278,7 +235,6 @@ class VectorRegister(IntEnum):
     FREQUENCY = 0x4  # cells per second, float
     CYCLES = 0x7  # -1 is without end
     TRIGGER = 0x8
-    INDEX = 0xA  # read only
 
 
 class ChannelRegisters:
@@ -302,8 +258,3 @@ class ChannelRegisters:
 
 
 X, Y = ChannelRegisters(0), ChannelRegisters(1)
-
-
-def log_slot(slot: int) -> int:
-    """Return the id of the register that assigns a slot of the logger; the recorded vector has the same id."""
-    return 0x2400 | slot

@@ -1,11 +1,8 @@
 """The rig as a source of lines: mirror and camera take a sweep in captures, and its lines come back in order.
 
 Each capture has as many lines as the mirror's vector memory holds positions for. Its files are fetched, its lines get
-their positions, and their samples are binned. With pulses a line's position is the one sent to the mirror at mid
-exposure (float32), without them the one that the mirror's log measured. Time is by the camera's stamps, in us.
-
-An emulated rig gives the lines of its simulated source, bit for bit, in any number of captures. Times differ where the
-vector memory is loaded in the middle of a sweep, since a rig stops for it.
+their positions, and their samples are binned. A line's position is that of the path at its time by the camera's
+stamps.
 
 A journal beside the fetched files records all that the rig has acknowledged. A later call with the same ``kept``
 continues a transfer where it broke off, and captures only what the camera does not have.
@@ -85,10 +82,8 @@ class RigSource:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Return settings and captures of this ``kept``, with the method of the lines' positions."""
-        rig: dict[str, Any] = {
-            name: getattr(self.rig, name) for name in ("pulses", "ends", "read_back", "strict_crc", "provenance")
-        }
+        """Return settings and captures of this ``kept``, with the possible error of the lines' positions."""
+        rig: dict[str, Any] = {name: getattr(self.rig, name) for name in ("ends", "provenance")}
         if self.rig.mounting != STRAIGHT:
             rig["mounting"] = asdict(self.rig.mounting)
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
@@ -107,6 +102,12 @@ class RigSource:
         other = copy(self)
         other._say = say
         other._runner = None
+        return other
+
+    def opening(self, open_devices: Callable[[], RigDevices]) -> RigSource:
+        """Return the same source over other devices."""
+        other = self.saying(self._say)
+        other._open = open_devices
         return other
 
     @contextmanager
@@ -150,12 +151,10 @@ class RigSource:
                 reason = "its files or positions end there"
                 held = self._journal.holding(sweep, line)
                 if held is None:
-                    # pulses step through the sweep if there is one per position
-                    triggered = self.rig.pulses == "position" or (self.rig.pulses == "frame" and sweep.positions == 1)
-                    path = next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs, triggered=triggered)
-                    taken = runner.take(path)
+                    taken = runner.take(next_path(sweep, line, self.camera, vector_pairs=self.vector_pairs))
                 else:
-                    taken = runner.recovered(held)
+                    taken = held
+                    runner.wait(taken)
                 try:
                     for found in self._read(runner, taken, line):
                         yield found
@@ -229,7 +228,7 @@ class RigSource:
                 raise
             raise UnusableCaptureError(str(error)) from error
         self._check_size(captured.values.shape[1:], taken.folder)
-        path = path_of(taken.sweep, (taken.first, taken.stop), self.camera, triggered=taken.triggered)
+        path = path_of(taken.sweep, (taken.first, taken.stop), self.camera)
         located = locate_lines(captured, path, taken, self.camera)
         self._journal.record_positions(taken, located.positions, captured.notes)
         sweep = taken.sweep

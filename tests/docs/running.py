@@ -8,7 +8,6 @@ The comment before a block, `<!-- test: WORDS -->`, changes how it is run:
     bucket          s3://bucket/prefix is an archive on the S3 server of the tests
     tree FLAGS      run in one process with a copy of the four folders, to which the page's files and changes were
                     added; add the flags to the first command
-    meanwhile       start, and end after the page; other blocks wait for the file after -o
 """
 
 from __future__ import annotations
@@ -19,11 +18,8 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from string import Template
@@ -39,7 +35,6 @@ from tests.flows.conftest import FEW_BANDS
 SHOWN = ("text",)  # program output and pictures of letters: nothing to run
 BUILT = ("{toctree}", "{eval-rst}")  # run by `make docs`
 BUCKET = "s3://bucket/prefix"
-BEGUN_WITHIN_S = 120.0
 EACH = """
 import json, sys
 from flows.cli.main import main
@@ -58,7 +53,6 @@ class Reader:
     folder: Path
     bucket: str | None = None
     names: dict[str, Any] = field(default_factory=lambda: {"__name__": "page"})
-    left: ExitStack = field(default_factory=ExitStack)  # ends the processes that were started
 
     def follow(self, block: Block) -> None:
         """Run one block; raise AssertionError with its place if it fails."""
@@ -66,7 +60,7 @@ class Reader:
         if block.language in (*SHOWN, *BUILT):
             assert not block.mark, f"{block.place}: nothing of a {block.language} block is tested"
         elif block.language == "sh":
-            assert word in ("", "with", "parses", "bucket", "tree", "meanwhile"), f"{block.place}: {block.mark}?"
+            assert word in ("", "with", "parses", "bucket", "tree"), f"{block.place}: {block.mark}?"
             for command in commands_of(block):
                 self._command(block, command, word, rest)
             if word == "tree":
@@ -102,11 +96,8 @@ class Reader:
         if word == "bucket":
             assert self.bucket is not None
             given = [one.replace(BUCKET, self.bucket) for one in given]
-        if word == "meanwhile":
-            self._begin(block, given)
-        else:
-            code = run_here(given)
-            assert code == 0, f"{block.place}: {command} ended with {code}"
+        code = run_here(given)
+        assert code == 0, f"{block.place}: {command} ended with {code}"
 
     def _matching(self, word: str) -> list[str]:
         """Expand the stars of a word as a shell does; return the word itself if it has none or no file matches."""
@@ -121,23 +112,6 @@ class Reader:
         command = [sys.executable, "-c", EACH, json.dumps([[*first, *shlex.split(flags)], *others])]
         ended = subprocess.run(command, env=environment, cwd=self.folder, capture_output=True, text=True, check=False)
         assert ended.returncode == 0, f"{block.place}: {ended.stderr[-2000:]}"
-
-    def _begin(self, block: Block, words: list[str]) -> None:
-        """Start a command that runs until the page ends."""
-        made = self.folder / words[words.index("-o") + 1]
-        command = [str(Path(sys.executable).with_name("spectralzoom")), *words]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=self.folder)
-
-        def end() -> None:
-            process.send_signal(signal.SIGINT)
-            process.wait(30)
-
-        self.left.callback(end)
-        until = time.monotonic() + BEGUN_WITHIN_S
-        while not made.exists():
-            assert process.poll() is None, f"{block.place}: ended with {process.returncode}"
-            assert time.monotonic() < until, f"{block.place}: there is no {made.name} yet"
-            time.sleep(0.1)
 
     def _python(self, block: Block) -> None:
         if block.file is not None:  # a new file in the copy of the folders

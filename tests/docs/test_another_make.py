@@ -1,10 +1,9 @@
-"""The camera that how-to/second-rig.md builds takes a sweep with the emulated mirror."""
+"""The camera that how-to/second-rig.md builds takes a sweep with the fake mirror."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,19 +18,17 @@ from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture_paths import REFERENCES, capture_prefix
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import CameraDriver, RigDevices, open_camera_driver, open_mirror_driver
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
+from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
 from pipeline.rig.rig_check import check_camera
 from pipeline.rig.rig_source import RigSource
 from pipeline.rig.transports import StateUnknown
 from tests.docs.pages import DOCS, blocks_of
-from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 
 MODULE = "folder_camera"
-PX = 11275  # about the pixels of a unit on the disk
 
 
-class SharedClock(ManualClock):
+class SharedClock(FakeClock):
     """A clock whose sleep lets another program work."""
 
     program: Program | None = None
@@ -44,12 +41,12 @@ class SharedClock(ManualClock):
 
 @dataclass
 class Program:
-    """The camera's program as the page describes it: it captures by the emulated camera and writes ENVI by SPy."""
+    """The camera's program as the page describes it: it captures by a fake camera and writes ENVI by SPy."""
 
     folder: Path
-    line: InProcessRig
+    seen: FakeCamera
     busy: bool = False
-    runs: dict[str, str] = field(default_factory=dict)  # folders of the emulated camera, by names of captures
+    runs: dict[str, str] = field(default_factory=dict)  # folders of the fake camera, by names of captures
 
     def work(self) -> None:
         """Take new requests, and save finished captures."""
@@ -58,29 +55,29 @@ class Program:
         self.busy = True
         for request in self.folder.glob("*.request"):
             self._begin(request)
-        if self.runs and not self.line.rig.camera.is_capturing():
+        if self.runs and not self.seen.is_capturing():
             self._drop()
         self.busy = False
 
     def _begin(self, request: Path) -> None:
         frames, *times = request.read_text().split()
-        camera = self.line.camera()
-        camera.configure(*map(float, times))
-        self.runs[request.stem] = camera.capture(int(frames), prefix=request.stem.rpartition("-")[0]).folder
+        self.seen.configure(*map(float, times))
+        self.runs[request.stem] = self.seen.capture(int(frames), prefix=request.stem.rpartition("-")[0]).folder
         (self.folder / f"{request.stem}.raw").touch()
         request.unlink()
 
     def _drop(self) -> None:
-        seen = self.line.rig.camera
         for name, folder in self.runs.items():
-            self._save(name, self.line.camera().fetch(folder, KeptInMemory()).values)
-            if name.startswith(REFERENCES):
-                for kind, frames in seen.view.references((seen.exposure_ms, seen.period_ms)).items():
-                    self._save(f"{name}_{kind.removesuffix('Reference')}", frames)
+            if not name.startswith(REFERENCES):
+                self._save(name, self.seen.fetch(folder, KeptInMemory()).values)
+                continue
+            for kind, frame in self.seen.references(folder, KeptInMemory()).items():
+                self._save(f"{name}_{kind}", np.rint(frame.mean)[None].astype(np.uint16))
+            self._save(name, np.zeros((1, *frame.mean.shape), np.uint16))
         self.runs.clear()
 
     def _save(self, name: str, values: np.ndarray[Any, Any]) -> None:
-        fps = 1000 / self.line.rig.camera.period_ms
+        fps = 1000 / self.seen.times_ms[1]
         path = str(self.folder / f"{name}.hdr")
         envi.save_image(path, values, dtype=np.uint16, interleave="bil", ext="raw", force=True, metadata={"fps": fps})
 
@@ -97,42 +94,35 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     sys.modules.pop(MODULE, None)
 
 
-@contextmanager
-def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]]:
-    """Yield a source of the emulated mirror and the page's camera, the camera, and its program in ``folder``."""
+def folder_rig(folder: Path) -> tuple[RigSource, CameraDriver, Program]:
+    """Return a source of a fake mirror and the page's camera, the camera, and its program in ``folder``."""
     folder.mkdir()
     clock = SharedClock(50.0)
-    settings = SurveyRig(camera_driver=f"{MODULE}:open_camera", host=str(folder), log_samples=16_000)
-    with InProcessRig(EmulatedRig(small_source(), clock, wired="none")) as line:
-        clock.program = Program(folder, line)
-        camera = open_camera_driver(settings, clock)
-
-        def devices() -> RigDevices:
-            return RigDevices(line.mirror(settings), camera, clock)
-
-        seen = small_source()
-        source = RigSource(
-            CAMERA, seen.wavelength_nm, seen.field_shape, devices, KeptInMemory(), rig=settings, vector_pairs=1500
-        )
-        yield source, camera, clock.program
+    settings = SurveyRig(camera_driver=f"{MODULE}:open_camera", host=str(folder))
+    clock.program = Program(folder, FakeCamera(clock, small_source()))
+    camera = open_camera_driver(settings, clock)
+    devices = RigDevices(FakeMirror(clock), camera, clock)
+    seen = small_source()
+    source = RigSource(CAMERA, seen.wavelength_nm, seen.field_shape, lambda: devices, KeptInMemory(), rig=settings)
+    return source, camera, clock.program
 
 
 @pytest.mark.usefixtures("module")
 def test_the_camera_of_the_page_takes_a_sweep(tmp_path: Path) -> None:
-    """All lines are valid, within 3 px by the mirror's log, and have values and references of the camera's files."""
-    with folder_rig(tmp_path / "incoming") as (source, _, _):
-        found = list(source.lines(FINE))
-        references = source.references(FINE)
-        (told,) = source.record["captures"]
+    """All lines are valid and in their places, and have values and references of the camera's files."""
+    source, _, _ = folder_rig(tmp_path / "incoming")
+    found = list(source.lines(FINE))
+    references = source.references(FINE)
+    (told,) = source.record["captures"]
     assert [line.number for line in found] == list(range(FINE.lines))
     assert all(line.valid for line in found)
-    assert (told["method"], told["folder"]) == ("log", f"{capture_prefix(FINE)}-0")
+    assert told["folder"] == f"{capture_prefix(FINE)}-0"
     header = tmp_path / "incoming" / f"{capture_prefix(FINE)}-0.hdr"
     stored = envi.open(str(header)).open_memmap(interleave="bip")
     np.testing.assert_array_equal([line.data for line in found], stored)
     np.testing.assert_allclose([line.time_s for line in found], CAMERA.mid_exposure_s(np.arange(FINE.lines)), atol=1e-6)
-    off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
-    assert np.hypot(*off.T).max() * PX < 3
+    places = [(line.mirror_x, line.mirror_y) for line in found]
+    np.testing.assert_allclose(places, line_positions(FINE, CAMERA), atol=told["residual_px"] / 10_000 + 1e-7)
     expected = small_source().references(FINE)
     np.testing.assert_allclose(references.dark, expected.dark, atol=0.5)
     np.testing.assert_allclose(references.white, expected.white, atol=0.5)
@@ -141,15 +131,15 @@ def test_the_camera_of_the_page_takes_a_sweep(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("module")
 def test_a_camera_program_that_does_not_run_ends_in_one_message(tmp_path: Path) -> None:
     """The request is withdrawn, so that no late capture follows; fetching a missing capture names it."""
-    with folder_rig(tmp_path / "incoming") as (_, camera, program):
-        program.busy = True
-        camera.configure(100.0, 110.0)
-        with pytest.raises(StateUnknown, match=r"lines-0.request was not taken in 10 s; does the camera's program run"):
-            camera.capture(5, prefix="lines")
-        with pytest.raises(RigError, match="cannot read capture lines-0"):
-            camera.fetch("lines-0", KeptInMemory())
-        assert list(program.folder.iterdir()) == []
-        assert [row.came for row in check_camera(lambda: camera)] == ["no capture runs"]
+    _, camera, program = folder_rig(tmp_path / "incoming")
+    program.busy = True
+    camera.configure(100.0, 110.0)
+    with pytest.raises(StateUnknown, match=r"lines-0.request was not taken in 10 s; does the camera's program run"):
+        camera.capture(5, prefix="lines")
+    with pytest.raises(RigError, match="cannot read capture lines-0"):
+        camera.fetch("lines-0", KeptInMemory())
+    assert list(program.folder.iterdir()) == []
+    assert [row.came for row in check_camera(lambda: camera)] == ["no capture runs"]
 
 
 BROKEN = {

@@ -18,7 +18,7 @@ README_LINES = 130
 PATH = re.compile(
     r"(?:pipeline|models|storage|flows|tests|docs|\.ci)(?:/[\w.-]+)*/?|[\w-]+\.(?:md|toml|yaml|txt)|Makefile"
 )
-OF_USERS = {"scene.toml", "emulated.toml", "field.toml", "survey.toml", "north.toml"}  # written by users of the pages
+OF_USERS = {"scene.toml", "fake.toml", "field.toml", "survey.toml", "north.toml"}  # written by users of the pages
 
 
 def named(page: Path) -> str:
@@ -32,7 +32,7 @@ def test_every_block_runs(page: Path, place: Path, request: pytest.FixtureReques
     blocks = blocks_of(page)
     bucket = request.getfixturevalue("bucket") if any(one.mark == "bucket" for one in blocks) else None
     reader = Reader(place, bucket)
-    with reader.left, with_effects() if page in OF_EFFECTS else without_effects():
+    with with_effects() if page in OF_EFFECTS else without_effects():
         for block in blocks:
             reader.follow(block)
 

@@ -39,9 +39,9 @@ def flip_journal(flips: int, seed: int = 0) -> Rot:
     truth = []
     for number in range(8):
         times = (float(number), number + 0.5)
-        taken = CaptureRecord(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", True, times, times)
+        taken = CaptureRecord(SWEEP, 5 * number, 5 * number + 5, f"/captured/a_{number}", times, times)
         journal.record_capture(taken)
-        truth.append(asdict(journal.record_end(taken)))
+        truth.append(asdict(taken))
     content = bytes(kept.files[JOURNAL])
     chance = random.Random(seed)
     found = Rot()

@@ -1,20 +1,16 @@
-"""Compare a survey through an emulated rig, in separate processes, with the simulated survey of the same scene.
+"""Compare a survey through a fake rig, in separate processes, with the simulated survey of the same scene.
 
-The rig is `spectralzoom rig emulate` behind a pty and sockets; `rig check` checks it first. The surveys share scene,
-seed, effects and budget, so their raw lines and their maps must be equal, bit for bit.
+`rig check` checks the rig first. The surveys share scene, seed, visit, effects and budget, so their raw lines and their
+maps must be equal, bit for bit.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import signal
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -26,42 +22,26 @@ from tests.faults.nursery import ROOT
 SIZE, QUICK_SIZE = "256x256", "128x128"
 QUICK_BANDS = ",".join(map(str, range(8, 264, 16)))
 SURVEY = ("survey", "--budget", "0.8", "--keep", "raw", "--engine", "plain", "--json")
+FAKE = 'source = "rig"\nscene = "farm"\n[rig]\nmirror_driver = "fake"\ncamera_driver = "fake"\n'
 PRODUCTS = ("raw_coarse", "raw_fine", "mosaic", "class_map")
 
 
 def rows(quick: bool) -> list[Row]:
     """Return the rows of the rig check and of the comparison of both surveys."""
-    scene = ["--scene", "farm", "--size", QUICK_SIZE if quick else SIZE, "--seed", "7"]
-    scene += ["--bands", QUICK_BANDS] if quick else []
+    scene = ["--size", QUICK_SIZE if quick else SIZE, "--seed", "7", *(("--bands", QUICK_BANDS) if quick else ())]
     with tempfile.TemporaryDirectory(prefix="survey-rig-") as name:
         folder = Path(name)
-        with emulated(folder / "emulated.toml", scene) as rig:
-            checked = run("rig", "check", str(rig))
-            print(checked, flush=True)
-            seen = survey(folder / "rig", str(rig), "--visit", "first")
-        wanted = survey(folder / "simulated", *scene)
-    how = "on the emulated rig, by the file that it wrote"
+        (folder / "fake.toml").write_text(FAKE)
+        checked = run("rig", "check", str(folder / "fake.toml"), "--move")
+        print(checked, flush=True)
+        seen = survey(folder / "rig", str(folder / "fake.toml"), *scene, "--visit", "first")
+        wanted = survey(folder / "simulated", "--scene", "farm", *scene, "--visit", "first")
     mended = "nothing to mend" in checked
-    found = [Row("rig check", how, 1, "nothing to mend", checked.splitlines()[-1], mended)]
+    found = [Row("rig check", "of the fake devices", 1, "nothing to mend", checked.splitlines()[-1], mended)]
     for one in PRODUCTS:
         same = seen[one] == wanted[one]
         found.append(Row(one, "rig beside simulated, SHA-256", 1, wanted[one], seen[one], same))
     return found
-
-
-@contextmanager
-def emulated(file: Path, scene: Sequence[str]) -> Iterator[Path]:
-    """Start an emulated rig for the block and yield the settings of a survey of it; end it as by Ctrl-C."""
-    words = [sys.executable, "-m", "flows.cli.main", "rig", "emulate", *scene, "--speed", "10", "--out", str(file)]
-    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
-        try:
-            while not file.exists() or "[rig]" not in file.read_text():
-                if process.poll() is not None:
-                    raise RuntimeError(f"the emulated rig did not begin (exit code {process.returncode})")
-                time.sleep(0.05)
-            yield file
-        finally:
-            process.send_signal(signal.SIGINT)
 
 
 def run(*words: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -40,7 +39,7 @@ from storage.export.image_files import write_recorded_files
 from storage.remote.opening import verify_archive
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.flows.conftest import CommandLine, be_version, command_line
-from tests.flows.tasks.test_survey_rig import emulated
+from tests.flows.tasks.test_survey_rig import FAKE
 from tests.flows.tasks.test_uniform_scan import RECORD
 from tests.prior_work import without_effects
 from tests.storage.readers.test_recordings import write_envi_cube
@@ -61,17 +60,19 @@ PASSES: dict[str, dict[str, Any]] = {
 
 
 def field() -> RasterScene:
-    """Return a field of three classes for the emulated rig."""
+    """Return a field of three classes."""
     camera = load_settings(None, dict(NARROW)).camera
     values = patchy_scene(SIZE[::-1], 3, 1)[0]
     return raster_from_values(values, camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0]))
 
 
 def rig_settings(out: Path, weights: Path, **asked: Any) -> Any:
-    """Return settings of a survey of the field through the rig."""
+    """Return settings of a survey of a field of three classes through a fake rig."""
+    scene = out.with_suffix(".npy")
+    np.save(scene, patchy_scene(SIZE[::-1], 3, 1)[0])
     told = {
-        **{"source": "rig", "scene": "field", "size": f"{SIZE[0]}x{SIZE[1]}", "wavelengths": "640,550,460"},
-        **{"rig.port": f"rig-{os.getpid()}", "rig.pulses": "position", "visit": "first", "engine": "plain"},
+        **{"source": "rig", "scene": str(scene), "wavelengths": "640,550,460", "effects": "none"},
+        **{**FAKE, "visit": "first", "engine": "plain"},
         **{"weights": str(weights), "out": str(out), **NARROW, **asked},
     }
     return load_settings(None, told)
@@ -98,15 +99,14 @@ def write_sweeps(out: Path, published: Published, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("asked", PASSES.values(), ids=PASSES)
-def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any]) -> None:
+def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, asked: dict[str, Any]) -> None:
     """The class map's hash is the same from ENVI and CSV files, and from the raw cubes of the archive."""
     weights = tmp_path / "reflectance.safetensors"
     made = random_weights((640.0, 550.0, 460.0))
     centre, spread = (np.full_like(made.normalisation.centre, level) for level in (0.3, 0.05))
     save_weights(replace(made, normalisation=replace(made.normalisation, centre=centre, spread=spread)), weights)
     settings = rig_settings(tmp_path / "rig", weights, keep="raw", **asked)
-    with emulated(settings, {}, monkeypatch, scene=field()):
-        published = run_survey(settings, QUIET)
+    published = run_survey(settings, QUIET)
     expected = digest_of_map(tmp_path / "rig", published.receipt)
     assert len(np.unique(load_class_map(tmp_path / "rig" / published.receipt["products"]["class_map"]).classes)) > 1
     folder = write_sweeps(tmp_path / "rig", published, tmp_path / "sweeps")
@@ -358,8 +358,7 @@ def test_source_recorded_needs_sweeps(command_line: CommandLine, tmp_path: Path)
 def test_a_rig_survey_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path) -> None:
     """After a new version of the capture, the archive's lines give the same map without the rig, and only once."""
     archive = tmp_path / "rig"
-    with emulated(rig_settings(archive, weights, keep="raw"), {}, monkeypatch, scene=field()):
-        published = run_survey(rig_settings(archive, weights, keep="raw", scan_step=2), QUIET)
+    published = run_survey(rig_settings(archive, weights, keep="raw", scan_step=2), QUIET)
     be_version(monkeypatch, "capture", 99)
     assert run_reprocess(archive, QUIET) == 0
     first, second = Archive.open(archive).runs()

@@ -17,7 +17,7 @@ from typing import Any, Self
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
+from pipeline.rig.device_settings import CONTROL_PORT, ControlPatience, FileServer
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
@@ -128,14 +128,9 @@ class HeadwallCamera:
         self._lock = threading.RLock()
 
     @classmethod
-    def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
+    def at(cls, host: str, server: FileServer, *, port: int = CONTROL_PORT, clock: Clock = SYSTEM_CLOCK) -> Self:
         """Return a camera on the network."""
-        return cls(
-            lambda: SocketTransport(address.host, address.port, clock, connect_s=address.connect_s),
-            server,
-            clock=clock,
-            **given,
-        )
+        return cls(lambda: SocketTransport(host, port, clock), server, clock=clock)
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period; StateUnknown where a capture may be running, see ``capture``. [ms]"""

@@ -2,12 +2,48 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 
-from tests.pipeline.rig.in_process import Incoming, ManualClock
+from pipeline.rig.fakes import FakeClock
+from pipeline.rig.transports import Clock
+
+
+class Incoming:
+    """Data on their way to a driver, possibly with an error; reading advances the clock."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.coming: list[tuple[float, int, bytes | Exception]] = []  # by the time at which they can be read
+        self._order = count()
+
+    def expect(self, when_s: float, data: bytes | Exception) -> None:
+        """Schedule data for a time, after all that is scheduled for the same time."""
+        heapq.heappush(self.coming, (when_s, next(self._order), data))
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Return the next part, at its time."""
+        if not self.coming or self.coming[0][0] > deadline:
+            self.clock.sleep(deadline - self.clock.now())
+            return b""
+        when_s, order, data = heapq.heappop(self.coming)
+        self.clock.sleep(when_s - self.clock.now())
+        if isinstance(data, Exception):
+            raise data
+        if data[at_most:]:
+            heapq.heappush(self.coming, (when_s, order, data[at_most:]))
+        return data[:at_most]
+
+    def drain(self) -> bytes:
+        """Return all data that have arrived."""
+        found = b""
+        while self.coming and self.coming[0][0] <= self.clock.now():
+            found += self.read(1 << 20, self.clock.now())
+        return found
 
 
 @dataclass(frozen=True)
@@ -30,9 +66,8 @@ class ScriptedTransport(Incoming):
 
     port = "scripted"
 
-    def __init__(self, pairs: Sequence[Pair], clock: ManualClock, stale: bytes = b"") -> None:
-        self.clock = clock
-        self.__post_init__()
+    def __init__(self, pairs: Sequence[Pair], clock: FakeClock, stale: bytes = b"") -> None:
+        super().__init__(clock)
         self.drained = b""
         self.sent = 0
         self.closed = False
@@ -71,7 +106,7 @@ class ScriptedTransport(Incoming):
 @contextmanager
 def scripted(pairs: Sequence[Pair], *, stale: bytes = b"", drained: bytes = b"") -> Iterator[ScriptedTransport]:
     """Play pairs, and fail at the end on unsent or unread ones. ``drained`` must be dropped unread."""
-    transport = ScriptedTransport(pairs, ManualClock(), stale)
+    transport = ScriptedTransport(pairs, FakeClock(), stale)
     yield transport
     transport.check()
     assert transport.drained == drained

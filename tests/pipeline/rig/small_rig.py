@@ -1,32 +1,27 @@
-"""A small scene in front of an emulated rig in this process, and the rig as a source of lines."""
+"""A small scene in front of a fake rig, whose devices fail where a test wants, and the rig as a source of lines."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
-from pipeline.rig.camera.camera_files import Kept, KeptInMemory
+from pipeline.rig.camera.camera_cubes import CapturedLines
+from pipeline.rig.camera.camera_files import Capture, Kept, KeptInMemory, Progress
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
-from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.pro_mode import Command
+from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
 from pipeline.rig.rig_source import RigSource
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
-from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
-from tests.pipeline.rig.in_process import InProcessRig, ManualClock
-from tests.pipeline.rig.mirror_faults import Fault
 from tests.pipeline.simulator.small_scenes import effects_on
 
 CAMERA = LineCamera(samples=48)
@@ -42,11 +37,6 @@ def small_source(**changed: Any) -> SimulatedSource:
     return replace(SimulatedSource(scene, Rig(CAMERA), 5, effects_on(*NAMES)), **changed)
 
 
-def set_anything(mirror: MirrorDevice) -> bool:
-    """Return whether any register or vector of the mirror was set."""
-    return any(request.command in (Command.SET_VALUES, Command.SET_VECTOR) for request in mirror.requests)
-
-
 @cache
 def simulated_lines(sweep: Sweep) -> list[Line]:
     """Return the simulated source's lines of a sweep, cached."""
@@ -60,65 +50,89 @@ def assert_simulated(found: Sequence[Line], sweep: Sweep, first: int = 0) -> Non
     np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
 
 
+Act = Callable[[], object]
+
+
+class FaultyCamera(FakeCamera):
+    """A fake camera that calls the next of ``acts`` at a capture, a fetch or a request for its state.
+
+    An act may raise. ``cuts`` has the lines that the next fetches bring; None: all. Captures of a ``late`` camera are
+    written only after that time.
+    """
+
+    def __init__(self, clock: FakeClock, source: SimulatedSource) -> None:
+        super().__init__(clock, source)
+        self.acts: dict[str, list[Act]] = {"capture": [], "fetch": [], "is_capturing": []}
+        self.cuts: list[int | None] = []
+        self.late = 0.0
+        self.stopped = 0
+
+    def capture(self, frames: int, *, prefix: str = "") -> Capture:
+        self._act("capture")
+        return super().capture(frames, prefix=prefix)
+
+    def is_capturing(self) -> bool:
+        self._act("is_capturing")
+        return super().is_capturing() or (bool(self.captures) and self.clock.now() < self.late)
+
+    def stop(self) -> None:
+        self.stopped += 1
+        super().stop()
+
+    def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
+        self._act("fetch")
+        found = super().fetch(folder, kept, progress)
+        cut = self.cuts.pop(0) if self.cuts else None
+        if cut is None:
+            return found
+        times = replace(found.times, frame=found.times.frame[:cut], stamp_us=found.times.stamp_us[:cut])
+        return replace(found, values=found.values[:cut], times=times, lost=len(found.values) - cut)
+
+    def _act(self, name: str) -> None:
+        if self.acts[name]:
+            self.acts[name].pop(0)()
+
+
 @dataclass
 class SmallRig:
-    """An emulated rig and the settings of its sources."""
+    """A fake rig, and the settings of its sources."""
 
-    line: InProcessRig
-    settings: SurveyRig
-    vector_pairs: int
-    wavelength_nm: NDArray[np.float64]
+    seen: SimulatedSource = field(default_factory=small_source)
+    settings: SurveyRig = field(default_factory=SurveyRig)
+    vector_pairs: int = 1500
     opened: int = 0
+    closed: int = 0
 
-    @property
-    def emulated(self) -> FaultyRig:
-        """Return both emulated devices."""
-        return cast("FaultyRig", self.line.rig)
+    def __post_init__(self) -> None:
+        self.clock = FakeClock(50.0)
+        self.mirror = FakeMirror(self.clock, self.vector_pairs)
+        self.camera = FaultyCamera(self.clock, self.seen)
+        self.wavelength_nm: NDArray[np.float64] = self.seen.wavelength_nm
 
     @property
     def captures(self) -> list[str]:
-        """Return the capture commands that the camera received, without references."""
-        return [said for said in self.emulated.camera.commands if "capture(" in said and "references" not in said]
+        """Return the captures that the camera began, without references."""
+        return [folder for folder in self.camera.captures if "references" not in folder]
 
     def devices(self) -> RigDevices:
         """Connect to both devices."""
         self.opened += 1
-        return self.line.devices(self.settings, self.vector_pairs)
+        rig = self
+
+        class Devices(RigDevices):
+            def close(self) -> None:
+                rig.closed += 1
+
+        return Devices(self.mirror, self.camera, self.clock)
 
     def source(self, kept: Kept | None = None) -> RigSource:
         """Return a source that captures with the rig; each call acts as another process."""
         return RigSource(
-            self.emulated.camera.view.source.camera,
+            self.seen.camera,
             self.wavelength_nm,
-            self.emulated.camera.view.source.field_shape,
+            self.seen.field_shape,
             self.devices,
             KeptInMemory() if kept is None else kept,
             rig=self.settings,
             vector_pairs=self.vector_pairs,
         )
-
-
-@contextmanager
-def small_rig(
-    source: SimulatedSource | None = None,
-    *,
-    faults: dict[CameraFault, int] | None = None,
-    passes: int = 0,
-    mirror_faults: list[Fault] | tuple[Fault, ...] = (),
-    vector_pairs: int = 1500,
-    mounting: Mounting = STRAIGHT,
-    **settings: Any,
-) -> Iterator[SmallRig]:
-    """Yield an emulated rig in front of a source's scene, with its mirror mounted as ``mounting``.
-
-    Settings and cable have one pulse per held position, and requests to the mirror a CRC, unless ``settings`` differ.
-    """
-    told = {"pulses": "position", "with_crc": True, **settings}
-    viewed = small_source() if source is None else source
-    clock = ManualClock(50.0)
-    camera_faults = CameraFaults(dict(faults or {}), 0, passes)
-    rig = FaultyRig(
-        viewed, clock, mirror_faults=mirror_faults, wired=told["pulses"], camera_faults=camera_faults, mounting=mounting
-    )
-    with InProcessRig(rig) as line:
-        yield SmallRig(line, SurveyRig(**told), vector_pairs, viewed.wavelength_nm)

@@ -11,8 +11,8 @@ from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_camera
 from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
 from pipeline.rig.device_settings import ControlPatience, FileServer, check_times
+from pipeline.rig.fakes import FakeClock
 from pipeline.rig.transports import DeviceRefused, StateUnknown
-from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
@@ -33,7 +33,7 @@ def refused(command: bytes, why: bytes) -> bytes:
 @contextmanager
 def talk(*connections: Sequence[Pair], retries: int = 2, hello: bytes = HELLO) -> Iterator[HeadwallCamera]:
     """Yield a client whose connections follow these scripts; all of them must be used up."""
-    clock = ManualClock()
+    clock = FakeClock()
     scripts = [ScriptedTransport(pairs, clock, hello) for pairs in connections]
     waiting = iter(scripts)
     yield HeadwallCamera(lambda: next(waiting), FileServer(), clock=clock, patience=ControlPatience(5.0, retries, 0.5))

@@ -9,11 +9,10 @@ import numpy as np
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture_paths import CaptureRecord, LinePositions
 from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
-from pipeline.rig.mirror_controller import MotionLog
 from tests.faults.growing_files import flip_journal
 from tests.pipeline.rig.small_rig import COARSE, FINE
 
-ONE = CaptureRecord(FINE, 0, 5, "/captured/a", True, (0.0, 0.1), (0.1, 0.2))
+ONE = CaptureRecord(FINE, 0, 5, "/captured/a", (0.0, 0.1), (0.1, 0.2))
 OTHER = replace(ONE, folder="/captured/b", first=3, stop=9)
 
 
@@ -55,19 +54,7 @@ def test_a_reused_folder_name_counts_as_the_latest_capture() -> None:
 
 def tied(residual_px: float) -> LinePositions:
     """Return line positions with a residual that identifies them."""
-    return LinePositions(np.zeros((0, 2)), np.zeros(0, np.bool_), "log", residual_px)
-
-
-def test_the_mirror_log_is_restored_from_the_journal() -> None:
-    """Another process reads the measured positions bit for bit."""
-    kept = KeptInMemory()
-    position = np.array([(0.1, -0.2), (0.3, 0.4)], np.float32)
-    journal = CaptureJournal(kept)
-    journal.record_capture(ONE)
-    journal.record_end(replace(ONE, log=MotionLog(position, 1000.0, 0.06, 0.04)))
-    found = CaptureJournal(kept).holding(FINE, 0)
-    np.testing.assert_array_equal(found.log.position, position)
-    assert (found.log.rate_hz, found.log.started_s, found.log.start_error_s) == (1000.0, 0.06, 0.04)
+    return LinePositions(np.zeros((0, 2)), np.zeros(0, np.bool_), residual_px)
 
 
 def test_a_flipped_bit_of_the_journal_changes_no_capture():

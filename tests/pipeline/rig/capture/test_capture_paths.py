@@ -12,7 +12,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig import capture_paths
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.camera.camera_texts import LineTimes
-from pipeline.rig.mirror_controller import MotionLog
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
@@ -52,8 +51,8 @@ def test_names_invalid_for_a_folder_are_refused(name: str) -> None:
         capture_paths.capture_prefix(Sweep(name, "fine", "x", 0.0, 0.0, 5))
 
 
-PATH = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=7, triggered=True)  # lines 3 to 9
-TAKEN = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=6)
+PATH = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=6)  # lines 3 to 9
+TAKEN = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", (0.1, 0.2), (0.1, 0.2))
 
 
 def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
@@ -85,58 +84,15 @@ def test_a_complete_capture_without_an_index_is_in_order():
     """As many rows as lines are unambiguous; fewer rows are refused."""
     assert capture_paths.locate_lines(frames([-1] * 6), PATH, TAKEN, CAMERA).row.tolist() == list(range(6))
     with pytest.raises(capture_paths.UnusableCaptureError, match="fetch frameIndex"):
-        capture_paths.locate_lines(frames([-1] * 5), PATH, replace(TAKEN, index_at_end=None), CAMERA)
+        capture_paths.locate_lines(frames([-1] * 5), PATH, TAKEN, CAMERA)
     with pytest.raises(capture_paths.UnusableCaptureError, match="has no number of the 6 frames"):
         capture_paths.locate_lines(frames(list(range(1000, 1006))), PATH, TAKEN, CAMERA)
 
 
-@pytest.mark.parametrize(("sweep", "last"), [(FINE, 6), (COARSE, 8)], ids=lambda value: getattr(value, "kind", ""))
-def test_captures_with_a_wrong_number_of_steps_are_refused(sweep: Sweep, last: int):
-    """With one edge too few or too many the wrong lines are unknown, also within the four cells of a coarse line."""
-    path = capture_paths.next_path(sweep, 2, CAMERA, vector_pairs=12, triggered=True)
-    count = last // sweep.step
-    taken = capture_paths.CaptureRecord(sweep, 2, 2 + count, "/x", True, (0.0, 0.1), (0.1, 0.2), index_at_end=last)
-    seen = frames(list(range(count)))
-    assert capture_paths.locate_lines(seen, path, taken, CAMERA).row.tolist() == list(range(count))
-    for index in (0, last - 3, last - 2, last - 1, last + 1):
-        words = rf"stands at cell {index} of its path, after {count} frames cell {last} was expected"
-        with pytest.raises(capture_paths.UnusableCaptureError, match=words):
-            capture_paths.locate_lines(seen, path, replace(taken, index_at_end=index), CAMERA)
-
-
-def test_a_mirror_log_gives_the_positions():
-    """Positions come from the log, not from command times. Lines after its end are left to another capture."""
-    path = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=6, triggered=False)
-    log = MotionLog(np.zeros((1000, 2), np.float32), 1000.0, started_s=0.06, start_error_s=0.04)
-    taken = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", False, (5.0, 5.1), (0.1, 0.2), log=log)
-    tied = capture_paths.locate_lines(frames(list(range(6))), path, taken, CAMERA).positions
-    assert tied.method == "log"
-    assert tied.valid.all()
-    short = replace(taken, log=replace(log, position=log.position[:400]))
-    assert capture_paths.locate_lines(frames(list(range(6))), path, short, CAMERA).row.tolist() == [0, 1, 2]
-
-
-@pytest.mark.parametrize("last", [11, 5, 0])
-def test_a_log_of_few_samples_does_not_bend_the_path(last: int):
-    """Lines lie at the held positions plus the log's offset. After the mirror stops, they stay at its last position."""
-    path = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=12, triggered=False)
-    cell = ((np.arange(20) / 14 - 0.2) * path.rate_hz).clip(0, last).astype(int)  # stands still from cell last on
-    log = MotionLog((path.cells[cell] + 1e-4).astype(np.float32), 14.0, started_s=0.05, start_error_s=0.0)
-    taken = capture_paths.CaptureRecord(FINE, 3, 15, "/captured/x", False, (0.24, 0.26), (0.25, 0.25), log=log)
-    tied = capture_paths.locate_lines(frames(list(range(12))), path, taken, CAMERA).positions
-    some = np.arange(11) if last == 11 else np.arange(last + 1, 11)
-    np.testing.assert_allclose(tied.position[some], path.middle[some.clip(0, last)] + 1e-4, atol=1e-6)
-
-
 def test_paths_contain_whole_lines():
-    """The held positions of a line stay together, and the lead-in cell takes one pair."""
-    path = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=True)
-    assert (path.first, path.stop, path.cells.shape) == (2, 4, (9, 2))
-    assert path.cells[0].tolist() == path.cells[1].tolist()
-    assert path.frames_at(8) == 2
-    assert path.frames_at(7) is None
-    with pytest.raises(SettingsError, match=r"memory 4 pairs; give cost\.vector_pairs of at least 5"):
-        capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=4, triggered=True)
-    free = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=12, triggered=False)
-    assert free.cells.shape == (12, 2)
-    assert free.rate_hz == 40.0
+    """The held positions of a line stay together."""
+    path = capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=11)
+    assert (path.first, path.stop, path.cells.shape) == (2, 4, (8, 2))
+    assert path.rate_hz == 40.0
+    with pytest.raises(SettingsError, match=r"memory 3 pairs; give cost\.vector_pairs of at least 4"):
+        capture_paths.next_path(COARSE, 2, CAMERA, vector_pairs=3)

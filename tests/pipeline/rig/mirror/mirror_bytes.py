@@ -20,6 +20,11 @@ def set_value(register: int, value: float) -> Frame:
     return Frame(0x10, register.to_bytes(2, "big") + float_cell(value))
 
 
+def get_value(register: int) -> Frame:
+    """Return a request for one register, which the driver never sends."""
+    return Frame(0x11, register.to_bytes(2, "big"))
+
+
 ASK_FIRMWARE = Frame(0x01, b"\x00\x00")
 GREET: Pair = (b"START\r\n", b"OK\r\n")
 WHO: list[Pair] = [(b"GETID\r\n", b"MR-E-2\r\n"), (b"GETVERSION\r\n", b"1.2.4065\r\n"), (b"GETSN\r\n", b"ABCD0123\r\n")]
@@ -45,41 +50,36 @@ READ_BACK = pair(
     "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 00 00 00 00 00 00 00 00 81 75 7E",
 )
 HALT = pair("7E 00 12 0E 00 02 68 01 69 01 00 00 00 00 00 00 00 00 BE 49 7E", DONE)
-# Three positions at 10 Hz, by rising edges: X in cells 0 to 3, Y in cells 3 to 6, ends excluded.
+# Three positions at 10 Hz: X in cells 0 to 3, Y in cells 3 to 6, ends excluded.
 SET_X = pair(
     "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
-    " 00 00 00 02 00 00 00 00 00 00 00 03 41 20 00 00 00 00 00 01 00 00 00 02 0F 02 7E",
+    " 00 00 00 02 00 00 00 00 00 00 00 03 41 20 00 00 00 00 00 01 00 00 00 00 8E C3 7E",
     DONE,
 )
 SET_Y = pair(
     "7E 00 12 26 00 06 69 00 69 02 69 03 69 04 69 07 69 08"
-    " 00 00 00 02 00 00 00 03 00 00 00 06 41 20 00 00 00 00 00 01 00 00 00 02 C8 44 7E",
+    " 00 00 00 02 00 00 00 03 00 00 00 06 41 20 00 00 00 00 00 01 00 00 00 00 49 85 7E",
     DONE,
 )
 SET_X_INCLUSIVE = pair(
     "7E 00 12 26 00 06 68 00 68 02 68 03 68 04 68 07 68 08"
-    " 00 00 00 02 00 00 00 00 00 00 00 02 41 20 00 00 00 00 00 01 00 00 00 02 0D 83 7E",
+    " 00 00 00 02 00 00 00 00 00 00 00 02 41 20 00 00 00 00 00 01 00 00 00 00 8C 42 7E",
     DONE,
 )
 SET_Y_INCLUSIVE = pair(
     "7E 00 12 26 00 06 69 00 69 02 69 03 69 04 69 07 69 08"
-    " 00 00 00 02 00 00 00 03 00 00 00 05 41 20 00 00 00 00 00 01 00 00 00 02 CD 87 7E",
+    " 00 00 00 02 00 00 00 03 00 00 00 05 41 20 00 00 00 00 00 01 00 00 00 00 4C 46 7E",
     DONE,
 )
 RUN = (  # control C0 and C1, inputs 68 and 69, both units running
     "7E 00 12 26 00 06 40 02 40 00 40 07 40 05 68 01 69 01"
     " 00 00 00 C0 00 00 00 68 00 00 00 C1 00 00 00 69 00 00 00 01 00 00 00 01 AE E3 7E"
 )
-STOP_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 00 10 78 7E", DONE)
-SET_LOG = pair(  # X feedback into slot 0, Y feedback into slot 1, 1000 Hz
-    "7E 00 12 14 00 03 24 00 24 01 24 11 00 00 23 02 00 00 23 03 44 7A 00 00 B7 2F 7E", DONE
-)
-START_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 01 D1 B8 7E", DONE)
 
 
 def connected(transport: ScriptedTransport, vector_pairs: int = 1500, **settings: Any) -> MirrorController:
     """Return a connected controller; the script begins with CONNECT, and its CRCs have to fit."""
-    told = {"with_crc": True, "strict_crc": True, **settings}
+    told = {"with_crc": True, **settings}
     mirror = MirrorController(transport, SurveyRig(**told), transport.clock, vector_pairs=vector_pairs)
     mirror.connect()
     return mirror

@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import Patience
+from pipeline.rig.fakes import FakeClock
 from pipeline.rig.transports import DeadlinePassed, DeviceGone, Kind, StateUnknown, Wire
-from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 
@@ -64,7 +64,7 @@ def test_reads_are_retried_within_one_deadline(name: str):
 def test_silence_between_retries_stays_within_the_deadline():
     """Bytes that arrive slowly after a retry is due do not extend the transaction."""
     parts = [Late(0.4 + 0.09 * number, b"x") for number in range(20)]
-    transport = ScriptedTransport([(b"q\n", parts), LOST], ManualClock())
+    transport = ScriptedTransport([(b"q\n", parts), LOST], FakeClock())
     with pytest.raises(DeadlinePassed):
         ask(make(transport))
     assert transport.clock.now() == pytest.approx(1.0)
@@ -82,7 +82,7 @@ def test_writes_are_sent_once():
 @pytest.mark.parametrize("received", [b"", b"half", b"bad\n", [Late(1.5, b"ok\n")], [DeviceGone("it went away")]])
 def test_an_unacknowledged_motion_is_sent_once_and_blocks(received):
     """If its acknowledgement is lost, damaged or late, the motion may have happened: all further ones are refused."""
-    transport = ScriptedTransport([(b"m\n", received)], ManualClock())
+    transport = ScriptedTransport([(b"m\n", received)], FakeClock())
     wire = make(transport)
     with pytest.raises(StateUnknown, match="asking m was sent to scripted and may have happened or not"):
         ask(wire, b"m\n", "motion")
@@ -107,7 +107,7 @@ def test_a_late_acknowledgement_does_not_answer_the_next_read(caplog: pytest.Log
 
 def test_an_interrupted_motion_blocks_further_motions():
     """After Ctrl-C before the acknowledgement it is unknown whether the motion happened."""
-    wire = make(ScriptedTransport([(b"m\n", b"x")], ManualClock()))
+    wire = make(ScriptedTransport([(b"m\n", b"x")], FakeClock()))
     stop = Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         wire.exchange(b"m\n", "going", "motion", lambda: stop)
@@ -157,7 +157,7 @@ def test_a_device_that_sends_endlessly_does_not_block():
             self.clock.sleep(0.01)
             return b"x"
 
-    transport = Babbling([(b"q\n", b""), (b"r\n", b"")], ManualClock())
+    transport = Babbling([(b"q\n", b""), (b"r\n", b"")], FakeClock())
     wire = make(transport)
     with pytest.raises(DeadlinePassed, match=r"other bytes came: 78"):
         ask(wire)
@@ -175,7 +175,7 @@ def test_a_motion_that_was_not_sent_blocks_nothing():
         def drain(self) -> bytes:
             raise DeviceGone("it went away")
 
-    wire = make(Gone([], ManualClock()))
+    wire = make(Gone([], FakeClock()))
     with pytest.raises(DeviceGone):
         ask(wire, b"m\n", "motion")
     assert not wire.unknown
@@ -202,7 +202,7 @@ def test_transactions_of_threads_do_not_mix():
 
         return take
 
-    wire = make(Echo([], ManualClock()))
+    wire = make(Echo([], FakeClock()))
 
     def work(mine: bytes) -> bool:
         return all(wire.exchange(mine, "it", "read", whole) == mine for _ in range(50))
