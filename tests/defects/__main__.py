@@ -26,7 +26,7 @@ from tests.defects.seeded import ROOT, Defect, TreeCopy, read_defects  # noqa: E
 
 def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", help="a part of the names of the defects that are applied")
+    parser.add_argument("--only", default="", help="regular expression of the names of the defects that are applied")
     parser.add_argument("--jobs", type=int, default=2, help="copies of the tree that are tested at a time")
     parser.add_argument("--tests", nargs="*", default=[], help="tests to run for every defect")
     asked = parser.parse_args(arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -48,9 +49,9 @@ class Defect:
 
 
 def read_defects(pattern: str = "") -> list[Defect]:
-    """Return the defects whose name contains a pattern, in the order of the list."""
+    """Return the defects in whose name a regular expression is found, in the order of the list."""
     listed = tomllib.loads(LIST.read_text(encoding="utf-8"))["defect"]
-    return [Defect(**one | {"tests": tuple(one["tests"])}) for one in listed if pattern in one["name"]]
+    return [Defect(**one | {"tests": tuple(one["tests"])}) for one in listed if re.search(pattern, one["name"])]
 
 
 @dataclass

@@ -60,13 +60,15 @@ def _judged(weights: Path, folder: Path, content: dict[str, Any], *, unlike: boo
 
 
 def test_a_uniform_scan_has_the_expected_score_of_its_map(survey_png: Survey, weights: Path, tmp_path: Path):
-    """It follows from the stored class probabilities and the bias of its exposure."""
+    """It follows from the stored class probabilities, and the bias of an exposure that is as long in full light."""
     path = _judged(weights, tmp_path, SCORES.as_dict())
-    receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
+    flags = {"effects": "none", "budget": None, "scan_step": "1", "sky.light_fraction": "0.75"}
+    receipt: Any = survey_png(tmp_path / "a", weights=str(path), **flags).receipt
     (store,) = (tmp_path / "a").glob("stages/segment/*/class_probabilities.zarr")
     said = xr.open_zarr(store, consolidated=False)["log_probability"].values
     said = said - np.log(np.exp(said).sum(axis=-1, keepdims=True))
-    told = expected_score(expected_counts([said], len(CLASSES)), BIAS, 0.01, 1, 100.0)
+    part = np.log(75 / 50) / np.log(100 / 50)  # between the exposures of the table
+    told = expected_score(expected_counts([said], len(CLASSES)), part * BIAS, 0.02 - 0.01 * part, 1, 75.0)
     assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
     assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
     assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)

@@ -44,6 +44,12 @@ def test_fifteen_and_270_bands_give_columns_of_one_scale():
     assert columns(15) == pytest.approx(columns(270), abs=0.02)
 
 
+def test_crowded_bands_share_the_weight_of_their_interval():
+    """Bands at 500, 510 and 700 nm stand for 5, 100 and 95 nm of a column that is far wider than all of them."""
+    matrix, _ = SpectralBasis(600.0, 600.0, 1).matrix(np.array([700.0, 500.0, 510.0]))
+    assert matrix[:, 0] == pytest.approx(np.array([95, 5, 100]) / 200, abs=0.002)
+
+
 @pytest.mark.parametrize("wavelength", [[550.0], [550.0, 550.0, 550.0]])
 def test_a_single_wavelength_has_weight_one(wavelength: list[float]):
     """One band, or one given several times, determines its column alone."""

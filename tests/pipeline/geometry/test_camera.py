@@ -74,6 +74,14 @@ def test_noise_has_the_moments_of_shot_and_read_noise(read_noise: float, expecte
     assert third == pytest.approx(expected, abs=5 * np.sqrt(15 * variance**3 / 4e5))
 
 
+def test_faint_light_is_as_skewed_as_shot_noise():
+    """The third moment of noise from one draw is that of the Poisson part: its standard error is 22 of 400."""
+    camera = replace(CAMERA, read_noise_e=10.0, electrons_per_dn=1.0, bits=16)
+    dn = digitise(np.full((2000, 2000), 400.0, np.float32), camera, np.random.default_rng(4))
+    third = ((dn.astype(np.float64) - camera.dark_dn - 400) ** 3).mean()
+    assert third == pytest.approx(400, abs=100)
+
+
 def test_digitising_without_noise_rounds_to_even_and_clips():
     """Half a DN rounds to even. Light beyond the full well gives full scale, negative light the dark level."""
     electrons = np.array([2.5, 7.5, 1e9, -50.0, CAMERA.full_scale_e])

@@ -156,6 +156,15 @@ def test_mounting_swaps_axes_as_set():
     assert Mounting().to_device(many).tobytes() == Mounting().to_model(many).tobytes() == many.tobytes()
 
 
+def test_clocking_turns_anticlockwise_from_x_to_y():
+    """The device's axes are named after the rotation, so with "y,-x" its X is the Y of the turned position."""
+    cos, sin = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
+    assert Mounting(clocking_deg=10).to_device([[0.5, 0], [0, 0.5]]) == pytest.approx(
+        0.5 * np.array([[cos, sin], [-sin, cos]])
+    )
+    assert Mounting("y,-x", 10).to_device([0.5, 0]) == pytest.approx(0.5 * np.array([sin, -cos]))
+
+
 def test_positions_that_the_device_would_clamp_are_refused():
     """An offset that moves a position beyond the device's rim raises an error with offset and position."""
     with pytest.raises(

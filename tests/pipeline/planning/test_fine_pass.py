@@ -13,7 +13,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import full_sweeps, patches_shown
-from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth
+from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth, lines_between
 from pipeline.planning.uniform_scans import MIOU, ScanPerformance
 
 CAMERA = LineCamera(samples=320)
@@ -122,6 +122,33 @@ def test_a_recording_limits_the_sweeps_of_a_plan() -> None:
     assert plan.seconds == COST.seconds(plan.sweeps, CAMERA)
     assert plan.reason.endswith("every line, 5 ms and 100 ms")
     assert not replace(second_pass(FULL_S), recorded=lambda made: []).plan(drawn(1)).patch_index.size
+
+
+@pytest.mark.parametrize(("first", "lines"), [(0, 9), (1, 6), (3, 3), (5, 4)])
+def test_a_run_ends_at_lines_of_the_first_pass(first: int, lines: int) -> None:
+    """A run that begins or ends between two of them is completed from the one before to the one after."""
+    (full, *_) = FULL
+    (coarse, *_) = every_nth(FULL)
+    run = replace(full, start_px=full.start_px + first, lines=lines)
+    places = [place - full.start_px for one in lines_between([run], [coarse]) for place in one.line_px()]
+    ends = first // 4 * 4, -(-(first + lines - 1) // 4) * 4
+    assert sorted(places) == [place for place in range(*ends) if place % 4]
+
+
+def test_old_and_new_lines_share_the_exposure_by_their_numbers() -> None:
+    """After every 4th line at 10 ms, three of four lines at 100 ms make every line, and one of two every second."""
+    planner = replace(second_pass(FULL_S), first_pass=every_nth(FULL, 4, 10.0), recorded_ms=(100.0,))
+    asked: list[tuple[int, float]] = []
+
+    def gain_of(spacing: int, mean_ms: float) -> np.ndarray:
+        asked.append((spacing, mean_ms))
+        return drawn(0)
+
+    planner.best(RECORD, gain_of)
+    shares = {1: 0.25, 2: 0.5}
+    assert dict(asked) == pytest.approx(
+        {step: (old / 10**2 + (1 - old) / 100**2) ** -0.5 for step, old in shares.items()}
+    )
 
 
 @pytest.mark.parametrize("step", FIRST_STEPS)

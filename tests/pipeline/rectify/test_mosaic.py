@@ -92,6 +92,17 @@ def test_a_single_point_is_blended_as_among_many() -> None:
     np.testing.assert_array_equal(np.concatenate(alone), mosaic(parts)[0])
 
 
+def test_closer_lines_count_only_where_they_reach() -> None:
+    """Lines of 1 px replace those of 4 px at the first point; at the second the former have no value."""
+    edge = np.full(2, 20.0)
+    far = MosaicPart(np.full((2, 1), 4, np.float32), np.ones(2, np.float32), edge, step=4)
+    near = MosaicPart(np.array([[1], [np.nan]], np.float32), np.array([1, 0], np.float32), edge, step=1)
+    for parts in ([far, near], [near, far]):
+        values, coverage = mosaic(parts)
+        assert values.tolist() == [[1], [4]]
+        assert coverage.tolist() == [1, 1]
+
+
 def test_a_point_on_the_edge_counts_if_it_is_alone() -> None:
     """A point exactly on a sweep's edge keeps its value. On the edges of two sweeps it has their mean."""
     values, coverage = mosaic([MosaicPart(np.full((1, 1), 7, np.float32), np.ones(1, np.float32), np.zeros(1))])

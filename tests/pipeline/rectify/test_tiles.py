@@ -166,6 +166,18 @@ def test_reach_contains_all_knots_and_samples_of_a_tile(row: int, column: int, h
         assert near.samples.stop >= min(at[:, 1].max() + 3, CAMERA.samples)
 
 
+def test_reach_of_distant_upright_lines_has_room_for_taps() -> None:
+    """Lines 4 px apart along the rows: every row has the line before its own and the two after it."""
+    placed = place(taken(Sweep("upright", "coarse", "x", 0.0, -100.0, 50, 4, held=1), bands=1), CAMERA)
+    grid = PixelGrid((-80.0, -70.0), 1, (160, 140))
+    near = ScanPathReach(placed, placed.scan_paths[0][0], CAMERA, grid).in_columns(slice(0, 140))
+    for row in range(160):
+        knot = np.floor(placed.coordinates(0, CAMERA, grid, slice(row, row + 1), slice(0, 140))[..., 0])
+        found = near.knots(slice(row, row + 1))
+        assert found.start <= knot.min() - 1
+        assert found.stop >= knot.max() + 3
+
+
 def test_turned_lines_are_cut_into_short_runs() -> None:
     """Cutting a long tile of lines turned by 30 degrees halves the calibrated area. Upright lines stay one run."""
     for tilt, most_fraction, runs in ((np.tan(np.pi / 6), 0.5, range(4, 20)), (0.0, 1.0, range(1, 2))):

@@ -47,10 +47,17 @@ def test_statistics_do_not_depend_on_blocks_of_lines(cuts: list[int], expected: 
 
 
 def test_merged_statistics_equal_those_of_all_lines() -> None:
-    """Two passes of different brightness, merged, have the moments and chosen spectra of all lines together."""
+    """Two passes of different brightness, merged, have the moments and chosen spectra of all lines together.
+
+    The second pass grows brighter, so that its sums from its first lines are not 0.
+    """
     values = field_of(3, (64, 40), 9).values
     values[32:] += 0.5
-    passes = [statistics_of(values[:32]), statistics_of(values[32:])]
+    values[40:] += 0.5
+    passes = [statistics_of(values[:32]), SignalStatistics(9, 32 * 40)]
+    for first in (32, 40):
+        some = values[first : first + (8 if first == 32 else 24)]
+        passes[1].add(some, np.ones(some.shape[:2], np.bool_))
     merged, whole = passes[0].merged(passes[1]), statistics_of(values)
     assert (merged.count, merged.means) == (whole.count, whole.means)
     assert merged.origin is not None

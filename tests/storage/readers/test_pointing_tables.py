@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SceneError
-from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
+from pipeline.geometry.mirror import REST_TANGENT, Mounting, direction_to_scene, position_to_direction
 from storage.readers.recorded_files import find_pointing, load_pointing_table
 
 MIRROR = "line,time,mirror_x,mirror_y\n0,0.05,0.1,0\n1,0.15,0.2,0\n2,0.25,0.3,0\n"
@@ -37,6 +37,15 @@ def test_positions_are_read_bit_by_bit(tmp_path: Path) -> None:
     values = np.random.default_rng(1).uniform(-0.5, 0.5, (200, 2))
     text = "mirror_x,mirror_y\n" + "".join(f"{x!r},{y!r}\n" for x, y in values.tolist())
     np.testing.assert_array_equal(load_pointing_table(_table(tmp_path, text)).of_cube("c", 200).position, values)
+
+
+def test_positions_of_a_device_are_those_of_its_mounting(tmp_path: Path) -> None:
+    """A mirror whose X is the model's Y, turned by 2 degrees, gives the model's positions."""
+    mounting = Mounting("y,-x", 2.0, 0.01, -0.02)
+    given = np.array([[0.1, 0.2], [0.0, 0.3]])
+    rows = "".join(f"{x!r},{y!r}\n" for x, y in mounting.to_device(given).tolist())
+    table = load_pointing_table(_table(tmp_path, "mirror_x,mirror_y\n" + rows))
+    np.testing.assert_allclose(table.of_cube("c", 2, mounting).position, given, atol=1e-12)
 
 
 def test_angles_are_converted_to_positions(tmp_path: Path) -> None:

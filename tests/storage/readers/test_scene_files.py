@@ -121,6 +121,16 @@ def test_a_nodata_value_beyond_the_number_type_is_ignored(tmp_path: Path) -> Non
         assert np.isnan(load_scene_file(tmp_path / "a.tif", wavelengths=[500.0]).values).sum() == missing
 
 
+def test_a_pixel_without_most_of_its_bands_is_missing(tmp_path: Path) -> None:
+    """With half of its bands a pixel still counts."""
+    values = np.ones((1, 3, 4), np.float32)
+    values[0, 1, :2], values[0, 2, :3] = np.nan, np.nan
+    np.save(tmp_path / "a.npy", values)
+    scene = load_scene_file(tmp_path / "a.npy", wavelengths=[450.0, 550, 650, 800])
+    assert scene.missing.tolist() == [[False, False, True]]
+    assert scene.filled_px == 2
+
+
 def test_scene_hash_depends_on_content_and_bands(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     """The hash does not depend on the file's location and labels."""
     one, two = _save(tmp_path / "a.npy", cube), _save(tmp_path / "b.npy", cube)
