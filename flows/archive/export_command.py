@@ -1,17 +1,19 @@
-"""Export a run's maps, products and cubes with a STAC catalogue: the verb `export`."""
+"""Export a run's maps and products with a STAC catalogue: the verb `export`."""
 
 from __future__ import annotations
 
-import math
+import json
 import os
+import re
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from odc.geo.geobox import GeoBox
 from rich.console import Console
 from rich.markup import escape
 
@@ -26,36 +28,30 @@ from flows.archive.export_layers import (
     open_exported,
     prior_map_layers,
 )
-from flows.archive.export_values import CSV, spectral_layers, write_areas
-from flows.archive.export_zones import check_zones, write_zones
-from flows.settings.flags import ArchiveName, AsJson, OutFile, Switch, check_outside
+from flows.archive.export_polygons import check_doses, write_polygons
+from flows.archive.export_values import spectral_layers, write_areas
+from flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json, stderr
 from pipeline.errors import ArchiveError, PipelineError
-from pipeline.ground.georeference import pixel_side_m
+from pipeline.lazy import deferred
 from storage.archive.manifests import read_manifest
 from storage.archive.staging import take_lock
-from storage.archive.whole_files import remove_leftovers
-from storage.arrays.georeference import load_geobox
-from storage.arrays.signal_cubes import RestoredCube, open_lines
-from storage.export.image_files import write_cog, write_recorded_files
-from storage.export.stac_items import COG, ZARR, Item, check_owner, clean_id, footprint, projection, write_stac
-from storage.readers.recordings import RESTORED
+from storage.archive.whole_files import remove_leftovers, to_json, write_whole
+from storage.export.image_files import write_cog
 from storage.remote.object_archive import ObjectArchive
 from storage.remote.opening import open_archive
 
-COLLECTION_TEXT = "Surveys exported from the archive {}. If no survey has a place, the extent is the whole earth."
-ENVI_NUMBERS = "application/octet-stream"
-NOT_PLACED = (
-    "The survey has no rig pose, and its scene no georeference: its images are on the camera's angular grid "
-    "(transforms in radians), without a place on the earth."
-)
+pystac: Any = deferred("pystac")
+rio_stac: Any = deferred("rio_stac")
+
+COLLECTION = "collection.json"
+COG, CSV = "image/tiff; application=geotiff; profile=cloud-optimized", "text/csv"
 RUN_FILES = {
-    "receipt.json": ("Receipt", "application/json", ["metadata"]),
-    "report.html": ("Report", "text/html", ["metadata"]),
-    "quicklook.png": ("Quicklook", "image/png", ["overview"]),
+    "receipt.json": ("Receipt", "application/json"),
+    "report.html": ("Report", "text/html"),
+    "quicklook.png": ("Quicklook", "image/png"),
 }
-Asset = dict[str, Any]
 
 
 def export(
@@ -63,11 +59,10 @@ def export(
     run: str | None = None,
     *,
     out: OutFile,
-    envi: Switch = False,
     products: ProductFlags = NO_PRODUCTS,
     as_json: AsJson = False,
 ) -> int:
-    """Export a run: maps as GeoTIFF, areas and a STAC catalogue; on request polygons, prescriptions and cubes.
+    """Export a run: maps as GeoTIFF, areas and a STAC catalogue; on request polygons, doses, spectra and indices.
 
     Parameters
     ----------
@@ -75,10 +70,8 @@ def export(
         The run's name, a folder's below runs, or `latest`, as without one.
     out
         Folder to export into; it may have other runs of the same archive.
-    envi
-        Also write the raw sweeps as ENVI with a pointing table each, for `survey --sweeps`.
     """
-    content = run_export(archive, run, out, envi, stderr, choose_products(products))
+    content = run_export(archive, run, out, stderr, choose_products(products))
     if as_json:
         print_json(content)
     return DONE
@@ -88,7 +81,6 @@ def run_export(
     archive: str | Path,
     run: str | None,
     out: Path,
-    envi: bool,
     console: Console,
     choice: ProductChoice = choose_products(NO_PRODUCTS),  # noqa: B008 - a value
 ) -> dict[str, Any]:
@@ -101,28 +93,28 @@ def run_export(
     """
     opened = open_exported(open_archive(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)
-    surveys = opened.archive.root.name
-    collection_id = clean_id(surveys, "surveys")
-    check_zones(opened, choice)
+    check_doses(opened, choice)
     layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]
     export = Export(opened, out)
     try:
         with ExitStack() as stack:
             release = take_lock(out / ".export.lock")
             stack.callback(release if release is not None else lambda: None)
-            check_owner(out, collection_id)
-            for folder in (out, export.folder, export.folder / "sweeps"):
+            check_owner(export)
+            for folder in (out, export.folder):
                 remove_leftovers(folder)
             _export_images(export, layers, console)
             areas = export.folder / "areas.csv"
             write_areas(opened, areas)
             export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
-            with console.status("drawing polygons"):
-                write_zones(opened, export.folder, choice, export.add)
-            _add_stores(export)
-            if envi:
-                _export_sweeps(export, console)
-            item, collection = write_stac(out, collection_id, COLLECTION_TEXT.format(surveys), describe_item(export))
+            if choice.polygons:
+                with console.status("drawing polygons"):
+                    for key, path, kind in write_polygons(opened, export.folder, choice.doses):
+                        export.add(key, path, "Classes as polygons", kind, ["data"])
+            for name, (title, kind) in RUN_FILES.items():
+                if name in read_manifest(opened.folder)["files"]:
+                    export.add(Path(name).stem, opened.folder / name, title, kind, ["metadata"])
+            item, collection = write_catalogue(export)
     except PipelineError:  # some are OSErrors
         raise
     except OSError as error:
@@ -143,25 +135,23 @@ class Export:
 
     run: ExportedRun
     out: Path  # with links resolved, so that the relative address of the archive is right
-    assets: dict[str, Asset] = field(default_factory=dict)
+    assets: dict[str, Any] = field(default_factory=dict)  # pystac's, by key
     files: dict[str, str] = field(default_factory=dict)  # paths of assets in `out`, relative to it
 
     @property
     def folder(self) -> Path:
         return self.out / self.run.id
 
-    def projection(self, geobox: GeoBox | None = None) -> Asset:
-        """Return the fields of an asset with this grid; a null code for one without a CRS in an item that has one."""
-        if self.run.geobox is None:
-            return {}
-        return {"proj:code": None} if geobox is None or geobox.crs is None else projection(geobox)
+    @property
+    def collection_id(self) -> str:
+        return re.sub(r"[^A-Za-z0-9_-]+", "-", self.run.archive.root.name).strip("-") or "surveys"
 
-    def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
-        """Add a file or store to the catalogue, by its address in a bucket, else by that relative to the item."""
+    def add(self, key: str, path: Path, title: str, kind: str, roles: Sequence[str], **more: Any) -> None:
+        """Add a file to the catalogue, by its address in a bucket, else by that relative to the item."""
         href = quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
         if isinstance(self.run.archive, ObjectArchive) and path.is_relative_to(self.run.archive.root):
             href = self.run.archive.url(path)
-        self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
+        self.assets[key] = pystac.Asset(href, title, media_type=kind, roles=[*roles], extra_fields=more)
         if path.resolve().is_relative_to(self.out):
             self.files[key] = path.resolve().relative_to(self.out).as_posix()
 
@@ -169,73 +159,84 @@ class Export:
 def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
     for layer in layers:
         path = export.folder / f"{layer.name}.tif"
-        image = layer.image
         with console.status(f"writing {path.name}"):
-            write_cog(path, image, layer.rows())
-        about: Asset = {"data_type": image.dtype, "nodata": "nan" if math.isnan(image.nodata) else image.nodata}
-        about |= {} if layer.unit is None else {"unit": layer.unit}
-        bands = [{"name": name, **about} for name in image.bands]
-        export.add(layer.name, path, layer.title, COG, [*layer.roles], bands=bands, **export.projection(image.geobox))
+            write_cog(path, layer.image, layer.rows())
+        unit = {} if layer.unit is None else {"unit": layer.unit}
+        bands = [{"name": name, "data_type": layer.image.dtype, **unit} for name in layer.image.bands]
+        export.add(layer.name, path, layer.title, COG, layer.roles, bands=bands)
 
 
-def _export_sweeps(export: Export, console: Console) -> None:
-    sweeps = export.run.sweeps()
-    if not sweeps:
-        console.print("[dim]note: --envi writes sweeps, and this run has none[/]")
-    for path in sweeps:
-        name = path.stem
-        with console.status(f"writing {name}.bil"):
-            header = write_recorded_files(lines := open_lines(path), export.folder / "sweeps")
-        if restored := isinstance(lines, RestoredCube):
-            console.print(f'[dim]note: {name}: {RESTORED}; keep = "raw" keeps the lines of the next survey[/]')
-        export.add(
-            f"{name}_envi",
-            header.with_suffix(".bil"),
-            f"{'Restored' if restored else 'Raw'} numbers of {name}",
-            ENVI_NUMBERS,
-            ["data"],
-            **export.projection(),
+def check_owner(export: Export) -> None:
+    """Refuse a folder whose collection is another archive's (ArchiveError)."""
+    path = export.out / COLLECTION
+    if not path.exists():
+        return
+    try:
+        found = json.loads(path.read_bytes())["id"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ArchiveError(f"{path} cannot be read as STAC: {error}; remove it and export again") from error
+    if found != export.collection_id:
+        raise ArchiveError(
+            f"{path} is the collection {found!r} of another archive, expected {export.collection_id!r}; choose another "
+            "--out"
         )
-        export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
-        table = header.with_name(f"{name}.pointing.csv")
-        export.add(f"{name}_pointing", table, f"Pointing of the lines of {name}", CSV, ["metadata"])
 
 
-def _add_stores(export: Export) -> None:
-    """Add the archive's own stores and the run's files to the catalogue."""
-    run = export.run
-    for product, title in {
-        "mosaic": "Mosaic of all passes",
-        "class_map": "Class map and confidence on the camera's grid",
-        "attention": "Score and rank of the patches",
-        "ground_map": "Class map, picture and prior map, on the map",
-    }.items():
-        if run.store(product) is not None and (product != "ground_map" or run.geobox is not None):
-            box = None if product == "attention" else load_geobox(run.path(product))
-            path = run.archive.root / run.receipt["products"][product]
-            export.add(f"{product}_zarr", path, title, ZARR, ["data"], **export.projection(box))
-    for sweep in run.sweeps():
-        title, roles = ("Raw sweep", ["data", "raw"]) if (sweep / "dn").is_dir() else ("Signal of sweep", ["data"])
-        export.add(f"{sweep.stem}_zarr", sweep, f"{title} {sweep.stem}", ZARR, roles, **export.projection())
-    for name, (title, kind, roles) in RUN_FILES.items():
-        if name in read_manifest(run.folder)["files"]:
-            export.add(Path(name).stem, run.folder / name, title, kind, roles)
+def write_catalogue(export: Export) -> tuple[Path, Path]:
+    """Write ``ID/ID.json`` and the collection of all items in the folder; return both paths.
+
+    Raises ArchiveError: an item of an earlier export cannot be read.
+    """
+    items = [_describe(export)]
+    for path in sorted(export.out.glob("*/*.json")):  # earlier exports, each in the folder of its own name
+        if path.stem == path.parent.name and path.stem != export.run.id:
+            try:
+                items.append(
+                    pystac.Item.from_dict(json.loads(path.read_bytes()), href=f"/{path.relative_to(export.out)}")
+                )
+            except (OSError, ValueError, KeyError, TypeError, pystac.STACError, pystac.STACTypeError) as error:
+                raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
+    items.sort(key=lambda one: (str(one.datetime), one.id))
+    text = f"Surveys exported from the archive {export.run.archive.root.name}."
+    made = pystac.Collection(export.collection_id, text, _extent(items), license="other")
+    made.add_items(items)
+    made.catalog_type = pystac.CatalogType.SELF_CONTAINED
+    made.normalize_hrefs("/")  # links are relative; a folder's name may have characters of addresses, as # and ?
+    written = []
+    for one in (next(one for one in items if one.id == export.run.id), made):
+        written.append(export.out / one.self_href.lstrip("/"))
+        write_whole(written[-1], to_json(one.to_dict(include_self_link=False)))
+    return written[0], written[1]
 
 
-def describe_item(export: Export) -> Item:
-    """Return the run's item with all assets that were added."""
+def _describe(export: Export) -> Any:
+    """Return the run's item, with the place of its class map."""
     receipt = export.run.receipt
-    where = NOT_PLACED if export.run.geobox is None else "Images lie on a map."
-    properties: dict[str, Any] = {
-        "title": f"Survey of {receipt['survey']}",
-        "description": f"Survey of {receipt['survey']} ({receipt['source']} source). {where}",
-        "instruments": [str(receipt["source"])],
-        "processing:level": "L4",
-        "processing:lineage": ", then ".join(f"{one['name']} {one['key']}" for one in receipt["stages"] if one["key"]),
-        "processing:software": dict(receipt["versions"]),
-    }
-    outline = None
-    if export.run.geobox is not None:
-        properties |= {"proj:code": projection(export.run.geobox)["proj:code"], "gsd": pixel_side_m(export.run.geobox)}
-        outline = footprint(export.run.geobox)
-    return Item(export.run.id, *export.run.observed, properties, export.assets, outline)
+    start, end = (datetime.fromisoformat(text) for text in export.run.observed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a file has no CRS: it gets no place
+        item = rio_stac.create_stac_item(
+            str(export.folder / "class_map.tif"),
+            input_datetime=start,
+            id=export.run.id,
+            assets=export.assets,
+            properties={
+                "title": f"Survey of {receipt['survey']}",
+                "description": f"Survey of {receipt['survey']} ({receipt['source']} source).",
+                "instruments": [str(receipt["source"])],
+            },
+            with_proj=export.run.geobox is not None,
+            geom_densify_pts=21,
+        )
+    item.common_metadata.start_datetime, item.common_metadata.end_datetime = start, end
+    if export.run.geobox is None:
+        item.geometry = item.bbox = None
+    return item
+
+
+def _extent(items: Sequence[Any]) -> Any:
+    """Return the extent of all items; the whole earth if none has a place."""
+    found = pystac.Extent.from_items(items)
+    if all(one.bbox is None for one in items):
+        found.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
+    return found

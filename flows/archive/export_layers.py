@@ -32,8 +32,6 @@ from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import open_group
 from storage.export.image_files import ANGULAR, CogImage, angular_geobox
-from storage.export.map_files import UNITS, DoseUnit
-from storage.readers.recordings import stores_of_lines
 
 
 @Parameter(name="*")
@@ -46,59 +44,47 @@ class ProductFlags:
         Parameter(help="Also all bands as GeoTIFF: the coarse mosaic, of a raster its pixels, both without noise."),
     ] = False
     indices: Annotated[
-        str | None, Parameter(help="Spectral indices to write as GeoTIFF, with commas: NDVI,NDRE,MCARI,PRI.")
+        str | None, Parameter(help="Spectral indices to write as GeoTIFF, with commas: NDVI,NDREI,MCARI.")
     ] = None
     polygons: Annotated[
-        Switch, Parameter(help="Also the classes as polygons: GeoPackage, and GeoJSON where there is a CRS.")
+        Switch, Parameter(help="Also the classes as polygons, with hectares: GeoPackage and shapefile.")
     ] = False
-    prescription: Annotated[
-        str | None,
-        Parameter(help="Doses by class, with commas: weed=2.5,grass=1. Written as GeoPackage and ISOXML task data."),
-    ] = None
-    dose_unit: Annotated[str, Parameter(help="Unit of the doses: l/ha or kg/ha.")] = "l/ha"
-    cell: Annotated[
-        float | None, Parameter(help="Side of the prescription's cells [m]; by default 3 m, or a pixel if larger.")
+    dose: Annotated[
+        str | None, Parameter(help="Doses by class, with commas: weed=2.5,grass=1. A column of the polygons.")
     ] = None
 
 
 NO_PRODUCTS = ProductFlags()
-MOST_CELL_M = 1000
 
 
 @dataclass(frozen=True)
 class ProductChoice:
-    """The parsed flags: indices, doses by class (empty without a prescription) and their unit."""
+    """The parsed flags. Doses are by class and empty without the flag; they make polygons."""
 
-    flags: ProductFlags
+    reflectance: bool
     indices: tuple[SpectralIndex, ...]
+    polygons: bool
     doses: Mapping[str, float]
-    unit: DoseUnit
 
 
 def choose_products(flags: ProductFlags) -> ProductChoice:
-    """Parse the flags (SettingsError: a number, an index or a unit is wrong)."""
-    if flags.cell is not None and not 0 < flags.cell <= MOST_CELL_M:
-        raise SettingsError(f"--cell expects metres above 0 and at most {MOST_CELL_M:g}, got {flags.cell:g}")
-    if flags.dose_unit not in UNITS:
-        raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
-    for name in ("prescription", "indices"):
+    """Parse the flags (SettingsError: a number or an index is wrong)."""
+    for name in ("dose", "indices"):
         if (given := getattr(flags, name)) is not None and not split_list(given):
             raise SettingsError(f"--{name} {given!r} names nothing; give names with commas, or leave it out")
     doses = {}
-    for part in split_list(flags.prescription):
+    for part in split_list(flags.dose):
         name, _, number = part.rpartition("=")
         if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
             raise SettingsError(
-                f"--prescription expects classes with numbers, weed=2.5, got {part!r}; numbers are 0 or more, without "
+                f"--dose expects classes with numbers, weed=2.5, got {part!r}; numbers are 0 or more, without "
                 "an exponent"
             )
         if name.strip() in doses:
-            raise SettingsError(f"--prescription names {name.strip()} twice; give it one number")
+            raise SettingsError(f"--dose names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)
-    if not doses and (flags.cell is not None or flags.dose_unit != NO_PRODUCTS.dose_unit):
-        raise SettingsError("--cell and --dose-unit need --prescription, such as weed=2.5; give it or leave them out")
     indices = tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices)))
-    return ProductChoice(flags, indices, doses, UNITS[flags.dose_unit])
+    return ProductChoice(flags.reflectance, indices, flags.polygons or bool(doses), doses)
 
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
@@ -154,18 +140,10 @@ class ExportedRun:
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
 
-    def sweeps(self) -> list[Path]:
-        """Return the cubes of lines: raw ones, or condensed ones where raw ones were cleared away."""
-        stores = [self.archive.locate(uri) for uri in stores_of_lines(self.receipt["products"], self.archive.is_there)]
-        return [path for store in stores for path in sorted(store.glob("*.zarr"))]
-
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Return the grid of the run's map by its pose or scene, with longitudes from -180; None if neither has one."""
-        found = load_geobox(self.path(self.map_product))
-        if found is None or found.crs is None or not found.crs.geographic:
-            return found
-        return Affine.translation(-360 * ((found.boundingbox.left + 180) // 360), 0) * found
+        """Return the grid of the run's map by its pose or scene; None if neither has one."""
+        return load_geobox(self.path(self.map_product))
 
     @property
     def map_product(self) -> str:

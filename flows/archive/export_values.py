@@ -26,7 +26,6 @@ from storage.arrays.layout import open_group, read_bands
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.export.image_files import CogImage
 
-CSV = "text/csv"
 COLUMNS = (
     *("class", "pixels", "hectares", "fraction", "mean_confidence"),
     *("estimated_fraction", "standard_error"),  # by the labels
@@ -129,7 +128,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     Raises WavelengthError: the cube lacks bands of an index; SettingsError: an index needs reflectance, and the cube
     has other values.
     """
-    if not (choice.flags.reflectance or choice.indices):
+    if not (choice.reflectance or choice.indices):
         return []
     view = MosaicView(run)
     picked = [pick_bands(index, view.mosaic.wavelength_nm) for index in choice.indices]
@@ -141,7 +140,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
                 "an index of ratios, such as NDVI or PRI, or write the factor to reflectance into the scene.toml "
                 "beside the scene (scale = 0.0001 if 10000 is white) and survey it again"
             )
-    layers = [_reflectance(view, white)] if choice.flags.reflectance else []
+    layers = [_reflectance(view, white)] if choice.reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
 
 

@@ -1,8 +1,7 @@
 """Compute spectral indices by name: the bands that each needs, and its values from those of a cube.
 
 Names, formulas and the ranges of bands are those of Awesome Spectral Indices (Montero et al. 2023, doi:
-10.1038/s41597-023-02096-0) in the package spyndex. Four indices of narrower bands than those of satellites are added
-from their papers.
+10.1038/s41597-023-02096-0) in the package spyndex.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from pipeline.lazy import spyndex
 Floats = NDArray[np.float32]
 
 DARK_FRACTION = 0.01  # of white: pixels with a darker mean of bands have no index
-NARROW_NM = 10.0  # largest distance of a band from the wavelength of a narrow one
 LEAST_REFLECTANCE, MOST_REFLECTANCE = 0.02, 1.5  # of a cube of reflectance the 99th percentile lies between these
 LAMBDA = "lambda"  # prefix of a band's wavelength in a formula
 CONSTANTS = {"SAVI": {"L": 0.5}}  # instead of a default that belongs to another index
@@ -66,66 +64,19 @@ class SpectralIndex:
         return not np.isclose(self.formula(rising | nm), self.formula(twice | nm), rtol=1e-9, atol=0)
 
 
-def _narrow(*centres_nm: float) -> tuple[IndexBand, ...]:
-    return tuple(
-        IndexBand(f"R{centre:.0f}", f"near {centre:g} nm", centre, centre - NARROW_NM, centre + NARROW_NM)
-        for centre in centres_nm
-    )
-
-
-NARROW = (
-    SpectralIndex(
-        "NDRE",
-        "Normalized Difference Red Edge",
-        "Barnes et al. 2000, 5th International Conference on Precision Agriculture",
-        _narrow(790, 720),
-        lambda v: (v["R790"] - v["R720"]) / (v["R790"] + v["R720"]),
-    ),
-    SpectralIndex(
-        "PRI",
-        "Photochemical Reflectance Index",
-        "https://doi.org/10.1016/0034-4257(92)90059-S",
-        _narrow(531, 570),
-        lambda v: (v["R531"] - v["R570"]) / (v["R531"] + v["R570"]),
-    ),
-    SpectralIndex(
-        "REIP",
-        "Red Edge Inflection Point [nm]",
-        "Guyot and Baret 1988, ESA SP-287",
-        _narrow(670, 700, 740, 780),
-        lambda v: 700 + 40 * ((v["R670"] + v["R780"]) / 2 - v["R700"]) / (v["R740"] - v["R700"]),
-    ),
-    SpectralIndex(
-        "WBI",
-        "Water Band Index",
-        "https://doi.org/10.1080/01431169308954010",
-        _narrow(970, 900),
-        lambda v: v["R900"] / v["R970"],
-    ),
-)
-
-
 def find_index(name: str) -> SpectralIndex:
     """Return an index by its name, in any case.
 
     Raises SettingsError: the name is unknown, or the index needs an input that no camera has; lists similar names.
     """
-    own = {index.name.lower(): index for index in NARROW}
-    if name.lower() in own:
-        return own[name.lower()]
     listed = {one.lower(): one for one in spyndex.indices}
     if name.lower() not in listed:
-        near = get_close_matches(name.lower(), [*own, *listed], n=3, cutoff=0.5)
-        named = ", ".join(own[one].name if one in own else listed[one] for one in near) or "NDVI, NDRE, MCARI, PRI"
+        near = get_close_matches(name.lower(), listed, n=3, cutoff=0.5)
+        named = ", ".join(listed[one] for one in near) or "NDVI, NDREI, MCARI"
         raise SettingsError(
-            f"there is no index {name!r}; like it: {named}. All names: awesome-ee-spectral-indices.readthedocs.io, and "
-            f"{', '.join(index.name for index in NARROW)}"
+            f"there is no index {name!r}; like it: {named}. All names: awesome-ee-spectral-indices.readthedocs.io"
         )
-    return _listed(listed[name.lower()])
-
-
-def _listed(name: str) -> SpectralIndex:
-    """Return an index of spyndex's list with its constants."""
+    name = listed[name.lower()]
     about = spyndex.indices[name]
     bands: list[IndexBand] = []
     constants: dict[str, float] = {}

@@ -1,13 +1,10 @@
-"""Write images for programs that read no Zarr: ENVI, and cloud-optimised GeoTIFF by GDAL.
-
-Both are written block by block.
-"""
+"""Write images as cloud-optimised GeoTIFF by GDAL, block by block."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,14 +15,9 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
-from pipeline.geometry.grid import cuts
-from pipeline.rig.camera.camera_texts import DATA_TYPES
-from storage.archive.whole_files import make_folder, write_whole, written_aside
+from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.cubes import RawCube
 from storage.arrays.georeference import AngularGrid
-from storage.arrays.layout import SHARD_ROWS
-from storage.arrays.signal_cubes import RestoredCube
 
 TILE = 512  # px: rasters within one tile need no overviews
 ANGULAR = (
@@ -145,98 +137,3 @@ def _tag_wavelengths(file: Any, image: CogImage) -> None:
             usual["fwhm"] = f"{width:.9g}"
         file.update_tags(band, ns="IMAGERY", **own)
         file.update_tags(band, **usual)
-
-
-@dataclass(frozen=True)
-class EnviFile:
-    """The content of one file, its lines interleaved by band (BIL) and its bytes little endian."""
-
-    shape: tuple[int, int, int]  # (line, sample, band)
-    dtype: str  # such as u2 or f4
-    wavelength_nm: NDArray[np.float64] | None = None  # (band,)
-    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
-    description: str = ""
-    ending: str = ".img"  # of the file with the numbers
-    more: Mapping[str, str] = field(default_factory=dict)  # further entries of the header
-
-
-def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
-    """Write ``NAME.hdr`` and the numbers beside it; return the path of the latter.
-
-    Both files replace earlier ones together. Blocks of lines come in order. Raises ArchiveError: the disk refuses.
-    """
-    data = header.with_suffix(file.ending)
-    kind = np.dtype(file.dtype).newbyteorder("<")
-    text = "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _header_fields(file, kind))])
-    with written_aside(header.parent, [data.name, header.name]) as aside:
-        with (aside / data.name).open("wb") as stream:
-            for _, values in blocks:
-                stream.write(np.ascontiguousarray(values.transpose(0, 2, 1), kind).data)
-        (aside / header.name).write_text(text, encoding="utf-8")
-    return data
-
-
-def _header_fields(file: EnviFile, kind: np.dtype[Any]) -> Iterator[tuple[str, str]]:
-    """Yield sizes, type, byte order and bands."""
-    lines, samples, bands = file.shape
-    if file.description:
-        yield "description", _listed([file.description.replace("{", "(").replace("}", ")")])
-    yield from (("samples", str(samples)), ("lines", str(lines)), ("bands", str(bands)))
-    code = {name: code for code, name in DATA_TYPES.items()}[kind.str[1:]]
-    yield from (("header offset", "0"), ("file type", "ENVI Standard"), ("data type", str(code)))
-    yield from (("interleave", "bil"), ("byte order", "0"))
-    if file.wavelength_nm is not None:
-        yield "wavelength units", "Nanometers"
-    for key, values in (("wavelength", file.wavelength_nm), ("fwhm", file.fwhm_nm)):
-        if values is not None:
-            yield key, _listed([repr(number) for number in values.tolist()])
-    yield from file.more.items()
-
-
-def _listed(items: list[str]) -> str:
-    return "{" + ", ".join(items) + "}"
-
-
-def write_recorded_files(cube: RawCube, folder: Path) -> Path:
-    """Write a raw cube as ENVI with a pointing table and reference frames, named like its sweep; return the header.
-
-    `storage.readers.recordings` reads them back bit for bit::
-
-        NAME.bil NAME.hdr            raw numbers, with wavelengths and widths of the bands, and the lines' axis
-        NAME.pointing.csv            a row a line: line, time, mirror_x, mirror_y, exposure_ms, valid
-        NAME.dark.img NAME.dark.hdr  dark frame, one line of float32
-        NAME.white.*                 white frame; its header has the value of the white reference per band
-        NAME.bad.*  NAME.flat.*      bad elements (1), and the relative response where there is one
-
-    Numbers have as many digits as give the same float64 again. Files of these names are replaced. Raises ArchiveError:
-    the disk refuses; IncompleteStoreError: the cube is damaged.
-    """
-    make_folder(folder)
-    name = cube.sweep.name
-    header = folder / f"{name}.hdr"
-    bands = EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
-    axis = {"line axis": cube.sweep.along}
-    what = "restored" if isinstance(cube, RestoredCube) else "raw"
-    blocks = ((rows.start, cube.read(rows.start, rows.stop)) for rows in cuts(cube.shape[0], SHARD_ROWS))
-    write_envi(header, replace(bands, description=f"{what} numbers of sweep {name}", ending=".bil", more=axis), blocks)
-    known = cube.references
-    white_reference = ", ".join(repr(value) for value in known.white_reference.astype(np.float64).tolist())
-    of_white = {"white_reference": f"{{{white_reference}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}
-    bad = np.zeros(known.dark.shape, np.bool_) if known.bad is None else known.bad
-    frames: dict[str, tuple[NDArray[Any], str, dict[str, str]]] = {
-        "dark": (known.dark, "f4", {}),
-        "white": (known.white, "f4", of_white),
-        "bad": (bad.astype(np.uint8), "u1", {}),
-    }
-    if known.flat is not None:
-        frames["flat"] = (known.flat, "f4", {})
-    for kind, (frame, dtype, more) in frames.items():
-        shape = (1, *known.dark.shape)
-        file = replace(bands, shape=shape, dtype=dtype, description=f"{kind} frame of {name}", more=more)
-        write_envi(folder / f"{name}.{kind}.hdr", file, [(0, frame[None])])
-    rows = ["line,time,mirror_x,mirror_y,exposure_ms,valid"]
-    columns = (cube.time_s, *cube.position.T, cube.exposure_ms)
-    for number, values in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        rows.append(",".join([str(number), *map(repr, values), str(int(cube.valid_line[number]))]))
-    write_whole(folder / f"{name}.pointing.csv", "\n".join(rows) + "\n")
-    return header

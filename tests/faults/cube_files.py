@@ -19,8 +19,8 @@ import numpy as np
 from PIL import Image
 
 from pipeline.errors import PipelineError
-from storage.export.image_files import EnviFile, write_envi
 from storage.readers.open_cubes import open_cube
+from tests.envi_files import listed, write_cube
 
 SHAPE = (20, 12, 5)
 LONGEST_S = 30  # longer readings count as hanging
@@ -31,18 +31,19 @@ def _cube() -> Any:
 
 
 def _envi(folder: Path) -> str:
-    write_envi(folder / "a.hdr", EnviFile(SHAPE, "u2", np.linspace(400, 800, SHAPE[2])), [(0, _cube())])
+    bands = {"wavelength units": "Nanometers", "wavelength": listed(np.linspace(400, 800, SHAPE[2]))}
+    write_cube(folder / "a.hdr", _cube(), "u2", **bands)
     return "a.hdr"
 
 
 def _headwall(folder: Path) -> str:
     for first in (0, 10):
-        write_envi(folder / "part.hdr", EnviFile((10, *SHAPE[1:]), "u2"), [(0, _cube()[first : first + 10])])
+        write_cube(folder / "part.hdr", _cube()[first : first + 10], "u2")
         (folder / "part.hdr").rename(folder / f"raw_{first}.hdr")
         (folder / "part.img").rename(folder / f"raw_{first}")
         rows = "".join(f"{frame}\t{1000 + 10 * frame}\n" for frame in range(first, first + 10))
         (folder / f"frameIndex_{first}.txt").write_text("Frame#\tTimestamp\n" + rows)
-    write_envi(folder / "darkReference.hdr", EnviFile((1, *SHAPE[1:]), "u2"), [(0, _cube()[:1] // 8)])
+    write_cube(folder / "darkReference.hdr", _cube()[:1] // 8, "u2")
     return "."
 
 

@@ -35,9 +35,9 @@ from storage.archive.keys import array_digest
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import open_mosaic
-from storage.export.image_files import write_recorded_files
 from storage.remote.opening import verify_archive
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
+from tests.envi_files import write_recorded_files
 from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import FAKE
 from tests.flows.tasks.test_uniform_scan import RECORD

@@ -63,8 +63,7 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
             posed = replace(settings, pose=POSE) if request.param == "posed" else settings
             runs.append(run_survey(posed, QUIET))
     return [
-        Exported(archive, run.receipt, out, run_export(archive, run.folder.name, out, envi=False, console=QUIET))
-        for run in runs
+        Exported(archive, run.receipt, out, run_export(archive, run.folder.name, out, console=QUIET)) for run in runs
     ]
 
 

@@ -142,7 +142,7 @@ def test_areas_need_no_geographic_place(surveyed: Raster, tmp_path: Path, pixel_
     table = page.partition('<section id="areas">')[2].partition("</section>")[0]
     most = max(pixels, key=pixels.__getitem__)
     assert f"<td>{most.replace('_', ' ')}</td><td>{format_count(pixels[most])}</td>" in table
-    files = run_export(tmp_path / "archive", None, tmp_path / "out", envi=False, console=QUIET)["files"]
+    files = run_export(tmp_path / "archive", None, tmp_path / "out", console=QUIET)["files"]
     with (tmp_path / "out" / files["areas"]).open() as text:
         rows = {row["class"]: row for row in csv.DictReader(text)}
     assert {name: int(row["pixels"]) for name, row in rows.items()} == pixels
@@ -163,7 +163,7 @@ def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: We
     source = write_tif(tmp_path / "field.tif", values)
     published = surveyed(source, wavelengths="670,550,800", weights=str(make_weights((550.0, 670.0, 800.0))))
     choice = choose_products(ProductFlags(reflectance=True, indices="NDVI"))
-    run_export(tmp_path / "archive", None, tmp_path / "out", False, QUIET, choice)
+    run_export(tmp_path / "archive", None, tmp_path / "out", QUIET, choice)
     folder = tmp_path / "out" / published.folder.name
     with rasterio.open(folder / "reflectance.tif") as exported, rasterio.open(source) as own:
         assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)

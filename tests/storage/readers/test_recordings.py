@@ -22,8 +22,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
-from storage.export.image_files import write_recorded_files
 from storage.readers.recordings import RecordedWith, _middle_s, open_recording
+from tests.envi_files import write_recorded_files
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 from tests.storage.readers.test_envi_cubes import write_envi
 from tests.storage.small_archive import flip
