@@ -21,7 +21,7 @@ from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.mirror import wire_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress
-from pipeline.rig.camera.camera_texts import LineTimes
+from pipeline.rig.camera.frame_indices import LineTimes
 from pipeline.rig.capture_paths import announced
 from pipeline.rig.device_settings import FAKE
 from pipeline.rig.transports import Clock, DeviceRefused

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from pipeline.errors import SceneError
 from pipeline.lazy import GeoBox
-from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.readers.cube_sources import (
     BLOCK_LINES,

@@ -21,15 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
 from pipeline.errors import SceneError
-from pipeline.rig.camera.camera_texts import (
+from pipeline.rig.camera.frame_indices import (
     FRAME_INDEX,
     LONGEST_LINE,
-    EnviHeader,
     FrameIndex,
     LineTimes,
-    finite_number,
-    parse_envi_header,
     parse_frame_index,
     place_parts,
     times_of_lines,

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.envi_headers import finite_number, wavelengths_nm
 from pipeline.errors import SceneError
 from pipeline.lazy import GeoBox, odc_crs, odc_geobox, pyproj
-from pipeline.rig.camera.camera_texts import finite_number, wavelengths_nm
 from storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,

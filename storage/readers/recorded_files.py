@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.capture.straight_scans import angles_to_positions
+from pipeline.envi_headers import listed_numbers
 from pipeline.errors import SceneError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
-from pipeline.rig.camera.camera_texts import listed_numbers
 from pipeline.signal.calibrate import Floats, find_bad_elements, full_scale_notes
 from pipeline.source import References
 from storage.readers.cube_sources import CubeSource

@@ -13,15 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.envi_headers import EnviHeader, parse_envi_header
 from pipeline.errors import RigError, SceneError, ShapeError
-from pipeline.rig.camera.camera_texts import (
-    FRAME_INDEX,
-    EnviHeader,
-    LineTimes,
-    parse_envi_header,
-    parse_frame_index,
-    times_of_lines,
-)
+from pipeline.rig.camera.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
 from pipeline.signal.calibrate import find_bad_elements
 from pipeline.source import References
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rig.camera.camera_texts import times_of_lines
+from pipeline.rig.camera.frame_indices import times_of_lines
 from storage.readers.envi_files import load_frame_index
 from storage.readers.open_cubes import open_cube
 from tests.storage.readers.test_envi_cubes import write_envi

@@ -11,7 +11,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.scan import Sweep
 from pipeline.rig import capture_paths
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.camera.camera_texts import LineTimes
+from pipeline.rig.camera.frame_indices import LineTimes
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
