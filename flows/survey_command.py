@@ -29,9 +29,8 @@ from flows.tasks.prefect_tasks import Observer, inside_flow, observed_by
 from flows.terminal.progress import StageProgress
 from models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
 from pipeline.lazy import deferred
+from storage.archive.archive import Archive
 from storage.archive.staging import remove_tree, take_lock
-from storage.remote.object_stores import is_remote
-from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
     import flows.survey as survey_flow
@@ -90,7 +89,7 @@ def _prefect_server(out: str) -> Iterator[None]:
         check_answers(os.environ["PREFECT_API_URL"])
         yield
         return
-    root = open_archive(out).root
+    root = Archive.open(out).root
     home = root / ".prefect"
     release = take_lock(root / ".locks" / "prefect.lock", wait=False)
     if release is None:
@@ -107,6 +106,4 @@ def _prefect_server(out: str) -> Iterator[None]:
 def show_published(published: Published, out: str, console: Console, *, verbose: bool = False) -> None:
     """Print the score, the savings and the place of the report; with ``verbose`` all savings, stages and effects."""
     print_summary(published.receipt, console, verbose=verbose)
-    if is_remote(out):
-        console.print(f"Run: {escape(out)}/runs/{published.folder.name}", soft_wrap=True)
     console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)

@@ -19,7 +19,6 @@ from storage.archive.keys import LATEST
 from storage.archive.manifests import CURE
 from storage.archive.records import LINE_PRODUCTS, Run, read_run
 from storage.arrays.layout import damage_named, open_group
-from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
     import xarray
@@ -36,7 +35,7 @@ def open(archive: str | Path) -> OpenedArchive:
     Parameters
     ----------
     archive
-        A folder, or s3://bucket/prefix.
+        Its folder.
 
     Returns
     -------
@@ -48,7 +47,7 @@ def open(archive: str | Path) -> OpenedArchive:
     ArchiveError
         There is no archive, or it cannot be read.
     """
-    return OpenedArchive(open_archive(archive, create=False, write=False))
+    return OpenedArchive(Archive.open(archive, create=False, write=False))
 
 
 class OpenedArchive(Mapping[str, "OpenedRun"]):

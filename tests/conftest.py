@@ -27,7 +27,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights, with_record
 from storage.readers.labels import DEFAULT_COLOURS
-from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
+from tests.object_server import bucket, s3_server  # noqa: F401 - fixtures
 from tests.prior_work import remember, with_effects, without_effects
 from tests.zarr_at_once import close_loops, work_at_once
 

@@ -6,16 +6,11 @@ It serves S3 only: moto's server for all services selects a service at each requ
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import count
-from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from storage.remote.object_archive import ObjectArchive
 
 BUCKET = "surveys"
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_REGION": "us-east-1"}
@@ -47,23 +42,10 @@ def s3_server() -> Iterator[str]:
 
 
 @pytest.fixture
-def bucket(s3_server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the address of a new archive in the bucket; set the environment for it, with copies below ``tmp_path``."""
+def bucket(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the address of a new archive in the bucket, and set the environment for it."""
     for name in ("AWS_SESSION_TOKEN", "AWS_PROFILE", "AWS_DEFAULT_REGION", "AWS_ENDPOINT_URL_S3"):
         monkeypatch.delenv(name, raising=False)
     for name, value in {**KEYS, "AWS_ENDPOINT_URL": s3_server}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "work"))
     return f"s3://{BUCKET}/archive-{next(_numbers)}"
-
-
-@pytest.fixture
-def machine(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ObjectArchive]:
-    """Return a function that opens the bucket's archive as a named machine with its own working copy."""
-    from storage.remote.object_archive import open_object_archive
-
-    def open_as(name: str, *, create: bool = True, write: bool = True) -> ObjectArchive:
-        monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / name))
-        return open_object_archive(bucket, create=create, write=write)
-
-    return open_as

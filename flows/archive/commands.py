@@ -26,8 +26,7 @@ from storage.archive.lineage import Catalogue, find_product
 from storage.archive.records import Run, moment_of
 from storage.archive.whole_files import to_json
 from storage.maintenance.garbage import DAY_S, clear_up
-from storage.maintenance.verification import Finding
-from storage.remote.opening import open_archive, verify_archive
+from storage.maintenance.verification import Finding, verify_everything
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
@@ -36,7 +35,7 @@ MOST_ROWS = 20  # stores of a stage, removals
 
 def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
     """List the runs and stores of an archive with their age, scene, score and size."""
-    put_out(contents(open_archive(archive, create=False, write=False)), show_contents, as_json=as_json)
+    put_out(contents(Archive.open(archive, create=False, write=False)), show_contents, as_json=as_json)
     return DONE
 
 
@@ -49,7 +48,7 @@ def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> i
         Its address (stages/rectify/KEY), a key or its beginning, a run's name or `latest`, or a product's name in the
         newest run (class_map, mosaic).
     """
-    put_out(explanation(open_archive(archive, create=False, write=False), product), show_explanation, as_json=as_json)
+    put_out(explanation(Archive.open(archive, create=False, write=False), product), show_explanation, as_json=as_json)
     return DONE
 
 
@@ -58,7 +57,7 @@ def verify(archive: ArchiveName, *, as_json: AsJson = False) -> int:
 
     It names damaged stores and what was made of them, and the commands that remove them and make them again.
     """
-    opened = open_archive(archive, create=False, write=False)
+    opened = Archive.open(archive, create=False, write=False)
     findings = _verified(opened)
     put_out(verdict(opened, findings), show_verdict, as_json=as_json)
     return DONE if all(finding.problem is None for finding in findings) else FAILED
@@ -66,7 +65,7 @@ def verify(archive: ArchiveName, *, as_json: AsJson = False) -> int:
 
 def _verified(archive: Archive) -> list[Finding]:
     with StageProgress(stderr, {"verify": "reading again"}) as bars:
-        findings = verify_archive(archive, lambda uri, fraction: bars.show("verify", fraction, uri))
+        findings = verify_everything(archive, lambda uri, fraction: bars.show("verify", fraction, uri))
         bars.show("verify", 1.0, ended=True)
     return findings
 
@@ -94,7 +93,7 @@ def gc(
     dry_run
         Only print what would be removed, and its size.
     """
-    opened = open_archive(archive, create=False, write=not dry_run)
+    opened = Archive.open(archive, create=False, write=not dry_run)
     findings = _verified(opened) if damaged else None
     with StageProgress(stderr, {"gc": "clearing up"}) as bars:
         done = clear_up(

@@ -35,12 +35,11 @@ from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json, stderr
 from pipeline.errors import ArchiveError, PipelineError
 from pipeline.lazy import deferred
+from storage.archive.archive import Archive
 from storage.archive.manifests import read_manifest
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers, to_json, write_whole
 from storage.export.image_files import write_cog
-from storage.remote.object_archive import ObjectArchive
-from storage.remote.opening import open_archive
 
 pystac: Any = deferred("pystac")
 rio_stac: Any = deferred("rio_stac")
@@ -91,7 +90,7 @@ def run_export(
     was asked for; WavelengthError: its cube lacks bands of an index; ArchiveError: ``out`` is another archive's or
     cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
-    opened = open_exported(open_archive(archive, create=False, write=False), run)
+    opened = open_exported(Archive.open(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)
     check_doses(opened, choice)
     layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]
@@ -147,10 +146,8 @@ class Export:
         return re.sub(r"[^A-Za-z0-9_-]+", "-", self.run.archive.root.name).strip("-") or "surveys"
 
     def add(self, key: str, path: Path, title: str, kind: str, roles: Sequence[str], **more: Any) -> None:
-        """Add a file to the catalogue, by its address in a bucket, else by that relative to the item."""
+        """Add a file to the catalogue, by its address relative to the item."""
         href = quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
-        if isinstance(self.run.archive, ObjectArchive) and path.is_relative_to(self.run.archive.root):
-            href = self.run.archive.url(path)
         self.assets[key] = pystac.Asset(href, title, media_type=kind, roles=[*roles], extra_fields=more)
         if path.resolve().is_relative_to(self.out):
             self.files[key] = path.resolve().relative_to(self.out).as_posix()

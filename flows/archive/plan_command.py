@@ -38,8 +38,7 @@ from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan, frontier
 from pipeline.signal.subspace import SMALL_FIELD
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef, store_at
-from storage.remote.opening import is_archive, open_archive
+from storage.archive.keys import StageRef, is_archive, store_at
 
 if TYPE_CHECKING:
     import flows.survey as survey_flow
@@ -109,7 +108,7 @@ class Planner(OpenSurvey):
             row = StageForecast(stage, "blocked", None, why)
         else:
             row = StageForecast(stage, "to run" if found is None else "cached", key)
-            ref = found or _Awaited(product, key, store_at(self.run.archive.root, product, key).folder, made_by=stage)
+            ref = found or _Awaited(product, key, store_at(self.run.archive.root, product, key).path, made_by=stage)
         if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref
@@ -140,7 +139,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
-            archive = open_archive(settings.out, create=False, write=False)
+            archive = Archive.open(settings.out, create=False, write=False)
         run = open_run(settings, planning=True, archive=archive)
         planner = Planner(run)
         survey_flow.draw_class_map(planner)

@@ -31,12 +31,12 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import put_out, show_text, stderr
 from models.weights.files import describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError
+from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
 from storage.parallel.pool import THREADS, WorkerPool
 from storage.readers.recordings import stores_of_lines
-from storage.remote.opening import open_archive
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
 
@@ -88,7 +88,7 @@ def reprocess_fields(
     Fields whose newest run is current are skipped, so the same command continues after an interruption. Raises
     SettingsError: no field has this name; ArchiveError: the archive cannot be read or written.
     """
-    opened = open_archive(archive, create=False, write=not dry_run)
+    opened = Archive.open(archive, create=False, write=not dry_run)
     catalogue = Catalogue.read(opened.root)
     if weights is not None:
         describe_weights(weights)  # raises an error before any survey

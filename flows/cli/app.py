@@ -17,6 +17,8 @@ VERBS = {  # verb: module of its function, loaded on demand
     "explain": "flows.archive.commands",
     "verify": "flows.archive.commands",
     "gc": "flows.archive.commands",
+    "push": "flows.archive.bucket_commands",
+    "pull": "flows.archive.bucket_commands",
     "export": "flows.archive.export_command",
     "reprocess": "flows.archive.reprocess_command",
     "serve": "flows.cli.serve_command",
@@ -25,7 +27,7 @@ VERBS = {  # verb: module of its function, loaded on demand
     "evaluate": "flows.cli.model_verbs",
     "tradeoff": "flows.tradeoff",
 }
-GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve")  # verbs that resume
+GOES_ON = ("survey", "train", "export", "reprocess", "simulate", "serve", "push", "pull")  # verbs that resume
 
 
 def build_app(*, listed: bool) -> App:

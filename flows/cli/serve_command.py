@@ -42,9 +42,8 @@ from flows.terminal.processes import DONE, terminable
 from flows.terminal.progress import show_text
 from models.weights.files import describe_weights
 from pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
+from storage.archive.archive import Archive
 from storage.archive.staging import read_toml, take_lock
-from storage.remote.object_stores import is_remote
-from storage.remote.opening import open_archive
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 STOPPED_AGAIN_S = 15.0  # interval of requests to a runner to stop
@@ -73,7 +72,7 @@ def serve(
     timezone
         Time zone of --cron, such as Europe/Berlin; this machine's by default.
     out
-        Archive for all fields, a folder or s3://bucket/prefix; by default that of each field's settings.
+        Archive for all fields; by default that of each field's settings.
     limit
         Surveys at a time; by default one per field. A rig has always one.
     port
@@ -81,7 +80,7 @@ def serve(
     """
     schedule = schedule_of(cron, every, timezone)
     served = load_fields(fields, out)
-    archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
+    archives = {one.settings.out: Archive.open(one.settings.out).root for one in served}
     try:
         with terminable(), ExitStack() as held:
             for name, root in archives.items():
@@ -142,8 +141,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
     fields: dict[str, ServedField] = {}
     for file in files:
         settings = load_settings(file, {"out": out})
-        if not is_remote(settings.out):
-            settings = replace(settings, out=str(Path(settings.out).absolute()))
+        settings = replace(settings, out=str(Path(settings.out).absolute()))
         if "scene" not in read_toml(file) and settings.source != "rig":
             raise SettingsError(
                 f"{file} has neither scene nor source = 'rig'; set the field's scene ('field' for sweeps), or its rig"

@@ -28,8 +28,8 @@ from models.network.machine import keep_freed_memory
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
+from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.remote.opening import open_archive
 
 TITLES = {"effects": "choice of effects", "capture": "scan"}
 PATCH = 16  # of the shipped weights, so that scans are those of their surveys
@@ -54,7 +54,7 @@ def simulate(
         `farm` or `scouting` (built in; `farm@2` names the version of its law), or an image or cube file: PNG, JPEG,
         BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr.
     out
-        Archive for the raw cubes: a folder, or s3://bucket/prefix.
+        Folder of the archive for the raw cubes.
     coarse
         Simulate the coarse sweep instead: every fourth line.
     settings
@@ -107,7 +107,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     simulated = make_source(scene, settings)
     run = CaptureRun(
         settings=settings,
-        archive=open_archive(settings.out),
+        archive=Archive.open(settings.out),
         source=SimulatedField(simulated),
         simulated=simulated,
         scene=scene,

@@ -49,7 +49,6 @@ def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
     passes = survey.products.there(*PASSES)
     if not survey.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
-    archive.refresh()
     catalogue = Catalogue.read(archive.root)
     others = [one for raw in passes for one in catalogue.named_by(raw.uri) if one.settings.get("keep") != KEEP_SIGNAL]
     kept = f"{others[0].uri} keeps them" if others else None
@@ -70,7 +69,6 @@ def _clear_first_mosaic(survey: OpenSurvey) -> None:
     first = survey.products.get("rectify")
     if first is None or "rectify_fine" not in survey.products or survey.registers:  # fine sweeps are registered on it
         return
-    archive.refresh()
     if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
         archive.clear(first, wait=False)
 

@@ -76,7 +76,6 @@ class DataBytes(_Part):
     captured: int  # as the camera delivers them, of all passes
     written: int  # stores that were built, including cleared ones, and spools
     kept: int  # its stores with their inputs, but for raw lines that ``keep`` drops
-    moved_bucket: int  # to and from a bucket, 0 without one
     reference: int
 
 

@@ -37,12 +37,7 @@ COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "samples": ("samples on the field", format_count),
     "patches": ("patches read in full", format_count),
 }
-BYTE_LABELS = {
-    "kept": "bytes kept",
-    "captured": "bytes captured",
-    "written": "bytes written",
-    "moved_bucket": "bytes to and from the bucket",
-}
+BYTE_LABELS = {"kept": "bytes kept", "captured": "bytes captured", "written": "bytes written"}
 LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
 LEAST_REFERENCE = 100_000  # bytes; with a smaller reference, rows are not in MB
 SMALL_RUN = 2_000_000  # bytes kept, most of which do not depend on the field
@@ -67,9 +62,8 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
     show_bytes = format_bytes if full < LEAST_REFERENCE else lambda size: f"{three_digits(size / 1e6)} MB"
     for name, label in BYTE_LABELS.items():
         done = receipt["data_bytes"][name]
-        if done or name != "moved_bucket":
-            ratio = done / full if full else None
-            rows.append({"label": label, "done": show_bytes(done), "full": show_bytes(full), "ratio": ratio})
+        ratio = done / full if full else None
+        rows.append({"label": label, "done": show_bytes(done), "full": show_bytes(full), "ratio": ratio})
     return sorted(rows, key=lambda row: LEADING.index(row["label"]) if row["label"] in LEADING else len(LEADING))
 
 

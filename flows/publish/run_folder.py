@@ -271,7 +271,7 @@ def _pointing(ref: StageRef) -> dict[str, Any]:
 
 
 def count_bytes(survey: OpenSurvey, plan: FinePlan, rests_on: Iterable[str]) -> Facts:
-    """Return the bytes that a survey captured, wrote, keeps and moved, and those of the reference.
+    """Return the bytes that a survey captured, wrote and keeps, and those of the reference.
 
     ``rests_on`` are its stores and their inputs. Raw lines that the setting ``keep`` drops do not count as kept, nor do
     the stores of the visit of its prior map.
@@ -289,6 +289,5 @@ def count_bytes(survey: OpenSurvey, plan: FinePlan, rests_on: Iterable[str]) -> 
         "captured": captured,
         "written": survey.bytes_written,
         "kept": sum(archive.sizes(uri for uri in rests_on if uri not in others).values()),
-        "moved_bucket": archive.moved_bytes,
         "reference": reference,
     }

@@ -14,7 +14,7 @@ from flows.settings.load import FLAGS, SURVEY, TABLES
 from pipeline.errors import SettingsError
 from pipeline.setting_fields import numbers_of
 
-ArchiveName = Annotated[str, Parameter(help="The archive's folder, or s3://bucket/prefix.")]
+ArchiveName = Annotated[str, Parameter(help="The archive's folder.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]
 Switch = Annotated[bool, Parameter(negative="")]  # without a --no- form
 OutFile = Annotated[Path, Parameter(name=("--out", "-o"))]

@@ -42,10 +42,10 @@ from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import format_number, span_of
 from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from storage.archive.keys import is_archive
 from storage.archive.records import Run, moment_of
 from storage.archive.staging import read_toml
 from storage.readers.recordings import find_recorded_run
-from storage.remote.opening import is_archive
 
 
 @dataclasses.dataclass(frozen=True)

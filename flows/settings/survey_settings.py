@@ -158,7 +158,7 @@ class Settings:
     )
     sweeps: str | None = stated(
         None,
-        "Recorded sweeps: an archive, ARCHIVE/runs/NAME, s3://bucket/prefix, a folder of ENVI cubes or of a Headwall"
+        "Recorded sweeps: an archive, ARCHIVE/runs/NAME, a folder of ENVI cubes or of a Headwall"
         " camera, or one ENVI or Zarr cube. Without another scan or budget, every line is used as it was taken",
         example="sweeps",
     )
@@ -174,7 +174,7 @@ class Settings:
     white: str | None = stated(
         None, "White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr", example="white.hdr"
     )
-    out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
+    out: str = stated("archive", "Folder of the archive")
     keep: Literal["signal", "raw"] = stated(
         "signal", "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), or raw"
     )

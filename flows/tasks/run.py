@@ -67,11 +67,11 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
 from storage.archive.archive import Archive
+from storage.archive.keys import is_archive
 from storage.arrays.layout import image_spec
 from storage.parallel.pool import WorkerPool
 from storage.readers.open_cubes import load_labels_array
 from storage.readers.scene_files import RasterPixels, SceneFile
-from storage.remote.opening import is_archive, open_archive
 
 if TYPE_CHECKING:
     import flows.tasks.rig_field as rig_field
@@ -366,7 +366,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     name = settings.name or Path(scene.name).stem
     found = None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
-        archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
+        archive = Archive.open(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (
             (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names, scene)
         )
@@ -381,7 +381,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     shown = None if zones.fractions is None else zones.fractions > 0
     budget = None if settings.macs is None else PatchBudget.asked(costs, shown, settings.policy, settings.macs)
     source, simulated, raster = _open_source(settings, scene, grid, planned.plan, recorded, pixels)
-    archive = open_archive(settings.out) if archive is None else archive
+    archive = Archive.open(settings.out) if archive is None else archive
     if raster is not None and not planning:
         outside += other_unit(raster, scene.wavelength_nm, model.load(), model.path)
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene)

@@ -8,7 +8,7 @@
     .locks/                   held while something is made
 
 A folder whose name ends in ``.part`` is not finished: the next process that builds the same store removes it. An
-archive in a bucket (`storage.remote.object_archive`) has the same addresses.
+archive may be copied to a bucket and back (`storage.remote.bucket`).
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ from storage.archive.staging import (
     remove_tree,
     rename_into_place,
     retire,
+    sync_path,
     take_lock,
 )
 from storage.arrays.layout import consolidate_stores
@@ -75,8 +76,6 @@ class StagedStore:
 class Archive:
     """A folder of immutable stores. A folder with its final name is complete, wherever a process was killed."""
 
-    in_bucket = False  # whether `root` is a working copy alone
-
     def __init__(self, root: Path, *, writes: bool = True) -> None:
         self.root = root
         self.writes = writes
@@ -84,13 +83,12 @@ class Archive:
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
-        """Open the archive in a folder, or create it with ``create``; `storage.remote.opening` opens buckets as well.
+        """Open the archive in a folder, or create it with ``create``.
 
         Raises ArchiveError: the path is a file, is missing, or cannot be written to (``write``).
         """
-        path = Path(root).absolute()
-        open_folder(path, create=create, write=write)
-        return cls(path, writes=write)
+        open_folder(Path(root), create=create, write=write)
+        return cls(Path(root).absolute(), writes=write)
 
     @property
     def name(self) -> str:
@@ -208,11 +206,8 @@ class Archive:
         """Return every published store (of one stage), by stage and key."""
         return published_stores(self.root, stage)
 
-    def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
-        """Remove one store; False where another process holds it and ``wait`` is false.
-
-        With ``unnamed``, an archive in a bucket checks once more that no run names it.
-        """
+    def discard(self, ref: StageRef, *, wait: bool = True) -> bool:
+        """Remove one store; False where another process holds it and ``wait`` is false."""
         with refusals(self.root, "remove from the archive"), self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held:
             if held:
                 retire(ref.path)
@@ -232,6 +227,25 @@ class Archive:
         return held
 
     @contextmanager
+    def adopt(self, uri: str) -> Iterator[Path | None]:
+        """Yield a folder to copy a published store or run into, with its manifest; None where it is here already."""
+        final = self.root / uri
+        part = final.with_name(final.name + PART_SUFFIX)
+        with refusals(self.root, "write to the archive"), self._locked(self._lock_name(final)):
+            if final.exists():
+                yield None
+                return
+            remove_tree(part)
+            part.mkdir(parents=True)
+            try:
+                yield part
+                for path in (*part.rglob("*"), part):
+                    sync_path(path)
+                rename_into_place(part, final)
+            finally:
+                remove_tree(part)
+
+    @contextmanager
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep other processes from removing stores while the block runs; many may use an archive at a time.
 
@@ -247,13 +261,13 @@ class Archive:
     def reclaim(self) -> list[str]:
         """Remove what killed processes left in this folder; return the addresses."""
         with refusals(self.root, "clear up the archive"):
-            return [uri for uri in Archive.leftovers(self, 0.0) if Archive.drop_leftover(self, uri)]
+            return [uri for uri in self.leftovers() if self.drop_leftover(uri)]
 
-    def leftovers(self, keep_days: float) -> dict[str, int]:
+    def leftovers(self) -> dict[str, int]:
         """Return addresses and bytes of what killed processes left.
 
         These are unfinished folders, spools of published captures, and stores that are marked as cleared and have
-        files. In a bucket also incomplete uploads that are older than ``keep_days``.
+        files.
         """
         spools = [
             path
@@ -288,10 +302,6 @@ class Archive:
         kind = "capture" if path.parent.name == "spool" else path.parent.name
         return f"{kind}-{path.name.removesuffix(PART_SUFFIX)}"
 
-    def now(self) -> datetime:
-        """Return the time from which the age of stores is counted."""
-        return datetime.now(UTC)
-
     def size_of(self, uri: str) -> int:
         """Return the present bytes of all files of a store or run, manifest included."""
         return bytes_below(self.root / uri)
@@ -299,11 +309,6 @@ class Archive:
     def sizes(self, uris: Iterable[str]) -> dict[str, int]:
         """Return the sizes of stores and runs, as `size_of` counts them, by address."""
         return {uri: self.size_of(uri) for uri in uris}
-
-    @property
-    def moved_bytes(self) -> int:
-        """Return the bytes transferred to and from a bucket."""
-        return 0
 
     def drop_run(self, uri: str) -> None:
         """Remove a damaged run."""
@@ -369,9 +374,6 @@ class Archive:
         if self.writes:
             self.spooled_bytes += bytes_below(self.root / "spool" / key)
             remove_tree(self.root / "spool" / key)
-
-    def refresh(self) -> None:
-        """Read again which runs there are; in a folder nothing has to be fetched for that."""
 
     def _lock_path(self, name: str) -> Path:
         return self.root / ".locks" / f"{name}.lock"

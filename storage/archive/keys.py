@@ -12,7 +12,7 @@ import math
 import os
 import re
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
@@ -88,6 +88,7 @@ def array_digest(array: NDArray[np.generic]) -> str:
 
 
 STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
+ADDRESS = re.compile(r"(?i)[a-z][a-z0-9+]+:(?=/)")  # of a bucket or server
 LATEST = "latest"  # the newest run
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
 
@@ -98,13 +99,7 @@ class StageRef:
 
     stage: str
     key: str
-    folder: Path = field(compare=False)
-    fetch: Callable[[str], Path] | None = field(default=None, compare=False, repr=False)
-
-    @property
-    def path(self) -> Path:
-        """Folder of the store on this machine; a store in a bucket is fetched."""
-        return self.folder if self.fetch is None else self.fetch(self.uri)
+    path: Path = field(compare=False)
 
     @property
     def uri(self) -> str:
@@ -158,19 +153,29 @@ def in_text(text: str) -> str | None:
     return found.group(0) if found is not None and all(is_name(part) for part in found.groups()) else None
 
 
+def is_archive(address: str | Path) -> bool:
+    """Return whether there is an archive to open, or a file that will be refused."""
+    return (Path(address) / "stages").is_dir() or Path(address).is_file()
+
+
 def open_folder(path: Path, *, create: bool, write: bool) -> None:
     """Create an archive's folder with ``create``, and check that it can be used.
 
-    Raises ArchiveError: the path is a file, is missing, or cannot be read or written to (``write``).
+    Raises ArchiveError: the path is the address of a bucket, is a file, is missing, or cannot be read or written to
+    (``write``).
     """
+    if (found := ADDRESS.match(str(path))) is not None:
+        raise ArchiveError(
+            f"{found[0]}//{str(path)[found.end() :].lstrip('/')} is not a folder: expected the folder of an archive; "
+            "spectralzoom pull copies one from s3://bucket/prefix, and push copies it there"
+        )
     try:
         with refusals(path, "use the archive"):
             _open_folder(path, create=create, write=write)
     except ArchiveError:
         raise
     except OSError as error:  # at the door whatever the system answers means that this is no place for an archive
-        cure = "choose another folder, or SPECTRALZOOM_WORK for the working copy of a bucket"
-        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; {cure}") from error
+        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; choose another folder") from error
 
 
 def _open_folder(path: Path, *, create: bool, write: bool) -> None:

@@ -6,6 +6,7 @@ Stores are removed before their inputs, each in one step, so that the archive st
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -58,7 +59,7 @@ def clear_up(
 ) -> Clearance:
     """Remove what `plan_clearance` finds, except what another process holds; return what was removed.
 
-    With the findings of `verify_archive` as ``damaged``, remove what `plan_removal` finds.
+    With the findings of `verify_everything` as ``damaged``, remove what `plan_removal` finds.
     Raises ArchiveError: the disk refuses.
     """
 
@@ -78,21 +79,21 @@ def clear_up(
             for number, removal in enumerate(plan.removals):
                 if progress is not None:
                     progress(removal, number / len(plan.removals))
-                if _remove(archive, removal, unnamed=damaged is None):  # else another process holds it
+                if _remove(archive, removal):  # else another process holds it
                     gone.append(removal)
             for lock in archive.root.glob(".locks/*-*.lock"):  # of stores and runs, which nobody makes meanwhile
                 lock.unlink(missing_ok=True)
     return Clearance(tuple(gone), plan.kept, plan.obstacle)
 
 
-def _remove(archive: Archive, removal: Removal, *, unnamed: bool) -> bool:
+def _remove(archive: Archive, removal: Removal) -> bool:
     if removal.what == "leftover":
         return archive.drop_leftover(removal.uri)
     if removal.what == "run":
         archive.drop_run(removal.uri)
         return True
     path = archive.root / removal.uri
-    return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=unnamed)
+    return archive.discard(StageRef(path.parent.name, path.name, path), wait=False)
 
 
 def plan_removal(archive: Archive, findings: Sequence[Finding], *, raw_too: bool = False) -> Clearance:
@@ -124,7 +125,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     catalogue = Catalogue.read(archive.root)
     named = set[str]().union(*(run.names for run in catalogue.runs))
     spared: dict[str, str] = {}
-    now_s = archive.now().timestamp()
+    now_s = time.time()
     for uri, store in catalogue.stores.items():
         if uri in named:
             continue
@@ -143,9 +144,7 @@ def plan_clearance(archive: Archive, *, keep_days: float = 1.0, raw_too: bool = 
     removals = [
         Removal(uri, "store", archive.size_of(uri), "no run names it") for uri in reversed(catalogue.inputs_first(gone))
     ]
-    left = [
-        Removal(uri, "leftover", size, "its process has ended") for uri, size in archive.leftovers(keep_days).items()
-    ]
+    left = [Removal(uri, "leftover", size, "its process has ended") for uri, size in archive.leftovers().items()]
     return Clearance((*removals, *left), kept, obstacle)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from storage.archive.archive import Archive
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import broken_files, is_cleared, listed_bytes, try_manifest
@@ -27,14 +28,9 @@ class Finding:
     kind: Literal["whole", "broken", "missing", "stray"] = "whole"
 
 
-def verify_everything(
-    root: Path, progress: Progress | None = None, problems_of: Callable[[Path], Iterator[str]] | None = None
-) -> list[Finding]:
-    """Return a finding for each store and run without damage, and for each problem.
-
-    ``problems_of`` reads one published folder whose files lie elsewhere, as in a bucket.
-    """
-    catalogue = Catalogue.read(root)
+def verify_everything(archive: Archive, progress: Progress | None = None) -> list[Finding]:
+    """Return a finding for each store and run without damage, and for each problem."""
+    catalogue = Catalogue.read(archive.root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
     places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
     total = sum(size for *_, size in places) or 1
@@ -44,12 +40,12 @@ def verify_everything(
         if progress is not None:
             progress(uri, done / total)
         done += size
-        problems = list((problems_of or _problems)(path))
+        problems = list(_problems(path))
         if not path.exists() and not catalogue.named_by(uri):
             continue  # gc has removed it since
         found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
-    for path in without_manifest(root):
-        uri = path.relative_to(root).as_posix()
+    for path in without_manifest(archive.root):
+        uri = path.relative_to(archive.root).as_posix()
         if path.is_dir():
             found.append(Finding(uri, f"{MANIFEST_NAME} is missing", "broken"))
         else:

@@ -145,7 +145,7 @@ def run_blocks(
 
     On threads ``make`` and ``take`` must be safe to call from several at once. Otherwise ``make``, items and results
     are pickled, and ``take`` is called in this process. Workers of a dask scheduler read the stores ``inputs`` by the
-    same paths, or from the bucket. Raises SettingsError: no scheduler answers, or its workers lack the stores or run
+    same paths. Raises SettingsError: no scheduler answers, or its workers lack the stores or run
     other versions; WorkerError: workers died repeatedly.
     """
     results: dict[int, Any] = {}
@@ -287,8 +287,8 @@ class Cluster:
     def check(self, inputs: Sequence[StageRef]) -> int:
         """Compare versions, threads and stores of every worker with this process; return `count`.
 
-        Workers without the working copy of a bucket fetch the stores. Raises SettingsError: a worker differs, or cannot
-        read the bucket; WorkerError: there is none, or one was lost meanwhile.
+        Raises SettingsError: a worker differs, or cannot read the archive; WorkerError: there is none, or one was lost
+        meanwhile.
         """
         expected = {**about_here(inputs), THREADS_OF: "1"}
         count = self.count()
@@ -310,7 +310,7 @@ class Cluster:
                 if facts.get(what) != value:
                     raise SettingsError(
                         f"{self.name}: worker {worker} has {what} {facts.get(what)}, expected {value} as here; install "
-                        f"the same there, mount the archive under the same path or keep it in a bucket, and set "
+                        f"the same there, mount the archive under the same path, and set "
                         f"{THREADS_OF}=1"
                     )
         return count

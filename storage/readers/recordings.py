@@ -2,7 +2,7 @@
 
 ::
 
-    ARCHIVE, s3://bucket/prefix           raw cubes of the newest run, or of the run named: ARCHIVE/runs/NAME
+    ARCHIVE                               raw cubes of the newest run, or of the run named: ARCHIVE/runs/NAME
     stages/capture/KEY, NAME.zarr         raw cubes of one capture, or a single one
     NAME.hdr, NAME.bil, .bip, .bsq        an ENVI cube, or a folder of them
     a folder with raw_<frame> files       a Headwall camera's capture
@@ -34,7 +34,7 @@ from pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
 from pipeline.ground.georeference import geobox_of_record
 from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
-from storage.archive.keys import array_digest, store_at
+from storage.archive.keys import array_digest, is_archive, store_at
 from storage.archive.manifests import check_files, manifest_sha256
 from storage.archive.records import LINE_PRODUCTS, Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
@@ -56,8 +56,6 @@ from storage.readers.recorded_files import (
     with_bits,
 )
 from storage.readers.zarr_files import lost_chunks
-from storage.remote.object_stores import is_remote
-from storage.remote.opening import is_archive, open_archive
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"
@@ -144,7 +142,7 @@ def open_recording(
     given = given or RecordedWith()
     stores = find_raw_cubes(address)
     if stores is None:
-        return _open_files(Path(_fetched(address)), camera, given)
+        return _open_files(Path(address), camera, given)
     for name in ("pointing", "dark", "white", "wavelengths"):
         if getattr(given, name) is not None:
             raise SettingsError(
@@ -366,7 +364,7 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
     """
     if (named := _named_run(address)) is not None:
         return _run_with_cubes(*named)[2]
-    path = Path(_fetched(address))
+    path = Path(address)
     if not path.exists():
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
@@ -400,7 +398,7 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
     """
     named = _named_run(address)
     if named is None:
-        if not Path(_fetched(address)).exists():
+        if not Path(address).exists():
             raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
         return None
     archive, run, _ = _run_with_cubes(*named)
@@ -413,24 +411,18 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
     return RecordedRun(run, shape, geobox_of_record(params, shape))
 
 
-def _fetched(address: str | Path) -> str | Path:
-    """Return the path on this machine of a store in a bucket; other addresses as they are (IncompleteStoreError)."""
-    place, _, store = str(address).rpartition("/stages/")
-    return open_archive(place, create=False, write=False).locate(f"stages/{store}") if is_remote(place) else address
-
-
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:
     """Return the archive and the run (None: the newest) of an address; None if it is no archive's."""
-    text = str(_fetched(address)).rstrip("/")
+    text = str(address).rstrip("/")
     place, _, run = text.rpartition("/runs/")
     if place and run and is_archive(place):
         return place, run
-    return (text, None) if is_remote(text) or (Path(text) / "stages").is_dir() else None
+    return (text, None) if (Path(text) / "stages").is_dir() else None
 
 
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
     """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
-    archive = open_archive(address, create=False, write=False)
+    archive = Archive.open(address, create=False, write=False)
     for folder in reversed(archive.runs()) if name is None else [archive.run_folder(name)]:
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]

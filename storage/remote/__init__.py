@@ -1,1 +1,1 @@
-"""Archives in a bucket, with a working copy on this machine."""
+"""Copy archives to a bucket and back."""

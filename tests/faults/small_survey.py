@@ -11,7 +11,7 @@ from PIL import Image
 
 from models.weights.files import save_weights
 from storage.archive.archive import Archive
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import RGB_NM, patchy_scene, random_weights
 from tests.faults.injection import logged_calls
 from tests.faults.nursery import Ended, Nursery
@@ -87,7 +87,7 @@ def problems(archive: Path) -> list[str]:
     if not (archive / "stages").is_dir():
         return []
     opened = Archive.open(archive, create=False, write=False)
-    return [f"{finding.uri} {finding.problem}" for finding in verify_archive(opened) if finding.problem is not None]
+    return [f"{finding.uri} {finding.problem}" for finding in verify_everything(opened) if finding.problem is not None]
 
 
 def wrong_after_fault(subject: Subject, archive: Path, before: Stored | None = None) -> list[str]:

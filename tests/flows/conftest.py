@@ -22,7 +22,7 @@ from flows.tasks.local_server import QUIET, local_server
 from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import Flags, Survey
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects
@@ -53,7 +53,7 @@ class Ended:
 
 def problems(out: Path) -> list[str]:
     """Return the problems that a full verification of an archive finds."""
-    return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
+    return [f"{one.uri} {one.problem}" for one in verify_everything(Archive.open(out)) if one.problem]
 
 
 def class_map(out: Path) -> np.ndarray:

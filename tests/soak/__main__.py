@@ -20,7 +20,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.g
 
 from tests.faults.fault_table import rows_of, run_table  # noqa: E402
 
-PARTS = {"survey-rig": rows_of("tests.soak.rig_beside_simulation"), "bucket": rows_of("tests.soak.bucket_workers")}
+PARTS = {"survey-rig": rows_of("tests.soak.rig_beside_simulation")}
 HEADINGS = ("what", "how", "times", "demanded", "found", "met", "s")
 
 

@@ -12,7 +12,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import manifest_text
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def grow_old(ref: StageRef, days: float) -> None:
 
 def problems(archive: Archive) -> list[str]:
     """Return the problems that `verify` finds."""
-    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]
+    return [f"{one.uri} {one.problem}" for one in verify_everything(archive) if one.problem is not None]
 
 
 def write_class_map(path: Path, found: ClassMap) -> None:

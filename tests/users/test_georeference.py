@@ -24,8 +24,9 @@ from flows.publish.run_folder import Published
 from flows.settings.load import load_settings
 from flows.survey_command import run_survey
 from pipeline.ground.georeference import pixel_rows_m2
+from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
-from storage.remote.opening import open_archive, verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.prior_work import without_effects
 from tests.storage.readers.test_envi_cubes import write_envi
@@ -118,7 +119,7 @@ def test_products_have_the_position_of_their_scene(tmp_path: Path, weights: Path
     item = json.loads(Path(files["item"]).read_text())
     assert item["properties"]["proj:epsg"] == 32632
     assert item["properties"]["proj:transform"][:6] == pytest.approx(list(transform[:6]))
-    assert not [one for one in verify_archive(open_archive(tmp_path / "archive")) if one.problem]
+    assert not [one for one in verify_everything(Archive.open(tmp_path / "archive")) if one.problem]
 
 
 def test_transparent_pixels_are_nodata_in_every_product(tmp_path: Path, weights: Path) -> None:
@@ -169,7 +170,7 @@ def test_keys_of_mosaic_and_map_contain_the_georeference(tmp_path: Path, weights
     bare = tmp_path / "bare.npy"
     np.save(bare, PIXELS)
     run = survey(bare, weights, tmp_path / "archive", wavelengths="640,550,460", **ONE_SCAN)
-    archive = open_archive(tmp_path / "archive")
+    archive = Archive.open(tmp_path / "archive")
     for product in ("mosaic", "class_map"):
         ref = next(ref for ref in archive.refs() if run.receipt["products"][product].startswith(ref.uri))
         assert not {"georeference", "missing"} & set(archive.manifest(ref)["params"])

@@ -35,7 +35,7 @@ from storage.archive.keys import array_digest
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import open_mosaic
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.envi_files import write_recorded_files
 from tests.flows.conftest import CommandLine, be_version, command_line
@@ -122,7 +122,7 @@ def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, asked: dict[str, Any]) -
         told = one.receipt["recording"]
         assert (one.receipt["source"], told["lines_read"]) == ("recorded", told["lines_recorded"])
         assert "lines" not in one.receipt
-    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "files"))} == {"whole"}
+    assert {finding.kind for finding in verify_everything(Archive.open(tmp_path / "files"))} == {"whole"}
 
 
 @contextmanager
@@ -396,7 +396,7 @@ def test_a_damaged_signal_of_a_recording_goes_on_request(tmp_path: Path, pushbro
     assert chunk.is_file()
     assert gc(tmp_path / "a", damaged=True, raw_too=True) == DONE
     survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
-    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "a"))} == {"whole"}
+    assert {finding.kind for finding in verify_everything(Archive.open(tmp_path / "a"))} == {"whole"}
 
 
 def test_labels_of_a_recording_give_accuracy(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:

@@ -23,7 +23,7 @@ from flows.settings.load import load_settings
 from flows.survey_command import run_survey
 from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
 from storage.archive.archive import Archive
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET
 from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects
@@ -216,7 +216,7 @@ def test_missing_runs_and_bad_folders_are_refused(posed: Exported, tmp_path: Pat
         with pytest.raises(ArchiveError, match=r"cannot export to .*; choose another --out"):
             run_export(posed.archive, None, out, console=QUIET)
     assert (tmp_path / "file").read_text() == "mine"
-    assert all(finding.problem is None for finding in verify_archive(Archive.open(posed.archive)))
+    assert all(finding.problem is None for finding in verify_everything(Archive.open(posed.archive)))
 
 
 def test_a_missing_store_is_reported(posed: Exported, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid, block_means
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET, RGB_NM, WeightsMaker, patchy_scene
 from tests.storage.readers.test_raster_tags import write
 
@@ -112,7 +112,7 @@ def test_a_receipt_of_a_raster_has_no_camera_figures(surveyed: Raster, scene_fil
     assert receipt["data_bytes"]["kept"] > 0
     assert receipt["field"]["camera_s"] is receipt["field"]["lines"] is receipt["field"]["view_deg"] is None
     assert [row["name"] for row in receipt["stages"]] == [*("condense_raster", "score", "segment", "evaluate")]
-    assert [found.problem for found in verify_archive(Archive.open(tmp_path / "archive"))] == [None] * 5
+    assert [found.problem for found in verify_everything(Archive.open(tmp_path / "archive"))] == [None] * 5
 
 
 def test_multiply_adds_count_all_components(surveyed: Raster, tmp_path: Path, make_weights: WeightsMaker) -> None:

@@ -69,10 +69,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         settings=Settings().to_dict(),
         stages=[asdict(one) for one in stages],
         savings=savings,
-        data_bytes={
-            **{"captured": 2_000_000, "written": 7_000_000, "kept": 1_500_000, "moved_bucket": 0},
-            "reference": 4_000_000,
-        },
+        data_bytes={**{"captured": 2_000_000, "written": 7_000_000, "kept": 1_500_000}, "reference": 4_000_000},
         products={"quicklook": f"runs/{wall}/quicklook.png"},
         accuracy=accuracy if labels else None,
         effects=[row],

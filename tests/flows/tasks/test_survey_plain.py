@@ -36,7 +36,7 @@ from pipeline.simulator.render import BY_NAME
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.mosaics import open_mosaic
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import CLASSES, QUIET, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page, problems
 from tests.models.conftest import coarse_prediction
@@ -157,7 +157,7 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     assert comparable(first) == comparable(second)
     archive = Archive.open(tmp_path)
     assert len(archive.runs()) == 2
-    assert [finding.problem for finding in verify_archive(archive)] == [None] * (len(STAGES) + 2)
+    assert [finding.problem for finding in verify_everything(archive)] == [None] * (len(STAGES) + 2)
     cleared = ("spool/*", "stages/capture/*/*.zarr", "stages/rectify/*/*")  # raw lines, mosaic of the first pass
     assert {path.name for some in cleared for path in tmp_path.glob(some)} == {"manifest.json"}
 

@@ -26,7 +26,7 @@ from pipeline.rig.transports import DeviceGone
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import open_raw_cube
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET
 
 FAKE = {"rig.mirror_driver": "fake", "rig.camera_driver": "fake"}
@@ -144,7 +144,7 @@ def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, watch:
     assert watch.coarse == 3
     run_survey(replace(settings, rig=replace(settings.rig, mirror_axes="-x,-y")), QUIET)  # another mounting
     assert watch.coarse == 4
-    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
+    assert {finding.kind for finding in verify_everything(Archive.open(tmp_path))} == {"whole"}
 
 
 def test_a_rig_on_hardware_is_for_one_survey(tmp_path: Path) -> None:

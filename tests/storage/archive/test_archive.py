@@ -24,7 +24,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json, stage_key
 from storage.archive.manifests import check_files, read_table
 from storage.archive.staging import take_lock
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -145,7 +145,7 @@ def test_open_refuses_paths_that_are_no_archive(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     for name, create, words in (
         ("file", True, "is a file, expected a folder"),
-        ("file/archive", True, "Not a directory; choose another folder, or SPECTRALZOOM_WORK for"),
+        ("file/archive", True, "Not a directory; choose another folder"),
         ("none", False, "is not there"),
         ("folder", False, "no archive"),
     ):
@@ -217,7 +217,7 @@ def test_a_run_appears_with_all_its_files(archive: Archive) -> None:
     assert folder.name == run.id
     assert "field-7-north" in run.id
     assert json.loads((folder / "receipt.json").read_text()) == {"survey": "north"}
-    assert [(finding.uri, finding.problem) for finding in verify_archive(archive)] == [(f"runs/{run.id}", None)]
+    assert [(finding.uri, finding.problem) for finding in verify_everything(archive)] == [(f"runs/{run.id}", None)]
 
 
 def test_a_failed_run_leaves_nothing_and_a_live_one_is_kept(tmp_path: Path, archive: Archive) -> None:

@@ -13,7 +13,7 @@ from storage.archive import lineage
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.records import Run
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.storage.small_archive import flip, rewrite, small_survey
 
 
@@ -45,7 +45,7 @@ def test_an_invalid_manifest_is_reported_as_damaged(tmp_path: Path, archive: Arc
     catalogue = lineage.Catalogue.read(tmp_path)
     assert catalogue.stores[small.mosaic.uri].problem.startswith("manifest.json is damaged")
     assert catalogue.inputs_of(small.mosaic.uri) == []
-    assert [one.uri for one in verify_archive(archive) if one.problem is not None] == [small.mosaic.uri]
+    assert [one.uri for one in verify_everything(archive) if one.problem is not None] == [small.mosaic.uri]
 
 
 @pytest.mark.parametrize("inputs", [7, "abc", [3, None], {"a": 5}, ["nowhere", "stages/rectify/nowhere"]])
@@ -54,7 +54,7 @@ def test_malformed_inputs_of_a_manifest_are_tolerated(tmp_path: Path, archive: A
     small = small_survey(archive)
     rewrite(small.map.path / "manifest.json", **{"inputs": inputs, "params": 3, "created": None, "libraries": []})
     assert isinstance(lineage.Catalogue.read(tmp_path).inputs_of(small.map.uri), list)
-    assert all(isinstance(one.uri, str) for one in verify_archive(archive))
+    assert all(isinstance(one.uri, str) for one in verify_everything(archive))
 
 
 def test_raw_lines_of_unknown_origin_are_the_only_copy(tmp_path: Path, archive: Archive) -> None:

@@ -15,7 +15,6 @@ from storage.archive.archive import Archive
 from storage.archive.staging import PART_SUFFIX
 from storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import problems, small_survey
-from tests.storage.small_bucket import FIRST, Machine
 
 ROOT = Path(__file__).parents[3]
 KILL_EVERYWHERE = """
@@ -96,13 +95,3 @@ def test_a_run_is_whole_or_absent_when_killed_at_any_system_call(archive: Archiv
         opened.reclaim()
         assert not [*out.rglob(f"*{PART_SUFFIX}")]
     assert seen == {0, 1}
-
-
-def test_a_damaged_manifest_in_the_bucket_is_not_fetched(machine: Machine) -> None:
-    """It is reported and does not replace the copy."""
-    archive = machine(FIRST)
-    name = f"runs/{small_survey(archive).run.name}/manifest.json"
-    archive.objects.write(name, (archive.objects.read(name) or b"").replace(b'"survey": "farm"', b'"survey": "fern"'))
-    again = machine(FIRST, create=False)
-    assert len(again.runs()) == 1
-    assert any("its seal does not fit" in one for one in problems(again))

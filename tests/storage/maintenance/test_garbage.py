@@ -9,7 +9,7 @@ import pytest
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import IN_USE, Clearance, Removal, clear_up, plan_clearance
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.storage.small_archive import flip, grow_old, make_store, problems, small_survey
 
 
@@ -190,7 +190,7 @@ def test_a_negative_age_is_refused(tmp_path: Path) -> None:
 
 def remove_damaged(archive: Archive, *, raw_too: bool = False, dry_run: bool = False) -> Clearance:
     """Verify an archive, and remove what is damaged."""
-    return clear_up(archive, raw_too=raw_too, damaged=verify_archive(archive), dry_run=dry_run)
+    return clear_up(archive, raw_too=raw_too, damaged=verify_everything(archive), dry_run=dry_run)
 
 
 def test_a_damaged_store_goes_with_what_was_made_of_it(archive: Archive) -> None:

@@ -13,7 +13,7 @@ from pipeline.errors import IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
-from storage.remote.opening import verify_archive
+from storage.maintenance.verification import verify_everything
 from tests.storage.small_archive import flip, small_survey
 
 
@@ -31,7 +31,7 @@ def _with_cube(archive: Archive) -> StageRef:
 
 def _found(archive: Archive) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for one in verify_archive(archive):
+    for one in verify_everything(archive):
         if one.problem is not None:
             found.setdefault(one.uri, []).append(one.problem)
     return found
@@ -101,7 +101,7 @@ def test_verify_reports_a_missing_store_once(archive: Archive) -> None:
     small_survey(archive)
     for ref in (small.mosaic, other.mosaic):
         archive.discard(ref)
-    gone = [one for one in verify_archive(archive) if one.kind == "missing"]
+    gone = [one for one in verify_everything(archive) if one.kind == "missing"]
     assert [one.uri for one in gone] == [small.mosaic.uri, other.mosaic.key]
     assert f"is not there, but {other.map.uri} was made of it" in str(gone[1].problem)
 
@@ -111,7 +111,7 @@ def test_a_store_removed_during_verify_is_not_damage(archive: Archive) -> None:
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
     def clear(ref: StageRef) -> list[str]:
-        return [one.uri for one in verify_archive(archive, lambda *_: archive.discard(ref) and None) if one.problem]
+        return [one.uri for one in verify_everything(archive, lambda *_: archive.discard(ref) and None) if one.problem]
 
     assert clear(other.map) == []
     assert clear(named.map) == [named.map.uri]

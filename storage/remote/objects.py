@@ -1,7 +1,7 @@
-"""Read, write, list and remove the objects of an archive in a bucket.
+"""Read, write and list the objects of an archive in a bucket.
 
 The environment has the access data, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION,
-AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies.
+AWS_ENDPOINT_URL.
 """
 
 from __future__ import annotations
@@ -11,16 +11,14 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
-from threading import Lock
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from storage.archive.staging import sync_path
 
 if TYPE_CHECKING:
     from obstore.store import S3Store
@@ -49,8 +47,6 @@ _MEANINGS = (  # parts of a store's answers: their meaning and what to do
         "it does not answer: check the network and AWS_ENDPOINT_URL",
     ),
 )
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 class UnreachableError(ArchiveError):
@@ -69,23 +65,6 @@ class ObjectPlace:
     def url(self) -> str:
         """The address that the user gives."""
         return f"s3://{self.bucket}/{self.prefix}" if self.prefix else f"s3://{self.bucket}"
-
-    def working_copy(self) -> Path:
-        """Return the folder of the archive's working copy on this machine; its last part is the archive's name."""
-        base = os.environ.get("SPECTRALZOOM_WORK")
-        if base is None:
-            base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
-            base = f"{base}/spectralzoom/s3"
-        mark = hashlib.sha256(f"{self.endpoint or ''} {self.url}".encode()).hexdigest()[:12]
-        return Path(base).expanduser().absolute() / mark / (self.prefix.rpartition("/")[2] or self.bucket)
-
-
-def is_remote(root: str | Path) -> bool:
-    """Return whether an archive's name is an address on S3 (SettingsError: it is an address of another kind)."""
-    found = _ADDRESS.fullmatch(str(root)) is not None
-    if "://" in str(root) and not found:
-        raise SettingsError(f"{str(root)!r} is not valid for an archive; expected a folder, or s3://bucket/prefix")
-    return found
 
 
 def parse_place(text: str | Path) -> ObjectPlace:
@@ -166,14 +145,6 @@ def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-@dataclass(frozen=True)
-class Listed:
-    """Size of one object, and when it ``changed`` by the store's clock."""
-
-    size: int
-    changed: datetime
-
-
 class Objects:
     """The objects of one place; names are relative to it.
 
@@ -183,25 +154,12 @@ class Objects:
     def __init__(self, place: ObjectPlace) -> None:
         self.place = place
         self.store = connect(place)
-        self.moved_bytes = 0  # of objects written and read; names, listings and headers do not count
-        self._counting = Lock()
-
-    def _count(self, size: int) -> None:
-        with self._counting:
-            self.moved_bytes += size
 
     def read(self, name: str) -> bytes | None:
         """Return the content of a small object; None without one."""
-        return None if (found := self.read_dated(name)) is None else found[0]
-
-    def read_dated(self, name: str) -> tuple[bytes, datetime] | None:
-        """Return the content of a small object and its time of writing by the store's clock; None without one."""
         with answers_of(self.place):
             try:
-                answer = self.store.get(name)
-                content = bytes(answer.bytes())
-                self._count(len(content))
-                return content, answer.meta["last_modified"]
+                return bytes(self.store.get(name).bytes())
             except FileNotFoundError as error:
                 if "NoSuchBucket" in str(error):
                     raise
@@ -216,70 +174,42 @@ class Objects:
                 self.store.put(name, content, mode="create", use_multipart=False)
             except AlreadyExistsError:
                 return False
-            finally:
-                self._count(len(content))
         return True
 
     def write(self, name: str, source: Path | bytes) -> None:
         """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
         with answers_of(self.place):
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
-        self._count(len(source) if isinstance(source, bytes) else source.stat().st_size)
 
-    def save(self, name: str, path: Path) -> str:
-        """Write an object into a new file and return its SHA-256 (FileNotFoundError: there is none)."""
+    def fetch(self, name: str, path: Path, sha256: str) -> None:
+        """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has another SHA-256."""
         digest = hashlib.sha256()
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as file, answers_of(self.place):
-            for block in self.store.get(name).stream(PART_BYTES):
-                self._count(len(block))
-                digest.update(block)
-                file.write(block)
-        return digest.hexdigest()
-
-    def fetch(self, name: str, path: Path, sha256: str, aside: Path) -> None:
-        """Fetch an object to ``path``, through the file ``aside``, if its SHA-256 matches.
-
-        Raises IncompleteStoreError: it is missing or has changed; ``path`` is not written.
-        """
-        advice = f"run again; if that does not help, run verify on {self.place.url}"
+        advice = "push it again from a machine that has it"
         try:
-            if self.save(name, aside) != sha256:
-                raise IncompleteStoreError(
-                    f"{self.place.url}/{name} has changed since it was published (its SHA-256 differs); {advice}"
-                )
-            sync_path(aside)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            aside.replace(path)
-            sync_path(path.parent)
+            with path.open("wb") as file, answers_of(self.place):
+                for block in self.store.get(name).stream(PART_BYTES):
+                    digest.update(block)
+                    file.write(block)
         except FileNotFoundError:
             raise IncompleteStoreError(f"{self.place.url}/{name} is missing; {advice}") from None
-        finally:
-            with suppress(OSError):
-                aside.unlink(missing_ok=True)
+        if digest.hexdigest() != sha256:
+            raise IncompleteStoreError(
+                f"{self.place.url}/{name} has changed since it was published (its SHA-256 differs); {advice}"
+            )
 
-    def children(self, folder: str) -> list[str]:
-        """Return the names of the folders in a folder."""
+    def listing(self) -> set[str]:
+        """Return the names of all objects."""
         with answers_of(self.place):
-            found = self.store.list_with_delimiter(folder)
-        return sorted(prefix.rstrip("/").rpartition("/")[2] for prefix in found["common_prefixes"])
+            return {one["path"] for batch in self.store.list(chunk_size=1000) for one in batch}
 
-    def listing(self, folder: str | None = None) -> dict[str, Listed]:
-        """Return every object below a folder, or below the prefix, by its name."""
-        found: dict[str, Listed] = {}
+    def remove(self, name: str) -> None:
+        """Remove one object."""
         with answers_of(self.place):
-            for batch in self.store.list(folder, chunk_size=1000):
-                found |= {one["path"]: Listed(one["size"], one["last_modified"]) for one in batch}
-        return found
-
-    def remove(self, names: Iterable[str]) -> None:
-        """Remove objects; missing ones are ignored."""
-        if waiting := list(names):
-            with answers_of(self.place), suppress(FileNotFoundError):
-                self.store.delete(waiting)
+            self.store.delete(name)
 
 
-def some_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Run ``work`` on a few items at a time and return the results in order; raise the first error."""
+def some_at_a_time(work: Callable[[str], None], names: Iterable[str]) -> None:
+    """Run ``work`` on a few names at a time; raise the first error."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        return list(pool.map(work, items))  # which, after an error, cancels what has not begun
+        list(pool.map(work, names))  # which, after an error, cancels what has not begun

@@ -1,0 +1,60 @@
+"""Copy an archive to a bucket and back: the verbs `push` and `pull`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+from rich.console import Console
+
+from flows.settings.flags import ArchiveName, AsJson
+from flows.terminal.figures import counted, format_bytes
+from flows.terminal.processes import DONE, PARTLY
+from flows.terminal.progress import StageProgress, put_out, stderr
+from storage.archive.archive import Archive
+from storage.remote import bucket
+from storage.remote.objects import Objects, parse_place
+
+BucketName = Annotated[str, Parameter(name="bucket", help="Address in a bucket: s3://bucket/prefix.")]
+
+
+def push(archive: ArchiveName, to: BucketName, *, as_json: AsJson = False) -> int:
+    """Copy the stores and runs of an archive that a bucket lacks into it."""
+    opened, objects = Archive.open(archive, create=False), Objects(parse_place(to))
+    with StageProgress(stderr, {"push": "sending"}) as bars:
+        copied = bucket.push(opened, objects, lambda uri, part: bars.show("push", part, uri))
+    return _report(copied, as_json=as_json)
+
+
+def pull(source: BucketName, archive: ArchiveName, *, run: str | None = None, as_json: AsJson = False) -> int:
+    """Copy the stores and runs of a bucket that an archive lacks into it; create the archive if it is not there.
+
+    Parameters
+    ----------
+    run
+        Copy only this run (its name, or `latest`), with the stores that it names.
+    """
+    objects, opened = Objects(parse_place(source)), Archive.open(archive)
+    with StageProgress(stderr, {"pull": "fetching"}) as bars:
+        copied = bucket.pull(objects, opened, lambda uri, part: bars.show("pull", part, uri), run)
+    return _report(copied, as_json=as_json)
+
+
+def _report(copied: bucket.Copied, *, as_json: bool) -> int:
+    put_out(asdict(copied), show_copied, as_json=as_json)
+    return PARTLY if copied.conflicts else DONE
+
+
+def show_copied(content: Mapping[str, Any], console: Console) -> None:
+    """Print how many stores and runs were copied, and their size."""
+    runs = sum(uri.startswith("runs/") for uri in content["copied"])
+    stores = len(content["copied"]) - runs
+    console.print(
+        f"Copied {counted(stores, 'store')} and {counted(runs, 'run')} ({format_bytes(content['bytes'])}); "
+        f"{content['there']} were there.",
+        soft_wrap=True,
+    )
+    for uri in content["conflicts"]:
+        console.print(f"{uri} was not copied: the other side has another run of this name.", soft_wrap=True)

@@ -1,0 +1,165 @@
+"""Copy the stores and runs of an archive to a bucket, and back into a folder.
+
+Stores and runs never change, so a bucket is a copy. A store's or run's manifest has the same address in the bucket. Its
+files lie below ``<address>/<attempt>/``, where the attempt is the beginning of the SHA-256 of the manifest, so that two
+writers never mix their files. A conditional put of the manifest comes last: the first writer wins. Every file is
+compared with its hash before it is sent, and after it is fetched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import ArchiveError, IncompleteStoreError
+from storage.archive.archive import Archive
+from storage.archive.keys import in_text
+from storage.archive.manifests import CLEARED, as_table, check_files, is_cleared, parse_manifest
+from storage.archive.records import RESTS_ON
+from storage.archive.staging import MANIFEST_NAME, is_name
+from storage.remote.objects import Objects, some_at_a_time
+
+Report = Callable[[str, float], None]  # address, and the fraction that is done
+
+
+@dataclass(frozen=True)
+class Copied:
+    """Stores and runs that were copied, the bytes of their files, and those that were there before.
+
+    ``conflicts`` are runs that were not copied, since another run has their name.
+    """
+
+    copied: list[str]
+    bytes: int
+    there: int
+    conflicts: list[str]
+
+
+def push(archive: Archive, objects: Objects, report: Report) -> Copied:
+    """Send the stores and runs that the bucket lacks; stores come first, so that each run finds its own.
+
+    Raises UnreachableError: the bucket refuses or does not answer; IncompleteStoreError: a store or run is damaged;
+    ArchiveError: the bucket ignores conditional puts.
+    """
+    with archive.in_use():
+        here = [ref.uri for ref in archive.refs()] + [f"runs/{folder.name}" for folder in archive.runs()]
+        there = _published(objects.listing())
+        waiting = [uri for uri in here if uri not in there]
+        if waiting:
+            _check_conditional_puts(objects)
+        sent = 0
+        for number, uri in enumerate(waiting):
+            report(uri, number / len(waiting))
+            sent += _send(archive.root / uri, uri, objects)
+        return Copied(waiting, sent, len(here) - len(waiting), _conflicts(objects, archive, set(here) & set(there)))
+
+
+def pull(objects: Objects, archive: Archive, report: Report, run: str | None = None) -> Copied:
+    """Fetch the stores and runs that the archive lacks; with ``run`` this run alone, and the stores that it names.
+
+    Raises UnreachableError: the bucket refuses or does not answer; IncompleteStoreError: an object is missing or has
+    changed; ArchiveError: there is no archive or no such run in the bucket.
+    """
+    listed = objects.listing()
+    there = _published(listed)
+    if not there:
+        raise ArchiveError(f"{objects.place.url} has no archive: check the address, or push one")
+    with archive.in_use():
+        wanted = sorted(there, key=lambda uri: (not uri.startswith("stages/"), uri))  # stores before runs
+        if run is not None:
+            wanted = _of_run(objects, run, there)
+        waiting = [uri for uri in wanted if not (archive.root / uri).exists()]
+        fetched = 0
+        for number, uri in enumerate(waiting):
+            report(uri, number / len(waiting))
+            fetched += _fetch(uri, objects, archive, listed)
+        known = set(wanted) - set(waiting)
+        return Copied(waiting, fetched, len(known), _conflicts(objects, archive, known))
+
+
+def _send(folder: Path, uri: str, objects: Objects) -> int:
+    """Send one store or run, its manifest last; return the bytes of its files."""
+    check_files(folder, hashes=True)
+    text = (folder / MANIFEST_NAME).read_bytes()
+    place = _files_at(uri, text)
+    names: list[str] = [] if is_cleared(folder) else [*_manifest(uri, text)["files"]]
+    if is_cleared(folder):
+        objects.write(f"{place}/{CLEARED}", b"")
+    some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), names)
+    objects.create(f"{uri}/{MANIFEST_NAME}", text)  # else another writer was first: its store is as good
+    return sum((folder / name).stat().st_size for name in names)
+
+
+def _fetch(uri: str, objects: Objects, archive: Archive, listed: Collection[str]) -> int:
+    """Fetch one store or run into the archive; return the bytes of its files."""
+    text = objects.read(f"{uri}/{MANIFEST_NAME}")
+    if text is None:  # another machine has removed it meanwhile
+        return 0
+    place = _files_at(uri, text)
+    files = _manifest(f"{objects.place.url}/{uri}", text)["files"]
+    with archive.adopt(uri) as part:
+        if part is None:  # another process has fetched or made it
+            return 0
+        (part / MANIFEST_NAME).write_bytes(text)
+        if f"{place}/{CLEARED}" in listed:
+            (part / CLEARED).touch()
+            return 0
+        some_at_a_time(lambda name: objects.fetch(f"{place}/{name}", part / name, files[name]["sha256"]), files)
+    return sum(entry["size"] for entry in files.values())
+
+
+def _of_run(objects: Objects, run: str, there: Collection[str]) -> list[str]:
+    """Return the addresses of the stores that a run names, and of the run."""
+    runs = sorted(uri for uri in there if uri.startswith("runs/"))
+    uri = runs[-1] if run == "latest" and runs else f"runs/{run.removeprefix('runs/')}"
+    text = objects.read(f"{uri}/{MANIFEST_NAME}") if uri in there else None
+    if text is None:
+        known = ", ".join(name.removeprefix("runs/") for name in runs[-5:]) or "none"
+        raise ArchiveError(f"{objects.place.url} has no run {run!r}; its latest are {known}")
+    return [*sorted(as_table(_manifest(uri, text).get(RESTS_ON)).keys() & set(there)), uri]
+
+
+def _conflicts(objects: Objects, archive: Archive, both: Iterable[str]) -> list[str]:
+    """Return the runs of two machines that have one name."""
+    runs = sorted(uri for uri in both if uri.startswith("runs/"))
+    texts = ((uri, (archive.root / uri / MANIFEST_NAME).read_bytes()) for uri in runs)
+    return [uri for uri, text in texts if objects.read(f"{uri}/{MANIFEST_NAME}") != text]
+
+
+def _published(listed: Collection[str]) -> list[str]:
+    """Return the addresses of stores and runs that have a manifest in the bucket."""
+    ends = (name.removesuffix(f"/{MANIFEST_NAME}") for name in listed if name.endswith(f"/{MANIFEST_NAME}"))
+    return [uri for uri in ends if _is_address(uri)]
+
+
+def _is_address(uri: str) -> bool:
+    return in_text(uri) == uri or (uri.startswith("runs/") and is_name(uri.removeprefix("runs/")))
+
+
+def _files_at(uri: str, manifest: bytes) -> str:
+    """Return the address of the files that a manifest lists."""
+    return f"{uri}/{hashlib.sha256(manifest).hexdigest()[:16]}"
+
+
+def _manifest(place: str, text: bytes) -> dict[str, Any]:
+    """Return the content of a manifest. Raises IncompleteStoreError: it is damaged."""
+    content, problem = parse_manifest(text)
+    if problem is not None:
+        raise IncompleteStoreError(f"{place}/{MANIFEST_NAME} is damaged: {problem}")
+    return content
+
+
+def _check_conditional_puts(objects: Objects) -> None:
+    """Check that a second conditional put of one name is refused."""
+    name = f".probe-{secrets.token_hex(8)}"
+    written = objects.create(name, b""), objects.create(name, b"")
+    objects.remove(name)
+    if written != (True, False):
+        raise ArchiveError(
+            f"{objects.place.url}: this store ignores conditional puts (If-None-Match), without which two machines "
+            "would overwrite each other; use one that has them"
+        )
