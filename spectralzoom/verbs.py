@@ -57,6 +57,8 @@ def survey(settings: Asked = None, *, progress: Listener | None = None, quiet: b
     ------
     Error
         The survey failed; captured lines are kept.
+    SurveyStopped
+        The keyword ``until`` stops the survey before its class map; ``uri`` names the store.
     """
     asked = _settings(settings, flags)
     with _working(progress, quiet=quiet) as console:

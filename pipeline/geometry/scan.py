@@ -206,11 +206,10 @@ class Load:
         return self.parts[-1].pairs[1]
 
 
-def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int, *, lead: int = 0) -> list[Load]:
+def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
     """Lay the positions of sweeps into a memory of ``vector_pairs`` pairs, each load as full as whole lines allow.
 
-    A load takes the rest of one sweep and begins the next; the positions of one line stay in one load. ``lead`` pairs
-    of each load are not for positions.
+    A load takes the rest of one sweep and begins the next; the positions of one line stay in one load.
 
     Raises SettingsError: the positions of one line do not fit the memory.
     """
@@ -218,14 +217,14 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int, *, lead: int = 0) -
     parts: list[MemoryPart] = []
     used = 0
     for number, sweep in enumerate(sweeps):
-        if sweep.positions > vector_pairs - lead:
+        if sweep.positions > vector_pairs:
             raise SettingsError(
                 f"sweep {sweep.name} holds {sweep.positions} positions in each line, the mirror's vector memory "
-                f"{vector_pairs} pairs; give cost.vector_pairs of at least {sweep.positions + lead}"
+                f"{vector_pairs} pairs; give cost.vector_pairs of at least {sweep.positions}"
             )
         line = 0
         while line < sweep.lines:
-            room = (vector_pairs - lead - used) // sweep.positions
+            room = (vector_pairs - used) // sweep.positions
             if room == 0:
                 loads.append(Load(tuple(parts)))
                 parts = []

@@ -27,7 +27,6 @@ from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
     Clock,
-    Closing,
     DeadlinePassed,
     DeviceRefused,
     Kind,
@@ -197,7 +196,7 @@ def _run_values(run: int) -> dict[int, pro.Value]:
     return {channel.vector(pro.VectorRegister.RUN): run for channel in (pro.X, pro.Y)}
 
 
-class MirrorController(Closing):
+class MirrorController:
     """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
 
     Motions (goto, run) are sent once. One that is not acknowledged raises StateUnknown, and so does every later motion

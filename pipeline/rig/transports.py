@@ -7,11 +7,10 @@ import math
 import socket
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Literal, Protocol, Self, TypeVar
+from typing import Literal, Protocol, TypeVar
 
 import serial
 from serial.tools import list_ports
@@ -45,20 +44,6 @@ class SystemClock:
 SYSTEM_CLOCK = SystemClock()
 
 
-class Closing(ABC):
-    """A context that ends with :meth:`close`."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    @abstractmethod
-    def close(self) -> None:
-        """Release all resources."""
-
-
 class DeviceGone(RigError):  # noqa: N818 - the name states the case
     """A device is not there, or went away."""
 
@@ -87,7 +72,6 @@ _SLICE_S = 0.02  # reads wait in slices, so a deadline may be exceeded by one
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
 _MOST_DRAINED = 1 << 20  # bytes
 LOG = logging.getLogger(__name__)
-BITS_PER_BYTE = 10  # a start bit, eight of data, a stop bit
 
 Kind = Literal["read", "write", "motion"]
 Answer = TypeVar("Answer")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -150,7 +151,7 @@ def test_opening_connects_or_releases_the_port(monkeypatch: pytest.MonkeyPatch):
     silent = (b"START\r\n", b"")
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
-        with open_mirror(SETTINGS, 1500, transport.clock) as mirror:
+        with closing(open_mirror(SETTINGS, 1500, transport.clock)) as mirror:
             assert mirror.identity.device == "MR-E-2"
         assert transport.closed
     with scripted([*[silent] * 3, (w.LEAVE[0], b""), *[silent] * 3]) as transport:

@@ -15,7 +15,7 @@ from pipeline.rig.device_settings import Patience
 from pipeline.rig.fakes import FakeClock
 from pipeline.rig.mirror_controller import ProLink, frames_to_check, upload
 from pipeline.rig.pro_mode import Command, Frame, FrameReader, encode
-from pipeline.rig.transports import BITS_PER_BYTE, DeadlinePassed, Wire
+from pipeline.rig.transports import DeadlinePassed, Wire
 
 
 @given(st.floats(0, 1), st.floats(-7, 7))
@@ -157,6 +157,6 @@ def test_an_upload_takes_the_wire_time():
     """
     memory = Memory()
     upload(link(memory), path(1500))
-    plain_s, wire_s = 300 * (52 + 7) * 10 / BAUD, memory.passed * BITS_PER_BYTE / BAUD
+    plain_s, wire_s = 300 * (52 + 7) * 10 / BAUD, memory.passed * 10 / BAUD
     assert wire_s == pytest.approx(plain_s * 1.11, rel=0.02)
     assert memory.clock.now() == pytest.approx(wire_s)
