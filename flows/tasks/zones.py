@@ -16,10 +16,10 @@ from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, Place
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.ground.zones import Mask, extent_deg, on_field, patch_means, pixels_inside
-from pipeline.lazy import BaseGeometry, pyproj, shapely
+from pipeline.lazy import BaseGeometry, shapely
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import array_digest
-from storage.readers.polygons import ZoneFile, placed_on, read_zones
+from storage.readers.polygons import ZoneFile, place_on_earth, read_zones
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
         """Return the polygons of a file by name, in pixels of the field."""
         found = read_zones(source, named_by=named_by)
         notes.extend(found.notes)
-        on, crs = placed_on(place, found.crs, source, ZoneError)
-        shapes = {name: on_field(one, crs, on) for name, one in found.shapes.items()}
+        on = place_on_earth(place, source, ZoneError)
+        shapes = {name: on_field(one, found.crs, on) for name, one in found.shapes.items()}
         if not any(one.intersection(shapely.box(0, 0, *shape[::-1])).area > 0 for one in shapes.values()):
-            raise ZoneError(_format_beside(found, crs, on))
+            raise ZoneError(_format_beside(found, on))
         return shapes
 
     area = None if files.area is None else tuple(read(files.area).values())
@@ -93,9 +93,9 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
     return SurveyZones(place, grid, None if inside is None or inside.all() else inside, plots, tuple(notes))
 
 
-def _format_beside(found: ZoneFile, crs: pyproj.CRS, place: GroundPlace) -> str:
+def _format_beside(found: ZoneFile, place: GroundPlace) -> str:
     """Return a message on polygons that do not overlap the field, with the bounds of both."""
-    each = [extent_deg(one, crs) for one in found.shapes.values()]
+    each = [extent_deg(one, found.crs) for one in found.shapes.values()]
     low, high = np.min(each, axis=0).tolist(), np.max(each, axis=0).tolist()
     field = extent_deg(place.outline, place.crs)
     expected, got = (

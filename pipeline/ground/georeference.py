@@ -70,12 +70,6 @@ def pixel_side_m(geobox: GeoBox) -> float:
     return float(np.sqrt(abs(float(geobox.affine.determinant)) * _area(middle)))
 
 
-def is_in_metres(geobox: GeoBox) -> bool:
-    """Return whether a unit of the CRS is a metre on the ground within 1 %, in all directions at the middle pixel."""
-    middle = _metres_of_units(geobox, *np.divide(geobox.shape.xy, 2))
-    return bool(np.all(np.abs(np.linalg.svd(middle, compute_uv=False) - 1) < 0.01))
-
-
 def pixel_rows_m2(geobox: GeoBox) -> Iterator[Floats]:
     """Yield the ground area of the pixels of each row, (x,) [m2], from the first row down.
 

@@ -1,18 +1,14 @@
 """Read polygons from GeoJSON, GeoPackage and shapefile: zones with names, and labels burnt onto a scene's pixels.
 
-A pixel has the class of the last polygon in the file that contains its centre. On a scene with a place polygons are
-transformed from their CRS. On a scene without one they are in pixels, x to the right and y down from the upper left
-corner.
+A pixel has the class of the last polygon in the file that contains its centre.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +16,12 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError, SceneError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture
-from pipeline.ground.georeference import WGS84
 from pipeline.ground.zones import on_field
-from pipeline.lazy import BaseGeometry, GeoBox, pyogrio, pyproj, rasterio_features, shapely
+from pipeline.lazy import BaseGeometry, GeoBox, geopandas, pyogrio, pyproj, rasterio_features, shapely
 from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
-GEOJSON = (".geojson", ".json")
-ZONE_ENDINGS = (*GEOJSON, ".gpkg", ".shp")
+ZONE_ENDINGS = (".geojson", ".json", ".gpkg", ".shp")
 POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels; a .json file may hold anything
 USUAL_NAMES = ("name", "plot", "plot_name", "plot_id", "plotid", "id", "label")
 _OF_CROPS = ("crop", "crop_type", "species", "category", "land_cover", "landcover", "cover", "type", "code", "name")
@@ -36,22 +30,11 @@ POLYGONS = ("Polygon", "MultiPolygon")
 
 
 @dataclass(frozen=True)
-class PolygonLayer:
-    """Polygons of one layer, in its order, and their attributes."""
-
-    crs: pyproj.CRS | None  # None if the file names none
-    shapes: list[BaseGeometry]  # x before y, longitude before latitude
-    rows: list[int]  # of the polygons in the layer, from 0
-    fields: dict[str, NDArray[Any]]  # attributes by name, one value a polygon
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class ZoneFile:
     """Polygons of one file, united by name."""
 
     path: str
-    crs: pyproj.CRS | None  # None if the file names none
+    crs: pyproj.CRS
     shapes: dict[str, BaseGeometry]  # by name, in the order of the file; x before y, longitude before latitude
     notes: tuple[str, ...] = ()
 
@@ -61,17 +44,20 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
 
     None takes the first attribute of name, plot, plot_id, id and label, else numbers from 1. Polygons of one name are
     one zone. Invalid borders are repaired with a note. Raises ZoneError: there is no such file, layer or attribute, the
-    file cannot be read, or it has other shapes than polygons.
+    file cannot be read, has no CRS, or has other shapes than polygons.
     """
-    layer = read_polygons(source)
+    table, notes = read_polygons(source)
     shapes: dict[str, BaseGeometry] = {}
-    for name, shape in zip(_names(layer, named_by, source), layer.shapes, strict=True):
+    for name, shape in zip(_names(table, named_by, source), table.geometry, strict=True):
         shapes[name] = shape if name not in shapes else shapely.union(shapes[name], shape)
-    return ZoneFile(source, layer.crs, shapes, layer.notes)
+    return ZoneFile(source, table.crs, shapes, notes)
 
 
-def read_polygons(source: str) -> PolygonLayer:
-    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes, without empty ones (ZoneError)."""
+def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]:
+    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes, without empty ones; and notes.
+
+    GeoJSON without a CRS is WGS 84. The index has the rows of the layer, from 0. Raises ZoneError: as `read_zones`.
+    """
     path, layer = split_layer(source)
     if path.suffix.lower() not in ZONE_ENDINGS:
         raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
@@ -80,32 +66,26 @@ def read_polygons(source: str) -> PolygonLayer:
     try:
         if path.suffix.lower() == ".gpkg":
             layers = [str(one) for one in pyogrio.list_layers(path)[:, 0]]
-            if layer is None and len(layers) == 1:
-                layer = layers[0]
+            layer = layers[0] if layer is None and len(layers) == 1 else layer
             if layer not in layers:
                 asked = "has several layers" if layer is None else f"has no layer {layer!r}"
                 example = f"{path}:{layers[0] if layers else 'LAYER'}"
                 raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {example}")
-        about, _, found, values = pyogrio.raw.read(path, layer=layer)
-        known = about["crs"] is not None
-        if known and path.suffix.lower() in GEOJSON:  # GDAL assumes WGS 84
-            content = json.loads(path.read_text(encoding="utf-8-sig"))
-            known = isinstance(content, dict) and content.get("crs") is not None
-        crs = pyproj.CRS.from_user_input(about["crs"]) if known else None
-        geometry = [None if one is None else shapely.from_wkb(one) for one in (() if found is None else found)]
+        table = geopandas.GeoDataFrame(geopandas.read_file(path, layer=layer))
     except (OSError, ValueError, RuntimeError, pyproj.exceptions.CRSError, shapely.errors.GEOSException) as error:
         raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None
-    rows = [number for number, one in enumerate(geometry) if one is not None and not one.is_empty]
-    kinds = Counter(one.geom_type for one in geometry if one is not None and one.geom_type not in POLYGONS)
-    if kinds or not rows:
+    shapes = table.geometry if "geometry" in table else geopandas.GeoSeries()
+    table = table[~(shapes.isna() | shapes.is_empty)]
+    kinds = Counter(kind for kind in shapes[table.index].geom_type if kind not in POLYGONS)
+    if kinds or not len(table):
         came = " and ".join(f"{count} {kind}" for kind, count in kinds.items()) or "none"
         raise ZoneError(f"{source}: expected polygons, got {came}; draw areas, zones and plots as closed polygons")
-    shapes = [shapely.force_2d(geometry[number]) for number in rows]
-    crossed = sum(not shape.is_valid for shape in shapes)
-    shapes = [shape if shape.is_valid else polygons_of(shapely.make_valid(shape)) for shape in shapes]
-    note = f"{source}: the borders of {crossed} of {len(rows)} polygons cross or touch themselves and were repaired"
-    fields = {str(name): column[rows] for name, column in zip(about["fields"], values, strict=True)}
-    return PolygonLayer(crs, shapes, rows, fields, (note,) if crossed else ())
+    if table.crs is None:
+        raise ZoneError(f"{source} has no CRS; save it with one (a shapefile needs a .prj file)")
+    valid = table.geometry.is_valid
+    whole = [one if one.is_valid else polygons_of(shapely.make_valid(one)) for one in table.geometry.force_2d()]
+    crossed = f"{source}: the borders of {sum(~valid)} of {len(table)} polygons cross or touch themselves"
+    return table.set_geometry(whole, crs=table.crs), () if valid.all() else (f"{crossed} and were repaired",)
 
 
 def polygons_of(shape: BaseGeometry) -> BaseGeometry:
@@ -121,17 +101,23 @@ def split_layer(source: str | Path) -> tuple[Path, str | None]:
     return Path(f"{head}.gpkg" if mark else source), layer if mark else None
 
 
-def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:
+def _names(table: geopandas.GeoDataFrame, named_by: str | None, source: str) -> list[str]:
     """Return the name of each polygon."""
-    numbers = [str(row + 1) for row in content.rows]
-    by_word = {name.lower(): name for name in reversed(content.fields)}
-    if named_by is not None and named_by not in content.fields:
-        known = ", ".join(content.fields) or "no attribute"
+    numbers = [str(row + 1) for row in table.index]
+    fields = _fields(table)
+    by_word = {name.lower(): name for name in reversed(fields)}
+    if named_by is not None and named_by not in fields:
+        known = ", ".join(fields) or "no attribute"
         raise ZoneError(f"{source}: expected an attribute {named_by!r} to name plots by, got {known}")
     found = named_by or next((by_word[word] for word in USUAL_NAMES if word in by_word), None)
     if found is None:
         return numbers
-    return [word_of(value) or number for value, number in zip(content.fields[found], numbers, strict=True)]
+    return [word_of(value) or number for value, number in zip(table[found], numbers, strict=True)]
+
+
+def _fields(table: geopandas.GeoDataFrame) -> list[str]:
+    """Return the names of the attributes."""
+    return [str(name) for name in table.columns if name != table.geometry.name]
 
 
 def word_of(value: object) -> str:
@@ -157,8 +143,8 @@ def load_polygon_labels(
     the file, layer, attribute or a CRS is missing, no polygon lies on the scene, or one has a class that the settings
     lack.
     """
-    layer = _labels_in(address)
-    attribute, names = _classes_in(layer, address, settings)
+    table, repaired = _labels_in(address)
+    attribute, names = _classes_in(table, address, settings)
     classes = dict(settings.classes) or _named(names, settings.unlabelled, str(address))
     codes = [_index_of(name, classes, settings.unlabelled) for name in names]
     if unknown := [name for name, code in zip(names, codes, strict=True) if code is None and name]:
@@ -166,7 +152,7 @@ def load_polygon_labels(
             f"labels {address} have {unknown.count(unknown[0])} polygons of {attribute} = {unknown[0]!r}, which is no"
             f" class; add it to [classes] or state it as unlabelled in {SETTINGS_NAME}"
         )
-    moved = _moved(layer, NoPlace(shape) if geobox is None else PlacedPicture(geobox), address)
+    moved = _moved(table, NoPlace(shape) if geobox is None else PlacedPicture(geobox), address)
     burnt = [
         (one, code)
         for one, code in zip(moved, codes, strict=True)
@@ -182,7 +168,7 @@ def load_polygon_labels(
     lacking = names.count("")
     notes = (
         f"{len(burnt)} polygons by their attribute {attribute}",
-        *layer.notes,
+        *repaired,
         *([f"{lacking} polygons without a value of {attribute} are left out"] if lacking else []),
         *([f"{shared} px lie in polygons of several classes: the later polygon counts"] if shared else []),
     )
@@ -191,30 +177,31 @@ def load_polygon_labels(
 
 def polygon_classes(addresses: Iterable[str | Path], settings: SceneSettings) -> dict[str, ClassValue]:
     """Return every class of several files of polygons (SceneError, also for more than 64 classes)."""
-    names = [name for one in addresses for name in _classes_in(_labels_in(one), one, settings)[1]]
+    names = [name for one in addresses for name in _classes_in(_labels_in(one)[0], one, settings)[1]]
     return _named(names, settings.unlabelled, "of several files")
 
 
-def _labels_in(address: str | Path) -> PolygonLayer:
+def _labels_in(address: str | Path) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]:
     try:
         return read_polygons(str(address))
     except ZoneError as error:
         raise SceneError(f"labels: {error}") from error
 
 
-def _classes_in(layer: PolygonLayer, address: str | Path, settings: SceneSettings) -> tuple[str, list[str]]:
+def _classes_in(table: geopandas.GeoDataFrame, address: str | Path, settings: SceneSettings) -> tuple[str, list[str]]:
     """Return the class attribute and each polygon's value of it, empty without one."""
-    by_word = {name.lower(): name for name in reversed(layer.fields)}
+    fields = _fields(table)
+    by_word = {name.lower(): name for name in reversed(fields)}
     stated = settings.class_attribute
     found = next((by_word[word] for word in CLASS_ATTRIBUTES if word in by_word), None) if stated is None else stated
-    if found is None or found not in layer.fields:
+    if found is None or found not in fields:
         wanted = "an attribute that says the class" if stated is None else f"the attribute {stated!r}"
-        known = ", ".join(layer.fields) or "no attribute"
+        known = ", ".join(fields) or "no attribute"
         raise SceneError(
             f'labels {address} lack {wanted}; they have {known}; write class_attribute = "..." into a'
             f" {SETTINGS_NAME} beside the scene"
         )
-    return found, [word_of(value) for value in layer.fields[found]]
+    return found, [word_of(value) for value in table[found]]
 
 
 def _named(names: Iterable[str], unlabelled: ClassValue | None, where: str) -> dict[str, ClassValue]:
@@ -242,41 +229,30 @@ def _index_of(word: str, classes: dict[str, ClassValue], unlabelled: ClassValue 
     return values.index(int(word)) if word.isdecimal() and int(word) in values else None
 
 
-def placed_on(
-    place: FieldPlace, crs: pyproj.CRS | None, address: str | Path, error: type[PipelineError]
-) -> tuple[GroundPlace, pyproj.CRS]:
-    """Return the place of a field, and the CRS of polygons on it: WGS 84 for GeoJSON without one.
-
-    Raises ``error``: the field has no place on the earth, or another format than GeoJSON has no CRS.
-    """
+def place_on_earth(place: FieldPlace, address: str | Path, error: type[PipelineError]) -> GroundPlace:
+    """Return the place of a field with polygons (``error``: it has none on the earth)."""
     if isinstance(place, NoPlace):
         raise error(
             f"{address} has polygons, and this field has no georeference: give the rig's [pose], or a scene with a CRS"
             " and a transform (gdal_translate -a_srs -a_ullr)"
         )
-    if crs is not None:
-        return place, crs
-    if split_layer(address)[0].suffix.lower() not in GEOJSON:
-        raise error(f"{address} has no CRS; save it with one (a shapefile needs a .prj file)")
-    return place, pyproj.CRS.from_epsg(WGS84)
+    return place
 
 
-def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
+def _moved(table: geopandas.GeoDataFrame, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
     """Return the polygons in pixels of the scene, clipped to it.
 
-    Raises SceneError: none lies on the scene, or the scene or the polygons have no georeference.
+    Raises SceneError: none lies on the scene, or the scene has no georeference.
     """
-    on, crs = placed_on(place, layer.crs, address, SceneError)
-    moved = [polygons_of(on_field(shape, crs, on)) for shape in layer.shapes]
+    on = place_on_earth(place, address, SceneError)
+    moved = [polygons_of(on_field(shape, table.crs, on)) for shape in table.geometry]
     height, width = on.shape
     if all(one.is_empty or not one.intersects(shapely.box(0, 0, width, height)) for one in moved):
-        given = np.array([shape.bounds for shape in layer.shapes])
-        west, south = given[:, :2].min(axis=0)
-        east, north = given[:, 2:].max(axis=0)
+        west, south, east, north = table.total_bounds
         raise SceneError(
             f"labels {address} do not lie on the scene: all polygons are within x {west:g} to {east:g}, y {south:g} to"
-            f" {north:g} in {crs.name}, off its {height} x {width} px (y x x); are they of this scene, and is their CRS"
-            " right?"
+            f" {north:g} in {table.crs.name}, off its {height} x {width} px (y x x); are they of this scene, and is"
+            " their CRS right?"
         )
     return moved
 

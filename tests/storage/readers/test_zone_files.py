@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -65,14 +63,15 @@ def test_plots_are_named_by_an_attribute(tmp_path: Path) -> None:
         read_zones(path, named_by="variety")
 
 
-def test_files_without_a_crs_have_none(tmp_path: Path) -> None:
-    """For GeoJSON without a CRS and a shapefile without .prj, the survey decides which CRS is meant."""
+def test_only_geojson_may_lack_a_crs(tmp_path: Path) -> None:
+    """It is WGS 84 then; a shapefile without .prj is refused."""
     bare = {"type": "Feature", "properties": {}, "geometry": SQUARE.__geo_interface__}
     (tmp_path / "z.geojson").write_text("\ufeff" + json.dumps(bare), encoding="utf-8")
-    assert read_zones(str(tmp_path / "z.geojson")).crs is None
+    assert read_zones(str(tmp_path / "z.geojson")).crs.to_epsg() == 4326
     path = written(tmp_path / "z.shp", [SQUARE])
     (tmp_path / "z.prj").unlink()
-    assert read_zones(path).crs is None
+    with pytest.raises(ZoneError, match="has no CRS; save it with one"):
+        read_zones(path)
 
 
 @pytest.mark.parametrize(
@@ -93,12 +92,3 @@ def test_files_without_polygons_are_refused(name: str, content: str | None, word
         (tmp_path / name).write_text(content)
     with pytest.raises(ZoneError, match=words):
         read_zones(str(tmp_path / name))
-
-
-def test_a_ring_that_does_not_close_raises_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A corner of NaN is not equal to itself."""
-    ring = struct.pack("<BIII8d", 1, 3, 1, 4, *(math.nan, 1), *(5, 5), *(9, 1), *(math.nan, 1))
-    path = written(tmp_path / "z.geojson", [SQUARE])
-    monkeypatch.setattr("pyogrio.raw.read", lambda path, layer: ({"crs": None, "fields": []}, None, [ring], []))
-    with pytest.raises(ZoneError, match=r"cannot read .*z.geojson as polygons: .* closed .*; save it anew"):
-        read_zones(path)
