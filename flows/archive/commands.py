@@ -207,8 +207,6 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
     store = catalogue.stores.get(uri)
     if store is None:
         return {"uri": uri, "problem": "is not there", "inputs": []}
-    made = (row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key)
-    ran = next((row for row in made if row.get("state") == "ran"), {})
     node = {
         "uri": uri,
         "stage": store.ref.stage,
@@ -218,7 +216,6 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
         "called": sorted(catalogue.roles(uri)),
         "created": store.created,
         "bytes": store.size,
-        **{name: known_number(ran.get(name)) for name in ("wall_s", "cpu_s")},
         "problem": store.problem,
         "inputs": [],
     }
@@ -372,10 +369,9 @@ def _format_node(node: Mapping[str, Any]) -> str:
         return f"{name} [bold red]damaged: {escape(node['problem'])}[/]"
     if "see" in node:
         return f"{name} [dim]{node['see']}[/]"
-    took = "" if node["wall_s"] is None else f", took {format_seconds(node['wall_s'])}"
     when = escape(node["created"][:16].replace("T", " ")) or DASH
     size = "cleared away, made again if needed" if node["cleared"] else format_bytes(node["bytes"])
-    return f"{name} version {escape(node['version'])}, {when}, {size}{took}"
+    return f"{name} version {escape(node['version'])}, {when}, {size}"
 
 
 def show_verdict(content: dict[str, Any], console: Console) -> None:

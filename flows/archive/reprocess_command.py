@@ -273,5 +273,4 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     weights = None
     with suppress(OSError, PipelineError):  # they cannot be read
         weights = describe_weights(weights_path(settings)).key
-    complete = run.problem is None and all(row.get("state") != "failed" for row in run.stages)
-    return complete and not stale_stores(catalogue, set(run.names), weights)
+    return run.problem is None and not stale_stores(catalogue, set(run.names), weights)

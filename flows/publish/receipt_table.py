@@ -157,7 +157,6 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     stages = [
         [escape(one["name"]), one["state"], format_seconds(one["wall_s"]), format_bytes(one["bytes_out"])]
         for one in receipt["stages"]
-        if one["state"] != "skipped"
     ]
     console.print(table(("stage", "state", "wall time", "written"), stages, left=2))
     if "effects_total" in receipt:

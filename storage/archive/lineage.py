@@ -108,9 +108,9 @@ class Catalogue:
         """Return all stores that were made of these, directly or not, without themselves."""
         given = set(uris)
         found = set(given)
-        for uri in self.inputs_first(self.stores):
-            if not found.isdisjoint(self.inputs_of(uri)):
-                found.add(uri)
+        inputs = {uri: self.inputs_of(uri) for uri in self.stores}
+        while new := {uri for uri in inputs.keys() - found if not found.isdisjoint(inputs[uri])}:
+            found |= new
         return found - given
 
     def is_only_copy(self, uri: str) -> bool:

@@ -43,7 +43,7 @@ class StageRecord:
 
     name: str
     key: str
-    state: Literal["ran", "cached", "skipped", "failed"]
+    state: Literal["ran", "cached"]
     wall_s: float | None = None
     cpu_s: float | None = None
     peak_rss_bytes: int | None = None
