@@ -76,7 +76,7 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
     lines = f"line at {receipt['settings']['camera']['exposure_ms']:g} ms, stored as captured" if capture else "pixel"
     words = f"Reference: every {lines}, read by the full network."
     if receipt["data_bytes"]["reference"] < receipt["data_bytes"]["kept"] < SMALL_RUN:
-        words += " Bytes kept exceed it: report, pictures and records take 0.5 MB or more, however small the field is."
+        words += " Bytes kept exceed it: records of the stores take 0.2 MB or more, however small the field is."
     names = [stage["name"] for stage in receipt["stages"]]
     if "capture_fine" in names:
         between = receipt["stages"][names.index("capture_coarse") + 1 : names.index("capture_fine")]

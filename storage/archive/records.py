@@ -72,11 +72,6 @@ class Store:
         return as_table(self.facts.get("params"))
 
     @property
-    def libraries(self) -> dict[str, Any]:
-        """Libraries that it was made with, and their versions."""
-        return as_table(self.facts.get("libraries"))
-
-    @property
     def inputs(self) -> list[str]:
         """Keys of the stores that it was made of, in order."""
         inputs = self.facts.get("inputs")

@@ -159,7 +159,7 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     assert len(archive.runs()) == 2
     assert [finding.problem for finding in verify_everything(archive)] == [None] * (len(STAGES) + 2)
     cleared = ("spool/*", "stages/capture/*/*.zarr", "stages/rectify/*/*")  # raw lines, mosaic of the first pass
-    assert {path.name for some in cleared for path in tmp_path.glob(some)} == {"manifest.json"}
+    assert {path.name for some in cleared for path in tmp_path.glob(some)} == {"manifest.json", "cleared"}
 
 
 def test_a_first_mosaic_of_another_run_is_kept(survey_png: Any, tmp_path: Path) -> None:
