@@ -164,12 +164,9 @@ class Archive:
                 if not done:
                     consolidate_stores(part)
                     write_manifest(part, facts)
-                    self._put_in_place(part, final)
+                    (refill if final.exists() else rename_into_place)(part, final)  # there where it was cleared
             finally:
                 remove_tree(part)
-
-    def _put_in_place(self, part: Path, final: Path) -> None:
-        (refill if final.exists() else rename_into_place)(part, final)  # there where its files were cleared
 
     def produce(
         self,
@@ -199,8 +196,7 @@ class Archive:
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """Return the SHA-256 of the manifests of stores and all their inputs, and so of every byte, by address."""
-        plain = [store_at(self.root, ref.stage, ref.key) for ref in refs]
-        return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, plain)}
+        return {ref.uri: manifest_sha256(ref.path) for ref in rests_on(self.root, refs)}
 
     def refs(self, stage: str | None = None) -> list[StageRef]:
         """Return every published store (of one stage), by stage and key."""

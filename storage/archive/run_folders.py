@@ -17,7 +17,6 @@ class RunDraft:
     def __init__(self, run_id: str, folder: Path, root: Path, release: Callable[[], None]) -> None:
         self.id = run_id
         self.folder = folder
-        self.send: Callable[[str], None] | None = None  # called with the address of the published run
         self._root = root
         self._release = release
         self._done = False
@@ -59,8 +58,6 @@ class RunDraft:
             write_manifest(self.folder, {"run": self.id, "rests_on": dict(rests_on or {}), **plain(facts)})
             rename_into_place(self.folder, final)
         self._done = True
-        if self.send is not None:
-            self.send(f"runs/{self.id}")
         self._release()
         return final
 
