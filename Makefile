@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, survey-rig, test, lint, docs, notebooks, bench, paper, faults, soak, lock.
+# SpectralZoom: setup, survey, survey-rig, test, lint, docs, notebooks, bench, paper, faults, defects, soak, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check 
 # Ask the tools to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey survey-rig test lint docs notebooks bench paper faults soak lock
+.PHONY: setup survey survey-rig test lint docs notebooks bench paper faults defects soak lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -83,6 +83,13 @@ FAULTS ?=
 # `make test` runs a quick part of each.
 faults: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults $(FAULTS)
+
+DEFECTS ?=
+
+# Applies sixty seeded defects to copies of the source, one at a time, and prints the share that a test catches
+# (DEFECTS="--only archive" selects some). Twenty minutes.
+defects: $(BIN)/.ok-dev
+	$(BIN)/python tests/defects $(DEFECTS)
 
 KILLS ?= 100
 
