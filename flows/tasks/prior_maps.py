@@ -11,7 +11,7 @@ from typing import Any
 
 from flows.settings.load import anchor_paths
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
+from flows.settings.values import EXTENT_PART
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import OFF_GRID_PX, shift_px
@@ -102,8 +102,7 @@ def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> 
             continue
         run = read_run(folder)
         if run.receipt.get("survey") == name and PROBABILITIES in run.products:
-            before = {"extent": EXTENT_WHOLE, **run.settings}
-            if run.receipt.get("scene") == scene_key and all(before.get(key) == asked[key] for key in light):
+            if run.receipt.get("scene") == scene_key and all(run.settings.get(key) == asked[key] for key in light):
                 continue  # made of the requested light itself: no earlier visit
             days = _days_since(run, settings.visit, settings.moment)
             if days >= 0:

@@ -37,7 +37,7 @@ from flows.tasks.stage import FieldFrame, Report
 from flows.tasks.stages.attention import PatchGains, all_seen
 from flows.tasks.stages.capture import SweepRecorder
 from flows.tasks.stages.placement import tile_budget
-from flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, weights_path
+from flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, training_note, weights_path
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
@@ -362,7 +362,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
-    outside = beyond_training(settings, scene, described, model.trained_on, model.path)
+    outside = beyond_training(settings, scene, described, model.trained_on)
     name = settings.name or Path(scene.name).stem
     found = None
     if settings.extent == EXTENT_PART:  # the prior map chooses the lines
@@ -383,7 +383,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     source, simulated, raster = _open_source(settings, scene, grid, planned.plan, recorded, pixels)
     archive = Archive.open(settings.out) if archive is None else archive
     if raster is not None and not planning:
-        outside += other_unit(raster, scene.wavelength_nm, model.load(), model.path)
+        outside += other_unit(raster, scene.wavelength_nm, model.load())
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)
@@ -406,7 +406,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         budget=budget,
         extent=planned.extent,
         prior=prior,
-        notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *outside, *label_notes),
+        notes=(*notes, *zones.notes, *planned.notes, *prior_notes, *training_note(outside, model.path), *label_notes),
         refused=refused,
         outside=bool(outside),
     )

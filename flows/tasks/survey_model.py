@@ -88,14 +88,14 @@ DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # tolerances of
 
 
 def beyond_training(
-    settings: Settings, scene: RasterScene, described: Description, trained: TrainedOn | None, path: Path
-) -> tuple[str, ...]:
-    """Return a note on conditions outside of the training data, or nothing; ``trained`` is None if they are unknown."""
+    settings: Settings, scene: RasterScene, described: Description, trained: TrainedOn | None
+) -> list[str]:
+    """Return conditions outside of the training data; ``trained`` is None if they are unknown."""
     _, reached = described.basis.matrix(scene.wavelength_nm)
     known = np.ones_like(reached)  # spectral features that training covered
     if trained is not None and trained.bands_nm is not None:
         _, known = described.basis.matrix(np.array(trained.bands_nm))
-    found = []
+    found: list[str] = []
     if (known & ~reached).any():
         found.append(f"the bands cover {(known & reached).sum()} of the weights' {known.sum()} spectral features")
     if trained is not None:
@@ -120,12 +120,13 @@ def beyond_training(
             pixel_m = median_footprint_m(GroundView(settings.pose, settings.camera.ifov_rad), scene.shape)
         if pixel_m is not None and known_m is not None and not 1 / SCALE <= pixel_m / known_m <= SCALE:
             found.append(f"GSD of {100 * pixel_m:.3g} cm (training: {100 * known_m:.3g} cm)")
-    if not found:
-        return ()
-    return (
-        f"outside of the training data of {path.name}: {'; '.join(found)}. Expect a poorer map; train on such labelled"
-        f" scenes: spectralzoom train DATASET -o my.safetensors",
-    )
+    return found
+
+
+def training_note(found: Sequence[str], path: Path) -> tuple[str, ...]:
+    """Return the note that a scene is unlike the training of weights, with the conditions; or nothing."""
+    advice = "Expect a poorer map; train on such labelled scenes: spectralzoom train DATASET -o my.safetensors"
+    return (f"outside of the training data of {path.name}: {'; '.join(found)}. {advice}",) if found else ()
 
 
 def _lacking(bands_nm: Sequence[float], scene: RasterScene, described: Description) -> list[float]:
@@ -139,21 +140,16 @@ def _lacking(bands_nm: Sequence[float], scene: RasterScene, described: Descripti
     return [float(nm) for nm in bands[apart_nm > near_nm]]
 
 
-def other_unit(
-    raster: RasterPixels, wavelength_nm: NDArray[np.float64], weights: Weights, path: Path
-) -> tuple[str, ...]:
-    """Return a note where the values of a raster are far from those of training, or nothing; some rows are read."""
+def other_unit(raster: RasterPixels, wavelength_nm: NDArray[np.float64], weights: Weights) -> list[str]:
+    """Return the median of a raster where it is far from that of training; some rows are read."""
     first = max(0, (raster.grid.height - SAMPLED_ROWS) // 2)
     matrix, reached = weights.basis.matrix(wavelength_nm)
     seen = project(raster.rows(first, min(first + SAMPLED_ROWS, raster.grid.height)), matrix)[..., reached]
     known = float(np.median(weights.normalisation.centre[reached])) if reached.any() else 0.0
     here = float(np.median(seen[np.isfinite(seen)])) if np.isfinite(seen).any() else known
     if known <= 0 or known / OTHER_UNIT <= here <= known * OTHER_UNIT:
-        return ()
-    return (
-        f"the values have a median of {here:.3g}, those of the training of {path.name} {known:.3g}; if they are in "
-        "another unit, state their scale in a scene.toml beside the scene",
-    )
+        return []
+    return [f"values with a median of {here:.3g} (training: {known:.3g}; a scene.toml may state another unit's scale)"]
 
 
 def _season(moment: tuple[int, float] | None, trained: TrainedOn, *, now: bool) -> list[str]:

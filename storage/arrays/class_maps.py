@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, cuts
 from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
@@ -217,13 +217,11 @@ class Changes(NamedTuple):
 class ProbabilityStore:
     """Stored class probabilities, read in parts.
 
-    Raises IncompleteStoreError: they are missing or damaged, or their light is packed.
+    Raises IncompleteStoreError: they are missing or damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self._group = open_group(path)
-        if "log2_light" in self._group:
-            raise IncompleteStoreError(f"{path} has packed light, which is not read; reprocess computes it again")
         array = self._group.get("age")
         self.shape = (array.shape[0], array.shape[1]) if isinstance(array, zarr.Array) else (0, 0)
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
-from flows.tasks.survey_model import beyond_training
+from flows.tasks.survey_model import beyond_training, training_note
 from models.network.spectral import UNLIKE, unlike_training
 from models.weights.files import TrainedOn, Weights, describe_weights, load_weights, save_weights
 from tests.conftest import CLASSES, RGB_NM, Survey
@@ -58,7 +58,8 @@ def test_spectra_unlike_the_training_are_noted_for_every_source(
 
 def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, seen: TrainedOn = SEEN, **flags: Any) -> tuple[str, ...]:
     scene: Any = SimpleNamespace(wavelength_nm=np.array(nm), shape=(96, 128), light_fraction=1.0)
-    return beyond_training(load_settings(None, flags), scene, describe_weights(weights), seen, weights)
+    found = beyond_training(load_settings(None, flags), scene, describe_weights(weights), seen)
+    return training_note(found, weights)
 
 
 @given(st.integers(96, 300), st.floats(3.0, 100.0))

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from models.reading.prior_map import FAINTEST as FAINTEST_BELIEVED
 from pipeline.errors import IncompleteStoreError
 from storage.arrays import class_maps
-from storage.arrays.layout import open_group, write_image
 
 LEGEND = class_maps.ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
 SHAPE = (70, 50)
@@ -141,14 +140,10 @@ def test_a_first_visit_has_no_old_classes(tmp_path: Path) -> None:
         class_maps.write_changes_tile(path, (0, 0), np.zeros((64, 64), np.uint8))
 
 
-def test_missing_and_outdated_probabilities_are_refused(tmp_path: Path) -> None:
-    """A store whose light is packed in bytes has to be computed again by `reprocess`."""
+def test_missing_probabilities_are_refused(tmp_path: Path) -> None:
+    """The error names the store."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
         class_maps.ProbabilityStore(tmp_path / "none.zarr")
-    group = open_group(stored(tmp_path / "old.zarr"), "r+")
-    write_image(group, "log2_light", ("y", "x"), np.zeros(SHAPE, np.uint8), {})
-    with pytest.raises(IncompleteStoreError, match=r"has packed light, .*; reprocess computes it again"):
-        class_maps.ProbabilityStore(tmp_path / "old.zarr")
 
 
 def test_a_probability_of_1_is_not_read_as_unknown(tmp_path: Path) -> None:
