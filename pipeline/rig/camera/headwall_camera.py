@@ -128,9 +128,9 @@ class HeadwallCamera:
         self._lock = threading.RLock()
 
     @classmethod
-    def at(cls, host: str, server: FileServer, *, port: int = CONTROL_PORT, clock: Clock = SYSTEM_CLOCK) -> Self:
+    def at(cls, host: str, server: FileServer, *, clock: Clock = SYSTEM_CLOCK) -> Self:
         """Return a camera on the network."""
-        return cls(lambda: SocketTransport(host, port, clock), server, clock=clock)
+        return cls(lambda: SocketTransport(host, CONTROL_PORT, clock), server, clock=clock)
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period; StateUnknown where a capture may be running, see ``capture``. [ms]"""

@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -40,15 +39,6 @@ from tests.flows.schedule.prefect_server import free_port, server_process
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
 DUE = datetime(2026, 6, 1, 4, tzinfo=UTC)
-SERVES = """
-import sys
-from prefect import serve
-from prefect.types.entrypoint import EntrypointType
-import flows.survey
-flow, name = sys.argv[1].split("/")
-made = getattr(flows.survey, flow).to_deployment(name, entrypoint_type=EntrypointType.MODULE_PATH)
-serve(made, print_starting_message=False)
-"""
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -187,18 +177,6 @@ def test_two_fields_due_at_once_use_the_rig_in_turn(tmp_path: Path) -> None:
         one.join(PATIENCE_S)
     (_, ended), (began, _) = sorted(held)
     assert ended <= began
-
-
-@contextmanager
-def serving(api: str, name: str) -> Iterator[None]:
-    """Serve a flow as a deployment, with each run in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1", "PREFECT_API_URL": api}
-    with subprocess.Popen([sys.executable, "-c", SERVES, name], cwd=ROOT, env=environment) as process:
-        try:
-            wait_for(name)
-            yield
-        finally:
-            process.kill()
 
 
 def wait_for(name: str) -> None:
