@@ -67,11 +67,6 @@ class Drawing:
     choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
 
     @property
-    def inputs(self) -> list[StageRef]:
-        """Return the stores that workers read."""
-        return [self.mosaic, self.attention, *(() if self.prior is None else self.prior.stores)]
-
-    @property
     def chosen(self) -> NDArray[np.int64]:
         """Return the numbers of the patches that the attention ranks, ascending."""
         return chosen_patches(self.attention.path / "attention.zarr")
@@ -262,16 +257,11 @@ def draw_field(
             overviews = Path(folder) if pool.shares_memory else None
             overview = Scoring(work.weights, work.mosaic, work.capture, GAIN, overviews)
             some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
-            found = run_blocks(overview, some, pool, report=lambda done: report(begun * done), inputs=work.inputs)
+            found = run_blocks(overview, some, pool, report=lambda done: report(begun * done))
             class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)
             work = replace(work, choice=GainChoice(least_gain, overviews, class_pixels))
         parts: list[Drawn] = run_blocks(
-            work,
-            field.regions,
-            pool,
-            take=take,
-            report=lambda done: report(begun + (1 - begun) * done),
-            inputs=work.inputs,
+            work, field.regions, pool, take=take, report=lambda done: report(begun + (1 - begun) * done)
         )
     compared = [part.comparison for part in parts if part.comparison is not None]
     reading = None

@@ -241,7 +241,7 @@ class FieldWork:
     ) -> list[Any]:
         """Run a worker that reads ``patch_index`` in full for all regions."""
         pool = self.pool_for(patch_index, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
-        return run_blocks(worker, self.regions, pool, report=report, inputs=[mosaic])
+        return run_blocks(worker, self.regions, pool, report=report)
 
     def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Join arrays of all regions' own patches to that of the padded grid, (patch_y, patch_x, ...)."""

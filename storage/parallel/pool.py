@@ -1,46 +1,33 @@
 """Map a function over blocks, one task for each, on threads, on processes, or on the workers of a dask scheduler.
 
-Threads are those of `concurrent.futures`; processes are a dask cluster of this machine. A block reads published stores
-and returns arrays; only the survey's own process writes. The results are the same bytes everywhere if code, files and
-the number of arithmetic threads are the same.
+Processes are a dask cluster of this machine. A block reads published stores and returns arrays; only the survey's own
+process writes. The results are the same bytes everywhere if code, libraries and files are the same.
 """
 
 from __future__ import annotations
 
-import asyncio
-import hashlib
 import logging
 import os
-import pickle
-import platform
 import re
 import signal
-import threading
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
-from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import resource_tracker
 from operator import call
-from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.errors import PipelineError, SettingsError, WorkerError
+from pipeline.errors import SettingsError, WorkerError
 from pipeline.lazy import dask, dask_distributed
-from storage.archive.keys import StageRef
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 RESTART_S = 60.0  # time limit until a process of this machine replaces one that died
 AHEAD = 2  # blocks sent to a worker: one running, one waiting
-ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
-LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
-THREADS_OF = "OMP_NUM_THREADS"
 # one thread of arithmetic a worker, and freed memory kept: large arrays cost more page faults than arithmetic
 _ENVIRONMENT = {
-    **dict.fromkeys((THREADS_OF, "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
+    **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
     "MALLOC_MMAP_THRESHOLD_": f"{2**30}",
     "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}",
     "MALLOC_TOP_PAD_": f"{2**26}",
@@ -104,28 +91,27 @@ class WorkerPool:
 
         The first `run_blocks` starts them.
         """
-        with _guard:
-            _users[self] += 1
+        if self.shares_memory or self in _clusters:
+            yield self
+            return
+        _clusters[self] = None
         try:
             yield self
         finally:
-            with _guard:
-                _users[self] -= 1
-                if not _users[self]:
-                    _dismiss(self)
+            _dismiss(self)
+            del _clusters[self]
 
 
 THREADS = WorkerPool()
 
-_guard = threading.RLock()
-_users: Counter[WorkerPool] = Counter()  # blocks that keep a pool open
-_teams: dict[WorkerPool, Cluster] = {}  # the workers of open pools, once they are started
+_clusters: dict[WorkerPool, Cluster | None] = {}  # of open pools, None until they are started
 
 
 def _dismiss(pool: WorkerPool) -> None:
-    """Abandon the workers of a pool; the next use starts others."""
-    if (team := _teams.pop(pool, None)) is not None:
-        team.close()
+    """Abandon the workers of an open pool; the next use starts others."""
+    if (cluster := _clusters[pool]) is not None:
+        _clusters[pool] = None
+        cluster.close()
 
 
 def run_blocks(
@@ -135,60 +121,86 @@ def run_blocks(
     *,
     take: Callable[[Item, Result], Any] | None = None,
     report: Report = lambda done: None,
-    inputs: Sequence[StageRef] = (),
 ) -> list[Any]:
     """Call ``make`` with every item, each in a task of its own, and ``take`` with each item and its result.
 
     Returns what ``take`` returns, or without it the results, in the order of the items. Blocks start in order, at most
-    a few ahead of the oldest unfinished one, since neighbours share input. The first error is raised when no block is
-    running any more. ``report`` is called with the fraction done.
+    a few ahead of the oldest unfinished one, since neighbours share input. An error is raised when no block is running
+    any more. ``report`` is called with the fraction done.
 
     On threads ``make`` and ``take`` must be safe to call from several at once. Otherwise ``make``, items and results
-    are pickled, and ``take`` is called in this process. Workers of a dask scheduler read the stores ``inputs`` by the
-    same paths. Raises SettingsError: no scheduler answers, or its workers lack the stores or run
-    other versions; WorkerError: workers died repeatedly.
+    are pickled, and ``take`` is called in this process. Workers of a dask scheduler read stores by the same paths.
+    Raises SettingsError: no scheduler answers, or its workers cannot import this code; WorkerError:
+    workers died repeatedly, or none is left.
     """
-    results: dict[int, Any] = {}
-
-    def ended(number: int, result: Any) -> None:
-        results[number] = result
-        report(len(results) / len(items))
 
     def whole(item: Item) -> Any:
         return make(item) if take is None else take(item, make(item))
 
+    results: list[Any] = []
+
+    def ended(result: Any) -> None:
+        results.append(result)
+        report(len(results) / len(items))
+
     workers = min(pool.count, len(items))
-    if pool.shares_memory and workers < 2:
-        for number, item in enumerate(items):
-            ended(number, whole(item))
-    elif pool.shares_memory:
+    if not pool.shares_memory and items:
+        with pool.open(), closing(_run_away(pool, make, items)) as made:
+            for item, one in zip(items, made, strict=True):
+                ended(one if take is None else take(item, one))
+    elif workers < 2:
+        for item in items:
+            ended(whole(item))
+    else:
         with ThreadPoolExecutor(workers) as team:
-            _send(lambda item: team.submit(whole, item), items, workers, ended)
-    elif items:
-        with pool.open():
-            _send_away(
-                pool, make, items, inputs, lambda at, made: ended(at, made if take is None else take(items[at], made))
-            )
-    return [results[number] for number in range(len(items))]
+            for one in _in_order(lambda item: team.submit(whole, item), items, workers):
+                ended(one)
+    return results
 
 
-def _send_away(
-    pool: WorkerPool,
-    make: Callable[[Any], Any],
+def _in_order(
+    submit: Callable[[Any], Future[Any]],
     items: Sequence[Any],
-    inputs: Sequence[StageRef],
-    ended: Callable[[int, Any], None],
-) -> None:
-    """Run blocks in processes; dask runs blocks whose worker died again on others."""
-    with _guard:
-        team = _teams.get(pool) or Cluster(pool)
-        _teams[pool] = team
+    window: int,
+    alive: Callable[[], object] = lambda: None,
+    lost: tuple[type[Exception], ...] = (),
+) -> Generator[Any, None, None]:
+    """Submit blocks in order, fewer than ``window`` ahead of the oldest unfinished one; yield results in order.
+
+    An error is raised when the running blocks have ended. One of the types ``lost`` is raised at once: blocks of lost
+    workers may never end. ``alive``, called while the oldest does not end, raises without workers.
+    """
+    running: deque[Future[Any]] = deque()
+
+    def oldest() -> Any:
+        while not wait([running[0]], timeout=ANSWER_S).done:
+            alive()
+        return running.popleft().result()
+
+    try:
+        for item in items:
+            if len(running) == window:
+                yield oldest()
+            running.append(submit(item))
+        while running:
+            yield oldest()
+    except lost:
+        raise
+    except (Exception, GeneratorExit):
+        wait(running)
+        raise
+
+
+def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any, None, None]:
+    """Yield the results of blocks on the workers of dask, which runs blocks of a dead worker again on others."""
+    cluster = _clusters[pool] = _clusters[pool] or Cluster(pool)
     lost = (WorkerError, CancelledError, dask_distributed.KilledWorker)
     try:
-        count = team.check(inputs)
+        count = cluster.count()
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GiB"}):
-            shared = team.client.submit(_itself, make, pure=False)  # travels once to each worker
-        _send(partial(team.submit, call, shared), items, AHEAD * count, ended, alive=team.count, lost=lost)
+            shared = cluster.client.submit(_itself, make, pure=False)  # travels once to each worker
+        team: Any = cluster.client.get_executor(pure=False)
+        yield from _in_order(lambda item: team.submit(call, shared, item), items, AHEAD * count, cluster.count, lost)
     except lost as error:
         _dismiss(pool)
         if isinstance(error, WorkerError):
@@ -200,44 +212,16 @@ def _send_away(
                 "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
                 "--scheduler threads"
             )
-        raise WorkerError(f"{team.name}: {advice}") from None
+        raise WorkerError(f"{cluster.name}: {advice}") from None
+    except ImportError as error:
+        raise SettingsError(
+            f"{cluster.name}: a worker cannot import SpectralZoom ({error}); install the same version there, or use "
+            "--scheduler processes"
+        ) from None
 
 
 def _itself(make: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return make
-
-
-def _send(
-    submit: Callable[[Any], Future[Any]],
-    items: Sequence[Any],
-    window: int,
-    ended: Callable[[int, Any], None],
-    alive: Callable[[], object] = lambda: None,
-    lost: tuple[type[Exception], ...] = (),
-) -> None:
-    """Send blocks in order, fewer than ``window`` ahead of the oldest unfinished one; ``ended`` takes each result.
-
-    An error is raised when the running blocks have ended. One of the types ``lost`` is raised at once: blocks of lost
-    workers may never end. ``alive``, called while none ends, raises without workers.
-    """
-    running: dict[Future[Any], int] = {}
-    sent = 0
-    try:
-        while running or sent < len(items):
-            while sent < len(items) and sent - min(running.values(), default=sent) < window:
-                running[submit(items[sent])] = sent
-                sent += 1
-            done = wait(running, timeout=ANSWER_S, return_when=FIRST_COMPLETED).done
-            if not done:
-                alive()
-            for future in sorted(done, key=running.__getitem__):
-                ended(running[future], future.result())
-                del running[future]
-    except lost:
-        raise
-    except Exception:
-        wait(running)
-        raise
 
 
 class Cluster:
@@ -258,16 +242,6 @@ class Cluster:
                 f"{self.name}: {expected} ({type(error).__name__}); start `dask scheduler`, or use --scheduler threads"
             ) from None
 
-    def submit(self, make: Callable[..., Any], *given: Any) -> Future[Any]:
-        """Send one block.
-
-        dask's own executor fails where a block is lost with its worker between its end and its delivery.
-        """
-        sent = self.client.submit(make, *given, pure=False)
-        return asyncio.run_coroutine_threadsafe(
-            self.client.gather(sent, asynchronous=True), self.client.loop.asyncio_loop
-        )
-
     def close(self) -> None:
         """Disconnect from the workers; those elsewhere keep running."""
         self.client.close()
@@ -283,37 +257,6 @@ class Cluster:
             advice = f"start `dask worker {address}`" if self._own is None else "use --scheduler threads"
             raise WorkerError(f"{self.name} has no workers: expected at least one; {advice}") from None
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
-
-    def check(self, inputs: Sequence[StageRef]) -> int:
-        """Compare versions, threads and stores of every worker with this process; return `count`.
-
-        Raises SettingsError: a worker differs, or cannot read the archive; WorkerError: there is none, or one was lost
-        meanwhile.
-        """
-        expected = {**about_here(inputs), THREADS_OF: "1"}
-        count = self.count()
-        try:
-            theirs = self.client.run(_about_there, pickle.dumps(inputs))
-        except PipelineError as error:
-            raise SettingsError(f"{self.name}: a worker cannot read the archive. {error}") from None
-        except OSError as error:
-            raise WorkerError(
-                f"{self.name}: a worker was lost ({error}). Repeat the command: finished stages are kept"
-            ) from None
-        except Exception as error:  # of any type: errors of unpickling come back as text
-            raise SettingsError(
-                f"{self.name}: a worker cannot import SpectralZoom ({error}); install the same version there, or use "
-                "--scheduler processes"
-            ) from None
-        for worker, facts in theirs.items():
-            for what, value in expected.items():
-                if facts.get(what) != value:
-                    raise SettingsError(
-                        f"{self.name}: worker {worker} has {what} {facts.get(what)}, expected {value} as here; install "
-                        f"the same there, mount the archive under the same path, and set "
-                        f"{THREADS_OF}=1"
-                    )
-        return count
 
 
 def start(workers: int) -> Any:
@@ -333,37 +276,3 @@ def start(workers: int) -> Any:
             )
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-def about_here(inputs: Sequence[StageRef]) -> dict[str, str]:
-    """Return versions, threads and the content of stores as this process sees them, by name."""
-    threads = {THREADS_OF: os.environ.get(THREADS_OF, "not set")}
-    return versions_here() | threads | {one.uri: _seen(one.path) for one in inputs}
-
-
-async def _about_there(inputs: bytes) -> dict[str, str]:
-    """Return `about_here` of a worker, which answers its scheduler while it fetches stores."""
-    return await asyncio.to_thread(lambda: about_here(pickle.loads(inputs)))
-
-
-@cache
-def versions_here() -> dict[str, str]:
-    """Return the versions of code and libraries in this process, as they were at the first call."""
-    root = Path(__file__).parents[2]
-    found = hashlib.sha256()
-    for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
-        found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    facts = {"python": platform.python_version(), "spectralzoom": f"of code {found.hexdigest()[:12]}"}
-    for name in LIBRARIES:
-        try:
-            facts[name] = version(name)
-        except PackageNotFoundError:
-            facts[name] = "missing"
-    return facts
-
-
-def _seen(folder: Path) -> str:
-    if not folder.is_dir():
-        return "not there"
-    names = sorted(path.name for path in folder.iterdir())
-    return f"with {len(names)} names ({hashlib.sha256(repr(names).encode()).hexdigest()[:8]})"

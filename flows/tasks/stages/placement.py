@@ -77,11 +77,6 @@ class MosaicRecipe:
     interlaced: bool = False  # sweeps of two passes with lines between each other
     registration: StageRef | None = None
 
-    @property
-    def inputs(self) -> list[StageRef]:
-        """Return the stores that workers read."""
-        return [one for one in (self.signal, self.geolocation, self.registration) if one is not None]
-
     def sweeps(self) -> list[SweepPath]:
         """Open the sweeps, in the order of their names. Raises IncompleteStoreError: one is missing or damaged."""
         return open_sweeps(self.signal, self.registration, self.camera)
@@ -145,9 +140,7 @@ def write_mosaic(
     def take(place: Place, made: tuple[Values, Counts]) -> None:
         writer.write_tile(place[0].start, place[1].start, *made)
 
-    run_blocks(
-        maker, [(tile.rows, tile.columns) for tile in tiles], pool, take=take, report=report, inputs=recipe.inputs
-    )
+    run_blocks(maker, [(tile.rows, tile.columns) for tile in tiles], pool, take=take, report=report)
     free_tiles()
     return budget
 

@@ -19,9 +19,8 @@ import pytest
 from dask.distributed import LocalCluster
 
 from pipeline.errors import SettingsError, ShapeError, WorkerError
-from storage.archive.keys import StageRef
 from storage.parallel import pool as pool_module
-from storage.parallel.pool import THREADS_OF, WorkerPool, run_blocks
+from storage.parallel.pool import WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
 # dask does not close its handshake with a worker that dies
@@ -163,34 +162,9 @@ def elsewhere() -> Iterator[WorkerPool]:
             yield pool
 
 
-def test_workers_of_a_dask_scheduler_give_the_same_results(elsewhere: WorkerPool, tmp_path: Path) -> None:
-    """The workers make the blocks after they have shown that they see the input store."""
-    store = StageRef("rectify", "key", tmp_path)
-    assert run_blocks(square, range(6), elsewhere, inputs=[store]) == [square(item) for item in range(6)]
-
-
-@pytest.mark.parametrize(
-    ("here", "words"),
-    [
-        ({"numpy": "0.1"}, r"has numpy \d.*, expected 0.1 as here; install the same there"),
-        ({"spectralzoom": "of code abc"}, r"has spectralzoom of code \w+, expected of code abc as here"),
-        ({"stages/a/b": "with 7 names"}, r"has stages/a/b None, expected with 7 names as here.*mount the archive"),
-    ],
-)
-def test_workers_that_differ_are_refused(
-    elsewhere: WorkerPool, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
-) -> None:
-    """Other code, another numpy or other files would give other bytes; the error names the first difference."""
-    run = pool_module.dask_distributed.Client.run
-    true = pool_module.about_here([])
-    monkeypatch.setattr(pool_module.dask_distributed.Client, "run", lambda self, ask, inputs: run(self, _true, true))
-    monkeypatch.setattr(pool_module, "about_here", lambda inputs: {**true, **here})
-    with pytest.raises(SettingsError, match=rf"worker tcp:.* {words}"):
-        run_blocks(square, [1], elsewhere)
-
-
-def _true(facts: dict[str, str]) -> dict[str, str]:
-    return {**facts, THREADS_OF: os.environ[THREADS_OF]}
+def test_workers_of_a_dask_scheduler_give_the_same_results(elsewhere: WorkerPool) -> None:
+    """Results are in the order of the items."""
+    assert run_blocks(square, range(6), elsewhere) == [square(item) for item in range(6)]
 
 
 STALE_S = 0.6
@@ -211,12 +185,23 @@ def test_blocks_of_lost_workers_are_not_waited_for(monkeypatch: pytest.MonkeyPat
     """A block whose workers are gone may never end: the error is raised at once."""
     monkeypatch.setattr(pool_module, "ANSWER_S", 0.01)
     block: Future[None] = Future()
-    late = threading.Timer(5, block.set_result, [None])
-    late.start()
+    gone = Mock(side_effect=WorkerError("gone"))
     with pytest.raises(WorkerError, match="gone"):
-        pool_module._send(lambda _: block, [0], 1, print, Mock(side_effect=WorkerError("gone")), (WorkerError,))
-    late.cancel()
+        list(pool_module._in_order(lambda _: block, [0], 1, gone, (WorkerError,)))
     assert not block.done()
+
+
+def import_missing(number: int) -> int:
+    """Import a package that the workers lack."""
+    import missing_package  # type: ignore[import-not-found]
+
+    return number + int(missing_package.one)
+
+
+def test_a_worker_without_the_code_raises_one_error(elsewhere: WorkerPool) -> None:
+    """The message names the missing module and what to do."""
+    with pytest.raises(SettingsError, match=r"a worker cannot import SpectralZoom .*missing_package.*install the same"):
+        run_blocks(import_missing, [1], elsewhere)
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
