@@ -52,7 +52,7 @@ def simulate(
     ----------
     scene
         `farm` or `scouting` (built in; `farm@2` names the version of its law), or an image or cube file: PNG, JPEG,
-        BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr.
+        BMP, GeoTIFF, .npy, .mat, ENVI, Zarr.
     out
         Folder of the archive for the raw cubes.
     coarse

@@ -1,4 +1,4 @@
-"""Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy, .npz and .mat.
+"""Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy and .mat.
 
 Axes are found by their names; without names they are y, x and band. Values follow from scale, offset and fill value,
 the place on the earth from a grid mapping.

@@ -1,4 +1,4 @@
-"""List the arrays of .npy, .npz, .mat, NetCDF and HDF5 files.
+"""List the arrays of .npy, .mat, NetCDF and HDF5 files.
 
 Files are listed by their headers, and only the array wanted is read. Python objects, cells and structures are not read,
 nor links and virtual arrays of HDF5, which may lead to any file. EMIT's files follow CF, except for wavelengths and
@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import mmap
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -25,7 +24,7 @@ from pipeline.lazy import h5py
 from storage.readers.array_cubes import Arrays, FileArray
 from storage.readers.cube_sources import DEFLATE_RATIO
 
-ARRAY_ENDINGS = (".npy", ".npz", ".mat")
+ARRAY_ENDINGS = (".npy", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
 GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
 MOST_UNEVEN = 16  # times that a picture is longer than wide
@@ -45,8 +44,6 @@ def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
         values = load_npy(path)
         each = (1,) * values.ndim
         return {"": FileArray(str(path), values.shape, values.dtype, {}, values.__getitem__, each, values.nbytes)}, {}
-    if ending == ".npz":
-        return _npz_arrays(path), {}
     if not h5py.is_hdf5(path):
         if ending == ".mat":
             return _mat_arrays(path), {}
@@ -72,29 +69,6 @@ def _whole(
     """Return an array that is always read whole."""
     chunks = tuple(max(size, 1) for size in shape)
     return FileArray(where, shape, kind, {}, lambda part: load()[part], chunks, stored, ratio)
-
-
-def _npz_arrays(path: Path) -> dict[str, FileArray]:
-    """List the arrays of numbers in a pack."""
-
-    def load(member: zipfile.ZipInfo) -> NDArray[Any]:
-        with zipfile.ZipFile(path) as pack, pack.open(member) as stream:
-            return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-
-    found: dict[str, FileArray] = {}
-    with zipfile.ZipFile(path) as pack:
-        for member in pack.infolist():
-            if member.filename.endswith(".npy"):
-                with pack.open(member) as stream:
-                    formats = np.lib.format
-                    old = formats.read_magic(stream) == (1, 0)
-                    shape, _, kind = (formats.read_array_header_1_0 if old else formats.read_array_header_2_0)(stream)
-                if not kind.hasobject:
-                    ratio = 1 if member.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO
-                    found[member.filename.removesuffix(".npy")] = _whole(
-                        f"{path}:{member.filename}", shape, kind, partial(load, member), member.compress_size, ratio
-                    )
-    return found
 
 
 def _mat_arrays(path: Path) -> dict[str, FileArray]:

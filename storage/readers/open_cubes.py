@@ -39,7 +39,7 @@ from storage.readers.zarr_files import find_zarr_store, zarr_arrays
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 _WITH_VARIABLE = re.compile(
-    r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+)$"
+    r"^(?P<path>.+\.(?:mat|zarr|npy)):(?P<variable>[^/\\:]+)$"
     r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+)$",
     re.IGNORECASE | re.DOTALL,
 )

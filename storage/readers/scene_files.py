@@ -71,10 +71,10 @@ def open_scene_file(
     labels_needed: bool = False,
     keep: bool = False,
 ) -> SceneFile:
-    """Open a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
+    """Open a scene from an image, .npy, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
 
     ``address`` may be ``FILE.mat:ARRAY`` or ``STORE.zarr:ARRAY``. Axes are y, x, band; two axes are one band. All
-    values are read once for gaps; only with ``keep``, and of images, .mat and .npz, they stay in memory. Arguments take
+    values are read once for gaps; only with ``keep``, and of images and .mat, they stay in memory. Arguments take
     precedence over the ``scene.toml`` beside the file, and that over the file. ``labels`` are class numbers or colours
     on the same pixels, or polygons; others are found by their names. ``bands`` count from 0; ``wavelengths`` [nm] are
     one for each band used or for each of the file. ``classes`` replace those of a scene.toml that has none. Labels

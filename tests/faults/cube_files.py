@@ -52,11 +52,6 @@ def _npy(folder: Path) -> str:
     return "a.npy"
 
 
-def _npz(folder: Path, save: Callable[..., None] = np.savez) -> str:
-    save(folder / "a.npz", cube=_cube(), more=np.arange(9))
-    return "a.npz"
-
-
 def _mat(folder: Path, **how: Any) -> str:
     from scipy.io import savemat
 
@@ -126,8 +121,6 @@ FORMATS: dict[str, Callable[[Path], str]] = {
     "ENVI": _envi,
     "Headwall folder": _headwall,
     ".npy": _npy,
-    ".npz": _npz,
-    ".npz packed": lambda folder: _npz(folder, np.savez_compressed),
     ".mat v5": lambda folder: _mat(folder),
     ".mat v7": lambda folder: _mat(folder, do_compression=True),
     ".mat v7.3": _mat_hdf,

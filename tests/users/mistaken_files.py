@@ -70,7 +70,6 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
     }.items():
         np.save(here / f"{name}.npy", values)
     np.save(here / "objects.npy", np.array([{"soil": 1}], object), allow_pickle=True)
-    np.savez(here / "two.npz", north=cube, south=cube)
 
 
 def _containers(here: Path, cube: np.ndarray) -> None:

@@ -56,7 +56,7 @@ CASES = {
     "header without data": (1, SURVEY + "alone.hdr" + BANDS, "no data file beside"),
     "folder called zarr": (1, SURVEY + "hollow.zarr", "hollow.zarr has no array"),
     # which array
-    "several arrays": (1, SURVEY + "two.npz" + BANDS, r"north \(12, 16, 5\), south.*name one: two.npz:ARRAY"),
+    "several arrays": (1, SURVEY + "two_cubes.mat" + BANDS, r"north \(12, 16, 5\), south.*two_cubes.mat:ARRAY"),
     "no such variable": (1, SURVEY + "two_cubes.mat:west" + BANDS, r"no array west; it has north \(12, 16, 5\)"),
     "a table as a scene": (1, SURVEY + "table.npy --wavelengths 550", "table of 198 x 10000"),
     "series": (1, SURVEY + "series.npy" + BANDS, r"shape \(3, 12, 16, 5\); expected \(y, x, band\).* store one time"),
