@@ -126,7 +126,7 @@ class SurveyStopped(Exception):  # noqa: N818 - no error: the settings stop a su
     def __init__(self, until: str, uri: str, archive: str) -> None:
         super().__init__(
             f"stopped after {until}: stored in {archive}/{uri}; the same command without --until goes on, here or on "
-            "another machine with this archive"
+            "another machine with a copy of this archive"
         )
         self.until, self.uri, self.archive = until, uri, archive
 
