@@ -4,8 +4,8 @@
 
     python tests/defects [--only PATTERN] [--jobs 2] [--tests PATH ...]
 
-The tests of a defect pass without it, or the run ends. ``--tests`` replaces those of the list, to look for any test
-that catches a defect. The exit code is 1 if a defect no longer applies, or if its tests fail without it.
+A defect whose tests fail without it is not counted. ``--tests`` replaces those of the list, to look for any test that
+catches a defect. The exit code is 1 if a defect no longer applies, or if its tests fail without it.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ def main(arguments: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="defects-") as folder:
         copies = [TreeCopy.made(Path(folder) / str(number)) for number in range(max(asked.jobs, 1))]
         wrong = failing_without(copies, sorted({test for one in defects for test in asked.tests or one.tests}))
-        if wrong:
-            print("\n".join(f"{test} fails without a defect" for test in wrong))
-            return 1
-        found = caught_by(copies, defects, asked.tests)
-    report(defects, found)
-    return 1 if stale else 0
+        for test in wrong:
+            print(f"{test} fails without a defect: its file is not counted", flush=True)
+        files = {test.partition("::")[0] for test in wrong}
+        found = caught_by(copies, [one for one in defects if files.isdisjoint(asked.tests or one.tests)], asked.tests)
+    report([one for one in defects if one.name in found], found)
+    return 1 if stale or wrong else 0
 
 
 def failing_without(copies: Sequence[TreeCopy], tests: Sequence[str]) -> list[str]:
-    """Return tests that fail without any defect: the first of each copy, which each take a part of the tests."""
+    """Return tests that fail without any defect; each copy runs a part of them."""
     parts = [(copy, tests[at :: len(copies)]) for at, copy in enumerate(copies)]
     with ThreadPoolExecutor(len(copies)) as team:
-        found = team.map(lambda part: part[0].failing(part[1]) if part[1] else None, parts)
-        return [one for one in found if one is not None]
+        found = team.map(lambda part: part[0].failing(part[1]) if part[1] else [], parts)
+        return [one for some in found for one in some]
 
 
 def caught_by(copies: Sequence[TreeCopy], defects: Sequence[Defect], tests: Sequence[str]) -> dict[str, str | None]:

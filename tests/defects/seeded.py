@@ -92,13 +92,14 @@ class TreeCopy:
         except subprocess.TimeoutExpired:
             return subprocess.CompletedProcess(command, 124, "", "")
 
-    def failing(self, tests: Iterable[str], *options: str) -> str | None:
-        """Run some tests, and return the first that fails; None where all pass."""
-        run = self.python("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *options, *tests)
+    def failing(self, tests: Iterable[str], *options: str) -> list[str]:
+        """Run some tests, and return those that fail."""
+        run = self.python("-m", "pytest", "-q", "-p", "no:cacheprovider", *options, *tests)
         if run.returncode == 0:
-            return None
+            return []
         lines = [line for line in run.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-        return lines[0].partition(" ")[2].partition(" - ")[0] if lines else f"pytest ends with code {run.returncode}"
+        found = [line.partition(" ")[2].partition(" - ")[0] for line in lines]
+        return found or [f"pytest ends with code {run.returncode}"]
 
     def caught_by(self, defect: Defect, tests: Sequence[str]) -> str | None:
         """Return the test that fails with a defect, None where all pass; the copy is whole again afterwards."""
@@ -106,7 +107,7 @@ class TreeCopy:
         before = place.read_text(encoding="utf-8")
         self._write(place, defect.applied(before))
         try:
-            return self.failing(tests)
+            return next(iter(self.failing(tests, "-x")), None)
         finally:
             self._write(place, before)
 
