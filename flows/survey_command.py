@@ -7,7 +7,6 @@ import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -28,14 +27,8 @@ from flows.tasks.open_survey import TITLES, RunRef
 from flows.tasks.prefect_tasks import Observer, inside_flow, observed_by
 from flows.terminal.progress import StageProgress
 from models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
-from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.staging import remove_tree, take_lock
-
-if TYPE_CHECKING:
-    import flows.survey as survey_flow
-else:
-    survey_flow = deferred("flows.survey")
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -67,16 +60,18 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
     Inside another flow its tasks become tasks of that flow.
     """
+    from flows.survey import survey  # Prefect takes a second
+
     asked = SurveySettings.of(settings)
     if settings.engine != "plain" and not inside_flow():
         try:
             with _prefect_server(settings.out):
-                state = survey_flow.survey(asked, return_state=True)
+                state = survey(asked, return_state=True)
                 wait_until_recorded(state.state_details.flow_run_id)
                 return state.result()
         except ServerUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
-    return survey_flow.survey.fn(asked)
+    return survey.fn(asked)
 
 
 @contextmanager

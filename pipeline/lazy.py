@@ -1,4 +1,5 @@
 """Compute values and import modules when they are first used."""
+# ruff: noqa: F401 - imported from here
 
 from __future__ import annotations
 
@@ -52,12 +53,7 @@ class DeferredModule(ModuleType):
 def deferred(name: str) -> Any:
     """Return a module that is imported at its first use; packages that are listed below are imported from here.
 
-    Write it beside the import for type checkers::
-
-        if TYPE_CHECKING:
-            import flows.survey as survey_flow
-        else:
-            survey_flow = deferred("flows.survey")
+    Write it beside the import for type checkers, as below.
     """
     return DeferredModule(name)
 
@@ -71,7 +67,7 @@ if TYPE_CHECKING:
     import odc.geo.crs as odc_crs
     import odc.geo.geobox as odc_geobox
     import odc.geo.warp as odc_warp
-    import odc.geo.xr as odc_geo_xr
+    import odc.geo.xr as odc_xr
     import prosail
     import pvlib
     import pyogrio
@@ -88,22 +84,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 else:
     BaseGeometry = GeoBox = Tensor = Any  # only type checkers look at them
-    dask = deferred("dask")
-    dask_distributed = deferred("dask.distributed")
-    geopandas = deferred("geopandas")
-    h5py = deferred("h5py")
-    odc_crs = deferred("odc.geo.crs")
-    odc_geobox = deferred("odc.geo.geobox")
-    odc_warp = deferred("odc.geo.warp")
-    odc_geo_xr = deferred("odc.geo.xr")
-    prosail = deferred("prosail")
-    pvlib = deferred("pvlib")
-    pyogrio = deferred("pyogrio")
-    pyproj = deferred("pyproj")
-    rasterio = deferred("rasterio")
-    rasterio_features = deferred("rasterio.features")
-    rasterio_warp = deferred("rasterio.warp")
-    safetensors_torch = deferred("safetensors.torch")
-    shapely = deferred("shapely")
-    spyndex = deferred("spyndex")
-    torch = deferred("torch")
+    for _name in (
+        *("dask", "dask.distributed", "geopandas", "h5py", "odc.geo.crs", "odc.geo.geobox", "odc.geo.warp"),
+        *("odc.geo.xr", "prosail", "pvlib", "pyogrio", "pyproj", "rasterio", "rasterio.features", "rasterio.warp"),
+        *("safetensors.torch", "shapely", "spyndex", "torch"),
+    ):
+        globals()[_name.replace("odc.geo", "odc").replace(".", "_")] = deferred(_name)

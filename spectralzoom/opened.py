@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import IncompleteStoreError, NoRunError
-from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import LATEST
 from storage.archive.manifests import CURE
@@ -22,11 +21,6 @@ from storage.arrays.layout import damage_named, open_group
 
 if TYPE_CHECKING:
     import xarray
-
-    import spectralzoom.spectra as spectra
-else:
-    spectra = deferred("spectralzoom.spectra")
-    xarray = deferred("xarray")  # takes a second to import
 
 
 def open(archive: str | Path) -> OpenedArchive:
@@ -149,7 +143,9 @@ class OpenedRun:
 
         Spectra are restored from their components when they are used.
         """
-        return spectra.open_lazy_mosaic(self._place("mosaic"))
+        from spectralzoom.spectra import open_lazy_mosaic
+
+        return open_lazy_mosaic(self._place("mosaic"))
 
     cube = mosaic  # beside `lines`
 
@@ -160,8 +156,10 @@ class OpenedRun:
         They are restored from their components and from residuals of rare spectra when they are used. Time, mirror and
         exposure of each line are coordinates.
         """
+        from spectralzoom.spectra import open_lazy_lines
+
         names = [name for name in LINE_PRODUCTS.values() if name in self.receipt["products"]]
-        return {path.stem: spectra.open_lazy_lines(path) for path in self._sweeps_of(names)}
+        return {path.stem: open_lazy_lines(path) for path in self._sweeps_of(names)}
 
     @property
     def attention(self) -> xarray.Dataset:
@@ -227,6 +225,10 @@ def open_labelled(path: Path) -> xarray.Dataset:
     Numbers keep their type: no class becomes a float. Attributes are text, numbers or lists of them, others JSON text,
     so that ``to_netcdf`` and ``to_zarr`` write them. Raises IncompleteStoreError: the store is missing or damaged.
     """
+    import xarray  # takes a second
+
+    from spectralzoom.spectra import by_wavelength, with_plain_attributes
+
     with damage_named(str(path)):
         store: Any = open_group(path).store  # xarray takes a path with :: for a chain of file systems
         opened = xarray.open_dataset(
@@ -236,4 +238,4 @@ def open_labelled(path: Path) -> xarray.Dataset:
             blocks = one.encoding.get("shards") or one.encoding.get("chunks") or one.shape
             opened = opened.assign({name: one.chunk(dict(zip(one.dims, blocks, strict=True)))})
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
-    return spectra.by_wavelength(spectra.with_plain_attributes(opened.assign_coords(bare)))
+    return by_wavelength(with_plain_attributes(opened.assign_coords(bare)))

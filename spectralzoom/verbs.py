@@ -17,20 +17,12 @@ from flows.settings.load import load_settings
 from flows.terminal.processes import place_caches
 from flows.terminal.progress import Listener, heard_by, on_stderr
 from pipeline.errors import SettingsError
-from pipeline.lazy import deferred
 from spectralzoom.opened import OpenedRun
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    import flows.cli.model_verbs as model_verbs
-    import flows.evaluate.command as evaluate_command
-    import flows.survey_command as survey_command
     from flows.settings.survey_settings import Settings
-else:
-    model_verbs = deferred("flows.cli.model_verbs")
-    evaluate_command = deferred("flows.evaluate.command")
-    survey_command = deferred("flows.survey_command")
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
@@ -60,9 +52,11 @@ def survey(settings: Asked = None, *, progress: Listener | None = None, quiet: b
     SurveyStopped
         The keyword ``until`` stops the survey before its class map; ``uri`` names the store.
     """
+    from flows.survey_command import run_survey
+
     asked = _settings(settings, flags)
     with _working(progress, quiet=quiet) as console:
-        published = survey_command.run_survey(asked, console)
+        published = run_survey(asked, console)
     return opened.open(asked.out)[published.folder.name]
 
 
@@ -113,13 +107,16 @@ def evaluate(dataset: str | Path, *, progress: Listener | None = None, **flags: 
     Error
         A value or a file is not valid.
     """
+    from flows.cli.model_verbs import EvaluateFlags
+    from flows.evaluate.command import evaluate_weights
+
     if "weights" not in flags:
         raise SettingsError("evaluate needs weights=FILE, the weights to judge on the data set")
     weights = flags.pop("weights")
     files = tuple(map(Path, [weights] if isinstance(weights, str | Path) else weights))
-    request = _flags(model_verbs.EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
+    request = _flags(EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
     with _working(progress):
-        content: dict[str, Any] = evaluate_command.evaluate_weights(
+        content: dict[str, Any] = evaluate_weights(
             request, lambda what, done, figure: None if progress is None else progress(what, done, 1.0)
         )
     return content
@@ -148,10 +145,12 @@ def train(
     Error
         A value or a file is not valid.
     """
+    from flows.cli.model_verbs import TrainFlags, run_training
+
     arguments = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
-    asked = _flags(model_verbs.TrainFlags, "train", flags)
+    asked = _flags(TrainFlags, "train", flags)
     with _working(progress, quiet=quiet) as console:
-        model_verbs.run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(arguments)})", console)
+        run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(arguments)})", console)
     return Path(out)
 
 

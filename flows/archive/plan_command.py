@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -32,18 +32,12 @@ from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out, table
 from pipeline.errors import IncompleteStoreError, PipelineError
 from pipeline.geometry.scan import exposing
-from pipeline.lazy import deferred
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan, frontier
 from pipeline.signal.subspace import SMALL_FIELD
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, is_archive, store_at
-
-if TYPE_CHECKING:
-    import flows.survey as survey_flow
-else:
-    survey_flow = deferred("flows.survey")  # Prefect
 
 
 def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
@@ -136,13 +130,15 @@ def plan_content(settings: Settings) -> dict[str, Any]:
 
     Raises PipelineError: the survey would be refused for another reason than its size.
     """
+    from flows.survey import draw_class_map  # Prefect takes a second
+
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
             archive = Archive.open(settings.out, create=False, write=False)
         run = open_run(settings, planning=True, archive=archive)
         planner = Planner(run)
-        survey_flow.draw_class_map(planner)
+        draw_class_map(planner)
         if planner.is_judged:
             evaluate(planner, *planner.products.judged)
         fine: FinePlan | None = None

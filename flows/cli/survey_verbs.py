@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -12,12 +12,6 @@ from flows.settings.load import load_settings
 from flows.terminal.processes import format_failure
 from flows.terminal.progress import print_json, say, stderr
 from pipeline.errors import SurveyStopped
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import flows.survey_command as survey_command
-else:
-    survey_command = deferred("flows.survey_command")
 
 Verbose = Annotated[
     bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages and effects.")
@@ -35,6 +29,8 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     settings
         Settings files (TOML), surveyed one after the other; flags override each. Default: none.
     """
+    from flows.survey_command import run_survey
+
     every = [load_settings(file, by_setting(flags)) for file in settings or (None,)]
     printed: list[dict[str, Any]] = []
     code = 0
@@ -43,7 +39,7 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
             if len(every) > 1:
                 stderr.print(f"survey {number + 1} of {len(every)}: {settings[number]}", markup=False, soft_wrap=True)
             try:
-                printed.append(survey_command.run_survey(requested, stderr, verbose=verbose).receipt)
+                printed.append(run_survey(requested, stderr, verbose=verbose).receipt)
             except SurveyStopped as stopped:
                 printed.append({"until": stopped.until, "stored": stopped.uri, "archive": stopped.archive})
                 stderr.print(f"{stopped}", markup=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published, publish_run
 from flows.settings.values import KEEP_SIGNAL
 from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_tasks import as_task, inside_flow, prefect_artifacts
+from flows.tasks.prefect_tasks import as_task, inside_flow
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.condense import raw_differs
@@ -89,7 +89,9 @@ def _show_artifact(survey: OpenSurvey, published: Published) -> None:
             findings=[f"{name}: {text}" for name, text in finding_rows(published.receipt)],
             where=where,
         )
-        prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)
+        from prefect.artifacts import create_markdown_artifact
+
+        create_markdown_artifact(text, key=f"survey-{key}", description=where)
 
 
 def small_jpeg(png: bytes) -> bytes:

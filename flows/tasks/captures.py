@@ -13,7 +13,7 @@ from flows.settings.parameters import SurveySettings, at_due_time
 from flows.settings.survey_settings import RIG, Settings
 from flows.settings.values import KEEP_RAW
 from flows.tasks.open_survey import OpenSurvey
-from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow, prefect_context
+from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import scene_of_visit
 from flows.tasks.stages.attention import score
@@ -74,7 +74,11 @@ def _plan_capture(settings: SurveySettings) -> OpenSurvey:
 
 def _due_time() -> datetime | None:
     """Return the due time of a run of a deployment; None for other runs."""
-    context = prefect_context.FlowRunContext.get() if inside_flow() else None
+    if not inside_flow():
+        return None
+    from prefect.context import FlowRunContext
+
+    context = FlowRunContext.get()
     flow_run = None if context is None else context.flow_run
     if flow_run is None or flow_run.deployment_id is None or flow_run.expected_start_time is None:
         return None

@@ -24,15 +24,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
-from flows.tasks.prefect_tasks import (
-    prefect,
-    prefect_client,
-    prefect_filters,
-    prefect_handlers,
-    prefect_server,
-    prefect_settings,
-    uvicorn,
-)
 from flows.terminal.processes import cache_folder, place_pages
 from pipeline.errors import SettingsError
 
@@ -83,7 +74,11 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
     SettingsError: the port is in use.
     """
     with _listening(port) as listening, _using(home, listening.getsockname()[1], schedules=schedules) as api:
-        made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
+        import uvicorn
+        from prefect.logging.handlers import APILogWorker
+        from prefect.server.api.server import create_app
+
+        made: Any = create_app(final=schedules, ephemeral=not schedules)
         server = uvicorn.Server(uvicorn.Config(made, log_level="critical", lifespan="on"))
         thread = threading.Thread(
             target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True
@@ -97,7 +92,7 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
         try:
             yield api
         finally:
-            prefect_handlers.APILogWorker.drain_all(timeout=PATIENCE_S)
+            APILogWorker.drain_all(timeout=PATIENCE_S)
             server.should_exit = True
             thread.join(ENDED_WITHIN_S)
 
@@ -128,10 +123,10 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
     try:
-        known = {getattr(prefect_settings, name): value for name, value in wanted.items()}
-        with prefect_settings.temporary_settings(
-            updates={**known, prefect_settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
-        ):
+        from prefect import settings
+
+        known = {getattr(settings, name): value for name, value in wanted.items()}
+        with settings.temporary_settings(updates={**known, settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
             yield api
     except ImportError as error:
         raise ServerUnavailable(f"Prefect cannot be imported ({error})") from error
@@ -152,6 +147,8 @@ def create_database(path: Path) -> None:
     cache = cache_folder(os.environ)
     if path.exists() or cache is None:
         return
+    import prefect
+
     migrated = cache / "spectralzoom" / f"prefect-{prefect.__version__}.db"
     if not migrated.exists():
         _put_in_place(migrated, _migrate)
@@ -207,9 +204,12 @@ def wait_until_recorded(flow_run: Any) -> None:
 
     Tasks report in batches, which would be lost if the process ended before.
     """
-    of_run = prefect_filters.FlowRunFilter(id=prefect_filters.FlowRunFilterId(any_=[flow_run]))
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas import filters
+
+    of_run = filters.FlowRunFilter(id=filters.FlowRunFilterId(any_=[flow_run]))
     end = time.monotonic() + RECORDED_WITHIN_S
-    with suppress(Exception), prefect_client.get_client(sync_client=True) as client:  # the server may have stopped
+    with suppress(Exception), get_client(sync_client=True) as client:  # the server may have stopped
         while time.monotonic() < end:
             states = [run.state for run in client.read_task_runs(flow_run_filter=of_run)]
             if all(state is not None and state.is_final() for state in states):

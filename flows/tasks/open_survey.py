@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow, prefect_concurrency
+from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
@@ -21,16 +21,10 @@ from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import ground, segment
 from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
 from pipeline.errors import SurveyStopped
-from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.manifests import manifest_sha256
 from storage.archive.records import StageRecord
 from storage.archive.staging import bytes_below
-
-if TYPE_CHECKING:
-    import flows.tasks.rig_field as rig_field
-else:
-    rig_field = deferred("flows.tasks.rig_field")
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 LEASE_S = 60  # until a lost process frees that limit
@@ -147,15 +141,18 @@ class OpenSurvey:
             return
         if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
             return
+        from flows.tasks.rig_field import rig_to_oneself
+
         while inside_flow():  # signals are handled between tries
+            from prefect.concurrency.sync import concurrency
+
             try:
-                self._held.enter_context(
-                    prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
-                )
+                limit = concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
+                self._held.enter_context(limit)
                 break
             except TimeoutError:
                 self.observer.note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
-        self._held.enter_context(rig_field.rig_to_oneself(self.run.settings.rig.port))
+        self._held.enter_context(rig_to_oneself(self.run.settings.rig.port))
         self._holds_rig = True
 
     def stop_after(self, ref: StageRef, *stages: str) -> None:

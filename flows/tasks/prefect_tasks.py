@@ -10,37 +10,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
-
-from pipeline.lazy import deferred
-
-if TYPE_CHECKING:
-    import prefect
-    import prefect.artifacts as prefect_artifacts
-    import prefect.cache_policies as prefect_cache_policies
-    import prefect.client.orchestration as prefect_client
-    import prefect.client.schemas.filters as prefect_filters
-    import prefect.concurrency.sync as prefect_concurrency
-    import prefect.context as prefect_context
-    import prefect.logging.handlers as prefect_handlers
-    import prefect.runtime.task_run as prefect_task_run
-    import prefect.server.api.server as prefect_server
-    import prefect.settings as prefect_settings
-    import uvicorn
-else:
-    prefect = deferred("prefect")
-    prefect_artifacts = deferred("prefect.artifacts")
-    prefect_cache_policies = deferred("prefect.cache_policies")
-    prefect_client = deferred("prefect.client.orchestration")
-    prefect_concurrency = deferred("prefect.concurrency.sync")
-    prefect_context = deferred("prefect.context")
-    prefect_filters = deferred("prefect.client.schemas.filters")
-    prefect_handlers = deferred("prefect.logging.handlers")
-    prefect_server = deferred("prefect.server.api.server")
-    prefect_settings = deferred("prefect.settings")
-    prefect_task_run = deferred("prefect.runtime.task_run")
-    uvicorn = deferred("uvicorn")
-
+from typing import Any, TypeVar
 
 RETRY_DELAY_S = 2.0
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -48,7 +18,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def inside_flow() -> bool:
     """Return whether a Prefect flow is running."""
-    return "prefect.context" in sys.modules and prefect_context.FlowRunContext.get() is not None
+    if "prefect.context" not in sys.modules:
+        return False
+    from prefect.context import FlowRunContext
+
+    return FlowRunContext.get() is not None
 
 
 def as_task(function: Function, name: str, *, retries: int = 0) -> Function:
@@ -62,15 +36,19 @@ def as_task(function: Function, name: str, *, retries: int = 0) -> Function:
 
 @cache
 def _task(function: Any, name: str, retries: int) -> Any:
+    import prefect
+    from prefect.cache_policies import NO_CACHE
+    from prefect.runtime import task_run
+
     def run_name() -> str:
-        subject = next(iter(prefect_task_run.parameters.values()), None)
+        subject = next(iter(task_run.parameters.values()), None)
         return f"{name}-{getattr(subject, 'name_of_run', 'survey')}"
 
     return prefect.task(
         function,
         name=name,
         task_run_name=run_name,
-        cache_policy=prefect_cache_policies.NO_CACHE,  # the archive finds stores by their content
+        cache_policy=NO_CACHE,  # the archive finds stores by their content
         persist_result=False,
         retries=retries,
         retry_delay_seconds=RETRY_DELAY_S,
@@ -117,4 +95,6 @@ def current_observer() -> Observer:
 def log_to_run(text: str) -> None:
     """Write a line into the log of the Prefect run; errors of the server are ignored."""
     with suppress(Exception):
-        prefect.get_run_logger().info(text)
+        from prefect import get_run_logger
+
+        get_run_logger().info(text)

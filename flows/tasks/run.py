@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
-from pipeline.lazy import Once, deferred
+from pipeline.lazy import Once
 from pipeline.planning.fine_pass import FinePlan, SecondPass
 from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.placed import PixelGrid, place
@@ -72,12 +72,6 @@ from storage.arrays.layout import image_spec
 from storage.parallel.pool import WorkerPool
 from storage.readers.open_cubes import load_labels_array
 from storage.readers.scene_files import RasterPixels, SceneFile
-
-if TYPE_CHECKING:
-    import flows.tasks.rig_field as rig_field
-else:
-    rig_field = deferred("flows.tasks.rig_field")
-
 
 PRIOR_MAP_GAIN = 3.0  # least gain with a prior map over that without one: losses are then alike (prior-maps.md)
 REPRESENTATIVE = 3  # exposures of a second pass, for which effects are chosen
@@ -442,7 +436,9 @@ def _open_source(
     elif settings.is_map:
         source = FieldSource()
     elif settings.source == RIG:
-        source = rig_field.rig_field(scene, settings, (*plan.coarse, *plan.full), simulated)
+        from flows.tasks.rig_field import rig_field
+
+        source = rig_field(scene, settings, (*plan.coarse, *plan.full), simulated)
     if pixels is None:
         check_memory(simulated, grid, plan, settings.memory, settings.pool)
         return source, simulated, None

@@ -27,14 +27,11 @@ from models.network.spectral import (
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.lazy import Tensor, deferred, torch
+from pipeline.lazy import Tensor, torch
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    from models.network import segmenter
     from models.network.segmenter import Overview
-else:
-    segmenter = deferred("models.network.segmenter")
 
 ROWS_DRAWN = 64  # at once
 # Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on
@@ -184,7 +181,9 @@ def load_overview(path: Path, weights: Weights) -> Overview | None:
         return None
     stored = torch.from_numpy(np.load(path)).to(weights.segmenter.device)
     width = weights.config.overview_width
-    return segmenter.Overview(stored[:, :width], stored[:, width:])
+    from models.network.segmenter import Overview
+
+    return Overview(stored[:, :width], stored[:, width:])
 
 
 def segment(

@@ -19,16 +19,13 @@ from models.network.sizes import SegmenterConfig, TemporalSizes
 from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
 from pipeline.errors import WavelengthError, WeightsError
-from pipeline.lazy import Tensor, deferred, torch
+from pipeline.lazy import Tensor, torch
 from pipeline.readings import readings_alone
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
-    from models.network import segmenter, temporal_reader
     from models.network.segmenter import Segmenter
-else:
-    temporal_reader = deferred("models.network.temporal_reader")
-    segmenter = deferred("models.network.segmenter")
+    from models.network.temporal_reader import TemporalReader
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/6"
@@ -183,7 +180,7 @@ def add_map_scores(weights: Path, map_scores: MapScores) -> None:
     _add_part(weights, weights, MAP_SCORES, map_scores.as_dict(), {})
 
 
-def add_reader(weights: Path, out: Path, reader: temporal_reader.TemporalReader, record: Mapping[str, Any]) -> None:
+def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
     """Write the weights of a file with a temporal reader to ``out``. Raises as `add_map_scores`."""
     _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
 
@@ -196,7 +193,7 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
     write_checksummed(out, {**described.about, "keys": keys, part: about}, kept | added)
 
 
-def load_reader(weights: Path) -> temporal_reader.TemporalReader:
+def load_reader(weights: Path) -> TemporalReader:
     """Load the temporal reader of weights. WeightsError: their file has none, or it is damaged."""
     described = describe_weights(weights)
     if described.reader is None:
@@ -204,8 +201,10 @@ def load_reader(weights: Path) -> temporal_reader.TemporalReader:
             f"{weights} has no temporal reader; train one with: spectralzoom train DATASET --train-temporal "
             f"{weights} -o {weights}"
         )
+    from models.network.temporal_reader import TemporalReader
+
     with torch.device("meta"):
-        reader = temporal_reader.TemporalReader(described.reader.sizes)
+        reader = TemporalReader(described.reader.sizes)
     tensors = read_tensors(weights, described.about, lambda name: name.startswith(f"{READER}."))
     with refusing(weights):
         _check_numbers(tensors)
@@ -219,10 +218,12 @@ def load_weights(path: Path) -> Weights:
     Raises WeightsError: it is missing or of another format, or a tensor is damaged, does not fit the config, or has a
     value that is not finite.
     """
+    from models.network.segmenter import Segmenter
+
     described = describe_weights(path)
     config = described.config
     with torch.device("meta"):
-        network = segmenter.Segmenter(config)
+        network = Segmenter(config)
     tensors = read_tensors(path, described.about, lambda name: not name.startswith(f"{READER}."))
     with refusing(path):
         _check_numbers(tensors)

@@ -17,7 +17,7 @@ from affine import Affine
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import GeoBox, odc_crs, odc_geo_xr, odc_geobox
+from pipeline.lazy import GeoBox, odc_crs, odc_geobox, odc_xr
 from storage.arrays.layout import SmallArray, create_group, damage_named, open_group, zarr
 
 GRID_MAPPING = "spatial_ref"
@@ -144,7 +144,7 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
 
 def grid_mapping(geobox: GeoBox) -> SmallArray:
     """Return CRS and transform of a map as CF's grid mapping."""
-    mapping = odc_geo_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
+    mapping = odc_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
     return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
 
 
