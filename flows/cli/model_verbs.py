@@ -31,7 +31,7 @@ class SceneFlags:
     Parameters
     ----------
     seed
-        Random seed of initial weights, crops, noise, random policy and bootstrap.
+        Random seed of initial weights, crops, noise and random policy.
     scenes
         Number of built-in scenes. Default: 4 to evaluate; 48 to train, on days from April to October (`scouting`: May
         to July).

@@ -263,28 +263,26 @@ def _corners_on(
     return scene_to_sweep(sweep, camera, corners_along, np.stack([low, high, low, high])[..., scan])
 
 
-def select_patches(score: NDArray[np.floating], count: int, valid: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
-    """Return the ``count`` valid patches with the highest ``score`` (patch,), best first.
+def select_patches(score: NDArray[np.floating], count: int) -> NDArray[np.intp]:
+    """Return the ``count`` patches with the highest ``score`` (patch,), best first.
 
     Equal scores go to the lowest number, +inf comes first, NaN and -inf last. A smaller count gives the first patches
     of a larger one.
     """
-    allowed = np.arange(len(score)) if valid is None else np.flatnonzero(valid)
-    given = np.asarray(score, np.float64)[allowed]
-    return allowed[np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")[:count]]
+    given = np.asarray(score, np.float64)
+    return np.argsort(np.where(np.isnan(given), np.inf, -given), kind="stable")[:count]
 
 
-def frame_patches(
-    score: NDArray[np.floating], fraction: float, valid: NDArray[np.bool_] | None = None
-) -> NDArray[np.intp]:
-    """Return a fraction of the valid patches, chosen by `select_patches`; half a patch is rounded up.
+def frame_patches(score: NDArray[np.floating], fraction: float) -> NDArray[np.intp]:
+    """Return a fraction of the patches, chosen by `select_patches`; half a patch is rounded up.
 
     Raises BudgetError: the fraction is not a number from 0 to 1.
     """
-    number = len(score) if valid is None else int(np.count_nonzero(valid))
     if not 0 <= fraction <= 1:  # NaN too
-        raise BudgetError(f"the fraction of patches to buy must be from 0 to 1, got {fraction} (of {number} patches)")
-    return select_patches(score, min(int(np.floor(fraction * number + 0.5)), number), valid)
+        raise BudgetError(
+            f"the fraction of patches to buy must be from 0 to 1, got {fraction} (of {len(score)} patches)"
+        )
+    return select_patches(score, int(np.floor(fraction * len(score) + 0.5)))
 
 
 @dataclass(frozen=True)

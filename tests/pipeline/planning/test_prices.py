@@ -58,13 +58,6 @@ def test_a_smaller_choice_of_patches_begins_a_larger_one(values: list[float], da
     assert len(set(chosen.tolist())) == large
 
 
-def test_only_valid_patches_are_chosen():
-    """Masked patches are neither chosen nor counted, however high their score."""
-    valid = np.array([False, True, True, False])
-    assert coverage.select_patches(np.array([9.0, 1, 2, 9]), 2, valid).tolist() == [2, 1]
-    assert len(coverage.frame_patches(np.arange(64.0), 0.35, np.arange(64) < 20)) == 7
-
-
 @given(st.floats(0, 1), st.integers(0, 500))
 def test_patch_counts_follow_the_fraction(fraction: float, valid: int):
     """The count is within half a patch of the fraction and at most the number of patches."""
