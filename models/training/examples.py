@@ -66,7 +66,7 @@ def observe(
         first, last = max(top - HALO, 0), min(top + strip + HALO, rows)
         blurred = footprint(planes[first:last], camera)[top - first : top - first + strip]
         electrons = electrons_of(scene, blurred, camera)
-        columns[top : top + strip] = (expose(electrons, camera, step=1, rng=stream) * scale) @ matrix
+        columns[top : top + strip] = (expose(electrons, camera, rng=stream) * scale) @ matrix
     noise = ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
     return Example(scene.name, columns, labels, (grid.height, grid.width), noise)
 

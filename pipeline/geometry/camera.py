@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.setting_fields import assumed, stated
 
 Number = TypeVar("Number", float, NDArray[np.float64])
@@ -70,11 +69,6 @@ class LineCamera:
     def scan_seconds(self, lines: int) -> float:
         """Return the time for ``lines`` lines in one uninterrupted sweep [s] (the paper's t_img = N t_frame)."""
         return lines * self.frame_ms * 1e-3
-
-    @property
-    def most_binning(self) -> int:
-        """Return the largest number of samples whose sum always fits 16 bits."""
-        return LARGEST_SUM_DN // self.full_scale_dn
 
     def pixel_slopes(self, binning: int = 1) -> NDArray[np.float64]:
         """Return the tangent k_y/k_z of each (binned) sample's ray, (sample,) float64."""
@@ -139,50 +133,18 @@ def _shot_and_read(expected: NDArray[np.float32], camera: LineCamera, rng: np.ra
     return variance + expected
 
 
-def bin_samples(dn: NDArray[np.uint16], binning: int) -> NDArray[np.uint16]:
-    """Sum ``binning`` neighbouring samples, (..., sample, band) -> (..., sample // binning, band).
-
-    Samples that do not fill a bin are dropped.
-
-    Raises ShapeError: fewer samples than ``binning``, or a sum exceeds 16 bits.
-    """
-    if binning == 1:
-        return dn
-    count = dn.shape[-2] // binning
-    if count == 0:
-        raise ShapeError(f"cannot bin {dn.shape[-2]} samples by {binning}; use a smaller factor")
-    whole = dn[..., : count * binning, :].reshape(*dn.shape[:-2], count, binning, dn.shape[-1])
-    sums = whole.sum(axis=-2, dtype=np.uint32)
-    if (largest := int(sums.max(initial=0))) > LARGEST_SUM_DN:
-        raise ShapeError(
-            f"the sum of {binning} samples reaches {largest} DN, above the {LARGEST_SUM_DN} that 16 bits hold;"
-            " use a smaller factor or fewer bits"
-        )
-    return np.asarray(sums.astype(np.uint16))
-
-
 def footprint(light: NDArray[np.floating], camera: LineCamera) -> NDArray[np.float32]:
     """Blur a grid-aligned scene by the slit along y and the pixel along x; (y, x, k) in any linear unit."""
     return _convolve(_convolve(light, footprint_kernel(camera.slit_px), 0), footprint_kernel(1.0), 1)
 
 
-def expose(
-    seen: NDArray[np.floating], camera: LineCamera, *, step: int, rng: np.random.Generator | None
-) -> NDArray[np.float32]:
-    """Return one exposure by line of a grid-aligned scene (y, x, band) [e-] after the footprint; scan along y.
+def expose(seen: NDArray[np.floating], camera: LineCamera, *, rng: np.random.Generator | None) -> NDArray[np.float32]:
+    """Return one exposure by line of a grid-aligned scene (y, x, band) [e-] after the footprint, as float32 electrons.
 
-    The coarse pass takes every ``step``-th line. The mirror moves ``step`` px during one exposure, and ``step``
-    neighbouring samples are averaged, so that noise falls by sqrt(step), not by step. ``step=1`` is the fine pass. The
-    result is (y / step, x / step, band) float32 electrons without the dark level.
-
-    Raises ShapeError: a size is not a multiple of ``step``, or a binned sum exceeds 16 bits.
+    They are without the dark level. ``rng`` None means no noise.
     """
-    y, x, bands = seen.shape
-    if y % step or x % step:
-        raise ShapeError(f"a scene of {(y, x)} px does not divide by the step {step}; pad it first")
-    held = seen.reshape(y // step, step, x, bands).mean(axis=1)
-    dn = bin_samples(digitise(held, camera, rng), step).astype(np.float32)
-    return (dn / np.float32(step) - np.float32(camera.dark_dn)) * np.float32(camera.electrons_per_dn)
+    dn = digitise(seen, camera, rng).astype(np.float32)
+    return (dn - np.float32(camera.dark_dn)) * np.float32(camera.electrons_per_dn)
 
 
 def _convolve(image: NDArray[np.floating], kernel: NDArray[np.float64], axis: int) -> NDArray[np.float32]:

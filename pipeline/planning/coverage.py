@@ -50,7 +50,7 @@ def uniform_sweeps(
     exposure_ms: float | None = None,
     overlap_px: float = 0,
 ) -> list[Sweep]:
-    """Cover the whole scene with lines of ``step`` held positions without binning.
+    """Cover the whole scene with lines of ``step`` held positions.
 
     ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution; ``exposure_ms`` None takes the
     camera's.
@@ -59,7 +59,7 @@ def uniform_sweeps(
     mirror's range.
     """
     return [
-        replace(sweep, name=f"scan-{number}", kind="coarse", binning=1, exposure_ms=exposure_ms)
+        replace(sweep, name=f"scan-{number}", kind="coarse", exposure_ms=exposure_ms)
         for number, sweep in enumerate(_cover(grid, camera, along, step=step, overlap_px=overlap_px))
     ]
 
@@ -140,7 +140,7 @@ def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overl
     for number, swath in enumerate(_swath_centres((low, high), scan, camera, step, overlap_px)):
         seen = np.clip(swath + reach_px(swath, scan, camera, step), low + step / 2, high - step / 2)
         start, lines = _scan_range(float(swath), seen, scan, camera, step)
-        sweeps.append(Sweep(f"{name}-{number}", kind, along, float(swath), start, lines, step, step))
+        sweeps.append(Sweep(f"{name}-{number}", kind, along, float(swath), start, lines, step))
     check_reach(sweeps, camera)
     return sweeps
 

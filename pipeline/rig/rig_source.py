@@ -1,8 +1,7 @@
 """The rig as a source of lines: mirror and camera take a sweep in captures, and its lines come back in order.
 
-Each capture has as many lines as the mirror's vector memory holds positions for. Its files are fetched, its lines get
-their positions, and their samples are binned. A line's position is that of the path at its time by the camera's
-stamps.
+Each capture has as many lines as the mirror's vector memory holds positions for. Its files are fetched, and its lines
+get their positions: that of the path at a line's time by the camera's stamps.
 
 A journal beside the fetched files records all that the rig has acknowledged. A later call with the same ``kept``
 continues a transfer where it broke off, and captures only what the camera does not have.
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RigError
-from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
@@ -32,7 +31,6 @@ from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.drivers import RigDevices
 from pipeline.rig.transports import DeviceRefused, StateUnknown
 from pipeline.signal.calibrate import full_scale_notes
-from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
 
 LOG = logging.getLogger(__name__)
@@ -136,11 +134,10 @@ class RigSource:
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the sweep's lines one by one, from line ``first`` on.
 
-        Raises ShapeError: sums of ``sweep.binning`` samples may exceed uint16. Raises PoseError: a position is beyond
-        the mirror's reach. Raises StateUnknown: a motion or a capture was sent and not acknowledged. Raises RigError: a
-        device failed, or its answer does not fit; earlier lines and acknowledged captures stay.
+        Raises PoseError: a position is beyond the mirror's reach. Raises StateUnknown: a motion or a capture was sent
+        and not acknowledged. Raises RigError: a device failed, or its answer does not fit; earlier lines and
+        acknowledged captures stay.
         """
-        check_binning(sweep, self.camera)
         if first >= sweep.lines:
             return
         line = first
@@ -174,7 +171,7 @@ class RigSource:
                     LOG.warning("%s: line %d is captured again; %s: %s", sweep.name, line, taken.folder, reason)
 
     def references(self, sweep: Sweep) -> References:
-        """Return the dark and white frames with the sweep's binning; they are captured once for each exposure."""
+        """Return the dark and white frames; they are captured once for each exposure."""
         exposure_ms = sweep.exposure_ms
         folders = self._journal.references
         if folders.get(exposure_ms, "") not in self._whole:
@@ -187,9 +184,8 @@ class RigSource:
                 assert known is not None
                 self._whole[folders[exposure_ms]] = known
         whole = self._whole[folders[exposure_ms]]
-        bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
-        dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
-        return References(dark, white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
+        bad = None if whole.bad is None or not whole.bad.any() else whole.bad
+        return References(whole.dark, whole.white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
 
     def _known_references(self, runner: CaptureRunner, folder: str) -> References | None:
         """Return the frames of an earlier session; None where the camera does not have them any more."""
@@ -232,14 +228,14 @@ class RigSource:
         located = locate_lines(captured, path, taken, self.camera)
         self._journal.record_positions(taken, located.positions, captured.notes)
         sweep = taken.sweep
-        nothing = np.zeros((captured.values.shape[1] // sweep.binning, captured.values.shape[2]), np.uint16)
+        nothing = np.zeros(captured.values.shape[1:], np.uint16)
         for place in range(line - path.first, len(located.row)):
             row = int(located.row[place])
             valid = located.is_valid(place)
             x, y = located.positions.position[row] if valid else path.middle[place]
             yield Line(
                 number=path.first + place,
-                data=bin_samples(captured.values[row], sweep.binning) if row >= 0 else nothing,
+                data=captured.values[row] if row >= 0 else nothing,
                 mirror_x=float(x),
                 mirror_y=float(y),
                 time_s=self._time_s(sweep, path.first + place, int(located.stamp_us[row]) if row >= 0 else -1),
@@ -263,8 +259,3 @@ class RigSource:
                 f"{folder} holds lines of {found} (sample, band), the settings say {wanted}; set camera.samples and "
                 "the wavelengths to what the camera gives"
             )
-
-
-def _sums(frame: NDArray[Any], binning: int) -> NDArray[np.float32]:
-    count = len(frame) // binning
-    return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1, dtype=np.float32))

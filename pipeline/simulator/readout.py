@@ -40,7 +40,7 @@ def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Cho
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
 
     ``light``: (line, sample, band) of the block; negative values count as 0. [e-]
-    Returns (line, sample, band) uint16, before binning.
+    Returns (line, sample, band) uint16.
     Raises SceneError: a number is not finite; names the first.
     """
     readout = Readout(block, Choice.of(chosen))

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import wire_positions
 from pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
 from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
@@ -83,8 +82,7 @@ class SimulatedSource:
         return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Yield the sweep's lines from line ``first`` on. Raises ShapeError, PoseError as `render_lines`."""
-        check_binning(sweep, self.camera)
+        """Yield the sweep's lines from line ``first`` on. Raises PoseError as `render_lines`."""
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self.lines_of(sweep, range(start, min(start + BLOCK_LINES, sweep.lines)))
 
@@ -110,7 +108,7 @@ class SimulatedSource:
         return None
 
     def references(self, sweep: Sweep) -> References:
-        """Return means of dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
+        """Return means of dark and white frames (sample, band), free of noise. [DN]
 
         The white frame is scaled from a shorter exposure, so that it does not saturate. It is taken with the mirror at
         rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are
@@ -133,14 +131,14 @@ class SimulatedSource:
         if self.choice.variant(DEFECTS.name) != OFF:
             dead = dead_elements(rig, seen.shape[1])
             seen[dead] = 0
-            elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)  # of a sum one is enough
-            bad = _binned(elements.astype(np.float32), sweep.binning) > 0 if elements.any() else None
+            elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)
+            bad = elements if elements.any() else None
         white_reference = self.scene.white_reference.astype(np.float32)
         if (response := self.choice.variant(RESPONSE.name)) != OFF:
             white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
         return References(
-            dark=_binned(dark, sweep.binning),
-            white=_binned(dark + seen / np.float32(rig.camera.electrons_per_dn), sweep.binning),
+            dark=_rounded(dark),
+            white=_rounded(dark + seen / np.float32(rig.camera.electrons_per_dn)),
             white_reference=white_reference,
             bad=bad,
             by_mirror=self.choice.variant(VIGNETTING.name) != OFF,
@@ -221,35 +219,20 @@ def render_lines(
     seed: int = 0,
     started_s: float = 0.0,
 ) -> Raw:
-    """Return the raw numbers of some lines, (line, sample, band) uint16, binned [DN]. Threads may share arguments.
+    """Return the raw numbers of some lines, (line, sample, band) uint16 [DN]. Threads may share arguments.
 
-    Neither the other lines asked for nor the order of calls changes a number. Raises ShapeError: sums of
-    ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position is out of the mirror's reach.
+    Neither the other lines asked for nor the order of calls changes a number. Raises PoseError: a position is out of
+    the mirror's reach.
     """
-    check_binning(sweep, rig.camera)
     choice = Choice.of(chosen)
-    raw = np.empty((len(lines), rig.camera.samples // sweep.binning, len(scene.wavelength_nm)), np.uint16)
+    raw = np.empty((len(lines), rig.camera.samples, len(scene.wavelength_nm)), np.uint16)
     for first in range(0, len(lines), BLOCK_LINES):
         some = slice(first, first + BLOCK_LINES)
         block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s)
-        raw[some] = bin_samples(read_out(expected_light(scene, block, choice), block, choice), sweep.binning)
+        raw[some] = read_out(expected_light(scene, block, choice), block, choice)
     return raw
 
 
-def check_binning(sweep: Sweep, camera: LineCamera) -> None:
-    """Refuse sums that do not fit raw numbers.
-
-    Raises ShapeError: ``sweep.binning`` samples at full scale sum to more than uint16 holds.
-    """
-    if sweep.binning > camera.most_binning:
-        raise ShapeError(
-            f"sweep {sweep.name}: sums of {sweep.binning} samples of {camera.bits} bits do not fit uint16; "
-            f"bin at most {camera.most_binning}"
-        )
-
-
-def _binned(frame: Frame, binning: int) -> Frame:
-    """Return a frame with summed samples, rounded as a mean of `REFERENCE_FRAMES` frames of whole numbers is."""
-    count = len(frame) // binning
-    frame = (np.floor(frame.astype(np.float64) * REFERENCE_FRAMES + 0.5) / REFERENCE_FRAMES).astype(np.float32)
-    return np.asarray(frame[: count * binning].reshape(count, binning, -1).sum(axis=1))
+def _rounded(frame: Frame) -> Frame:
+    """Return a frame rounded as a mean of `REFERENCE_FRAMES` frames of whole numbers is."""
+    return (np.floor(frame.astype(np.float64) * REFERENCE_FRAMES + 0.5) / REFERENCE_FRAMES).astype(np.float32)

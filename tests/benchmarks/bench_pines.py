@@ -182,7 +182,7 @@ def exposed(scene: RasterScene, seed: int | Sequence[int]) -> Values:
     """Return a fine exposure of a scene, (y, x, band), as the fine pass of the training before its columns."""
     camera = LineCamera()
     electrons = electrons_of(scene, footprint(np.asarray(scene.planes, np.float32), camera), camera)
-    values = expose(electrons, camera, step=1, rng=np.random.default_rng(seed))
+    values = expose(electrons, camera, rng=np.random.default_rng(seed))
     return np.asarray(values * (scene.white_reference / scene.white_reference_electrons), np.float32)
 
 

@@ -192,8 +192,7 @@ class DarkCurrent(Effect):
         sd = float(np.hypot(rig.camera.read_noise_e, np.sqrt(max(probe.darkest_e, 0.0))))
         spread = separable(float(np.hypot(sd, np.sqrt(electrons))), sd)
         if probe.unit == "dn":
-            summed = float(np.sqrt(probe.binning))  # the spread of a sum over that of a sample
-            spread *= summed * float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
+            spread *= float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
         warm = rig.detector.temperature_deg_c
         why = f"{electrons:.3g} e- in {rig.camera.exposure_ms:g} ms at {warm:g} deg C, beside {sd:.3g} e- of noise"
         return Bound(probe.added(electrons, rig.camera.electrons_per_dn) + spread, why)
@@ -312,8 +311,8 @@ class Shot(Effect):
         total = float(np.hypot(np.sqrt(brightest), read))
         if variant == GAUSSIAN:
             worst = max(chip_variation(0.0), chip_variation(read))
-            # for one sample: 2 TV <= sqrt(divergence), which sums with samples.
-            apart = 2 * worst / np.sqrt(CHIP_SAMPLES) * np.sqrt(probe.binning)
+            # for one sample: 2 TV <= sqrt(divergence)
+            apart = 2 * worst / np.sqrt(CHIP_SAMPLES)
             return Bound(
                 in_unit(apart, total, probe, rig),
                 f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"
@@ -328,7 +327,7 @@ def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
     """Return deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
     if probe.unit == "sigma":
         return deviations
-    return deviations * sd_e * float(np.sqrt(probe.binning)) / rig.camera.electrons_per_dn
+    return deviations * sd_e / rig.camera.electrons_per_dn
 
 
 @dataclass(frozen=True)

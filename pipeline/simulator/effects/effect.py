@@ -101,7 +101,7 @@ class LightChange(Effect, Protocol):
 
 @dataclass(frozen=True)
 class SweepBlock:
-    """Lines ``lines`` (numbers within the sweep), with all samples of the camera, before binning.
+    """Lines ``lines`` (numbers within the sweep), with all samples of the camera.
 
     A result never depends on which other lines are in the block. ``started_s`` is since the survey's start.
     """

@@ -1,8 +1,6 @@
 """Basis of decisions on effects: a summary of scene and rig, units of stored numbers, gains over wavelength.
 
-A number of a raw line sums neighbouring samples, and has the noise of that sum. All is counted per sample: light as the
-mean over the samples of a sum, noise as that of the mean. A change of the one over the other is the change of the
-stored number in its own sigmas, whatever the binning.
+A change of light over its noise is the change of the stored number in its own sigmas.
 """
 
 from __future__ import annotations
@@ -30,9 +28,7 @@ class Probe:
     """Maxima over a scene, band by band, as the footprint of slit and pixel alone shows it.
 
     All but the electrons are over the unit of the tolerance. That is one standard deviation of the noise of the stored
-    number, or one DN of it. If that sums ``binning`` samples, a maximum is of the mean of their sizes over the noise of
-    their mean. So a change of any sign at each of them is bounded, and only as far as needed where they differ. Axis 0
-    of ``slope`` and ``curvature`` is (along the line, along the scan).
+    number, or one DN of it. Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
 
     unit: Unit
@@ -51,7 +47,6 @@ class Probe:
     seconds: float  # from the first line to the last
     white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
-    binning: int = 1  # samples that a stored number sums, the same in all of the sweeps
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
@@ -85,35 +80,18 @@ def _times(steep: Floats, way: Floats | float) -> Floats:
     return np.multiply(steep, way, out=np.zeros(np.shape(steep)), where=np.not_equal(way, 0))
 
 
-def stored_mean(light: NDArray[np.floating], binning: int) -> NDArray[np.floating]:
-    """Return the mean of each ``binning`` neighbours, (..., sample, band) -> (..., sample // binning, band).
-
-    A remainder is dropped, as in the raw lines.
-    """
-    if binning == 1:
-        return light
-    count = light.shape[-2] // binning
-    whole = light[..., : count * binning, :].reshape(*light.shape[:-2], count, binning, light.shape[-1])
-    return np.asarray(whole.mean(axis=-2))
-
-
-def noise_electrons(signal: NDArray[np.floating], rig: Rig, binning: int = 1) -> Radiance:
-    """Return one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]
-
-    ``signal`` is the mean of ``binning`` samples, each with noise of its own, and the noise is that of the mean.
-    """
+def noise_electrons(signal: NDArray[np.floating], rig: Rig) -> Radiance:
+    """Return one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]"""
     quantised = rig.camera.electrons_per_dn**2 / 12
     if rig.detector.noiseless:
-        return np.full_like(signal, np.sqrt(quantised / binning))
+        return np.full_like(signal, np.sqrt(quantised))
     noise: Radiance = np.sqrt(np.maximum(signal, 0) + np.float32(rig.camera.read_noise_e**2 + quantised))
-    return noise if binning == 1 else noise / np.float32(np.sqrt(binning))
+    return noise
 
 
-def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit, binning: int = 1) -> Radiance:
-    """Return what a unit of the tolerance, of a number that sums ``binning`` samples, is of their mean signal. [e-]"""
-    if unit == "sigma":
-        return noise_electrons(signal, rig, binning)
-    return np.full_like(signal, rig.camera.electrons_per_dn / binning)
+def unit_at(signal: NDArray[np.floating], rig: Rig, unit: Unit) -> Radiance:
+    """Return what a unit of the tolerance is at each signal. [e-]"""
+    return noise_electrons(signal, rig) if unit == "sigma" else np.full_like(signal, rig.camera.electrons_per_dn)
 
 
 def fixed_variance(camera: LineCamera) -> float:

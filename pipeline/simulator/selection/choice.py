@@ -1,8 +1,5 @@
 """Choose which effects to compute, and how, so that what is left out stays within one tolerance; list what was chosen.
 
-The tolerance applies to stored numbers, sums of samples where a sweep bins them. An effect counts by its change at the
-binning where that is greatest.
-
 The search is greedy, and starts with everything exact. The cheaper option that still fits and saves most per added
 error is taken, until none fits. One long step may be shut out by a short one. So the same is tried after each single
 step, and the cheapest end counts: it saves at least half of what can be saved. A larger tolerance never costs more, but
@@ -93,8 +90,8 @@ def decide(
     """Choose off or a variant for every effect, so that the sum of their errors stays within the tolerance.
 
     Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
-    and saturation are never off; what the rig has none of always is. ``probes``: one for each binning and exposure of
-    the survey; the worst counts. ``effects``: in the order of the chain, which does not change what is chosen.
+    and saturation are never off; what the rig has none of always is. ``probes``: one for each exposure of the
+    survey; the worst counts. ``effects``: in the order of the chain, which does not change what is chosen.
     ``tolerance``: greatest change of any stored number, in the unit of the probes. ``asked``: ``auto``; ``all``: on and
     exact; ``none``; or names with commas: those on, in the variants that the tolerance lets them have, the others off.
 
@@ -203,8 +200,8 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
 def list_effects(decision: Decision) -> list[dict[str, Any]]:
     """Return one plain row for every effect, in the order of the chain.
 
-    ``bound`` is on the change of any stored number, at the worst binning, with the factor of safety, in ``unit``. It is
-    0 where exact or absent, None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``reason`` is
+    ``bound`` is on the change of any stored number, with the factor of safety, in ``unit``. It is 0 where exact or
+    absent, None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``reason`` is
     that of `Treatment`. ``left_out`` is the bound on leaving it out, and ``magnitude`` the words of that bound.
     """
     return [

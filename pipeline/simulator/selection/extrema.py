@@ -34,12 +34,12 @@ _STRIP_PX = 2**21  # of which a strip of more tiles has less
 def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], most: int) -> Floats:
     """Return the pixels where light changes most over its noise, and where it is greatest and least.
 
-    ``sweeps`` are of one binning. Returns (place, 2) rows and columns [px], at most ``most``, the worst of every
+    Returns (place, 2) rows and columns [px], at most ``most``, the worst of every
     measure first. Each is in a tile of its own for one measure and band. Raises SceneError: the scene holds a number
     that is not finite.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    optics = PixelOptics.of(camera, sweeps[0].binning, tuple(sorted({sweep.along == "y" for sweep in sweeps})))
+    optics = PixelOptics.of(camera, tuple(sorted({sweep.along == "y" for sweep in sweeps})))
     tile = max(8, math.ceil(math.sqrt(scene.shape[0] * scene.shape[1] / _TILES)))
     ranking = Ranking()
     own_planes = spectra.ndim == 1
@@ -160,53 +160,40 @@ class PixelOptics:
     slit: NDArray[np.float32]
     pixel: NDArray[np.float32]
     fixed_noise: float
-    binning: int
     turned: tuple[bool, ...]
 
     @staticmethod
-    def of(camera: LineCamera, binning: int, turned: tuple[bool, ...]) -> PixelOptics:
+    def of(camera: LineCamera, turned: tuple[bool, ...]) -> PixelOptics:
         slit, pixel = _short_kernel(camera.slit_px), _short_kernel(1.0)
-        return PixelOptics(slit, pixel, fixed_variance(camera), binning, turned)
+        return PixelOptics(slit, pixel, fixed_variance(camera), turned)
 
     @property
     def halo(self) -> int:
-        """Return the reach of kernels, differences and sums [px]."""
-        return len(self.slit) // 2 + len(self.pixel) // 2 + 1 + self.binning // 2
+        """Return the reach of kernels and differences [px]."""
+        return len(self.slit) // 2 + len(self.pixel) // 2 + 1
 
     def noise(self, light: Radiance) -> Radiance:
         """Return one standard deviation at each light [e-]."""
         return np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
 
     def measures(self, light: Radiance) -> Iterator[Radiance]:
-        """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first.
-
-        Summed samples count by the average of sizes along the line, as in the probe.
-        """
+        """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first."""
         inner = (slice(self.halo, -self.halo), slice(self.halo, -self.halo))
         for along_y in self.turned:
             line = 0 if along_y else 1
             seen = _blurred(_blurred(light, self.slit, 1 - line), self.pixel, line)
-            level = self._summed(seen, line)[inner]
+            level = seen[inner]
             noise = self.noise(level)
             yield level
             yield -level
-            yield self._summed(np.abs(light - seen), line)[inner] / noise
+            yield np.abs(light - seen)[inner] / noise
             for axis in (0, 1):
                 ahead, behind = np.roll(seen, -1, axis), np.roll(seen, 1, axis)
-                yield self._summed(np.abs(ahead - behind), line)[inner] / noise
-                yield self._summed(np.abs(ahead + behind - 2 * seen), line)[inner] / noise
+                yield np.abs(ahead - behind)[inner] / noise
+                yield np.abs(ahead + behind - 2 * seen)[inner] / noise
             rise: Radiance = np.roll(seen, -1, 0) - np.roll(seen, 1, 0)
             mixed = np.abs(np.roll(rise, -1, 1) - np.roll(rise, 1, 1))  # what a box that does not lie turned misses
-            yield np.divide(self._summed(mixed, line)[inner], noise)
-
-    def _summed(self, values: Radiance, axis: int) -> Radiance:
-        """Return the mean over the samples of a stored number about each pixel, along an axis."""
-        if self.binning == 1:
-            return values
-        steps = np.arange(self.binning) - self.binning // 2
-        total: Radiance = sum((np.roll(values, -step, axis) for step in steps.tolist()), np.zeros_like(values))
-        total /= np.float32(self.binning)
-        return total
+            yield np.divide(mixed[inner], noise)
 
 
 def _short_kernel(width_px: float) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """Options of the decision: for every effect, off and each variant with its error and cost.
 
-A bound is the change of a stored number in units of its noise (or in DN), at the worst binning of the survey. If a
+A bound is the change of a stored number in units of its noise (or in DN). If a
 drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. If the
 draw is the noise itself (shot, read, dark), the total variation between the distributions of a number with and without
 it counts. Noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be detected as
@@ -69,7 +69,7 @@ def acts_on_light(effect: Effect) -> bool:
 def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     """Ask every effect for the bounds of its options; errors are in the unit of the probes.
 
-    Every option has the error of the worst probe; a survey has one for each binning and exposure.
+    Every option has the error of the worst probe; a survey has one for each exposure.
 
     Raises SettingsError: a bound is negative or not a number; names it.
     """
@@ -126,8 +126,8 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
                 " check the rig's numbers and the scene for values that are not finite"
             )
         error = bound.value * gain * SAFETY if bound.value else 0.0
-        why = bound.why if probe.binning == 1 or not error else f"{bound.why}, in sums of {probe.binning} samples"
-        return Option(variant, error, 0.0 if variant == OFF else max(effect.cost_ns[variant], LEAST_COST_NS), why)
+        cost_ns = 0.0 if variant == OFF else max(effect.cost_ns[variant], LEAST_COST_NS)
+        return Option(variant, error, cost_ns, bound.why)
 
     exact = replace(option(effect.variants[0]), error=0.0, why="exact")
     return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present)
@@ -190,7 +190,7 @@ def light_after(probe: Probe, rig: Rig, gains: Sequence[GainRange], blurred: flo
     apart = float((2 * blurred + ratio * (1 - kept) * probe.level + added / unit_e).max(initial=0.0))
     gaps = rising_gaps(probe.wavelength_nm)
     follows = probe.unit == "sigma" and not rig.detector.noiseless
-    own_e = np.sqrt((np.maximum(added, 0.0) + fixed_variance(rig.camera)) / probe.binning) if follows else unit_e
+    own_e = np.sqrt(np.maximum(added, 0.0) + fixed_variance(rig.camera)) if follows else unit_e
     return replace(
         probe,
         level=probe.level + added / own_e,

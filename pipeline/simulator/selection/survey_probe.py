@@ -19,7 +19,7 @@ from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF, Radiance
 from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
-from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, stored_mean, unit_at
+from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, unit_at
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
 from pipeline.simulator.optics.scene_radiance import SceneSampler
@@ -31,8 +31,7 @@ Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
 MOST_SAMPLES = 6_000
 FINEST_SAMPLES = 1000  # at which variants of the slit are compared with the finest
-_LEAST_PLACES = 24  # where samples are summed, however many samples that takes
-_BESIDE = 2  # samples to either side of a place; of sums, one
+_PATCH = np.stack(np.meshgrid(np.arange(-2.0, 3.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)  # samples and lines
 _PROBE = (2, 1)  # boxes of the probe
 _CLOSE = (3, 1)  # boxes that find where variants differ
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
@@ -60,16 +59,16 @@ def probe_survey(
     unit: Unit = "sigma",
     cost: CostModel = CostModel(),  # noqa: B008 - a value
 ) -> tuple[Probe, ...]:
-    """Return a probe for each pair of binning and exposure of the sweeps, the smallest binning first.
+    """Return a probe for each exposure of the sweeps, the shortest first.
 
     They have time and lines in common. ``cost`` says how long slewing, setting up and reloading take.
 
     Raises SceneError, SettingsError, PoseError as `probe_scene`.
     """
     taken = _taken(sweeps)
-    alike: dict[tuple[int, float], list[Sweep]] = {}
+    alike: dict[float, list[Sweep]] = {}
     for sweep in taken:
-        alike.setdefault((sweep.binning, exposing(rig.camera, sweep).exposure_ms), []).append(sweep)
+        alike.setdefault(exposing(rig.camera, sweep).exposure_ms, []).append(sweep)
     probes = [probe_scene(scene, rig, some, unit) for _, some in sorted(alike.items())]
     lines = sum(one.lines for one in probes)
     seconds = cost.seconds(list(taken), rig.camera)
@@ -79,18 +78,17 @@ def probe_survey(
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Return the maxima of the scene through slit and pixel, at its extrema.
 
-    They are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one binning
-    and exposure. Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take;
+    They are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one exposure.
+    Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take;
     PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     rig = rig.taking(taken[0])
-    binning = taken[0].binning
     camera = rig.camera
     bands = len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
-    most = room // (len(_patch_steps(binning)) * binning * len({sweep.along for sweep in taken}))
-    places = find_extrema(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
+    most = room // (len(_PATCH) * len({sweep.along for sweep in taken}))
+    places = find_extrema(scene, camera, taken, max(most, 1))
     views = views_of_places(places, scene, camera, taken)
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
     found = replace(
@@ -108,28 +106,21 @@ def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
 
 @dataclass(frozen=True)
 class SampleViews:
-    """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope.
-
-    ``binning`` in a row are the samples of one stored number.
-    """
+    """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope."""
 
     swath_px: Floats
     scan_px: Floats
     slope: Floats
     along_y: NDArray[np.bool_]
-    binning: int = 1
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
-        return SampleViews(
-            self.swath_px[which], self.scan_px[which], self.slope[which], self.along_y[which], self.binning
-        )
+        return SampleViews(self.swath_px[which], self.scan_px[which], self.slope[which], self.along_y[which])
 
 
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
     """Return patches about places, in the view of the most oblique sweep of each orientation that sees them.
 
-    A place that no sweep sees is looked at as if the lines and samples of the least oblique continued. All sweeps sum
-    as many samples to a number.
+    A place that no sweep sees is looked at as if the lines and samples of the least oblique continued.
     """
     centred = places - (np.array(scene.shape) - 1) / 2
     found: list[SampleViews] = []
@@ -166,29 +157,18 @@ def _first_seeing(
 
 
 def _held(sweep: Sweep) -> Sweep:
-    return replace(sweep, step=1, lines=sweep.lines * sweep.step, binning=1)
-
-
-def _patch_steps(binning: int) -> Floats:
-    """Return the steps of a patch about a place, (number, 2): stored numbers along the line, and lines."""
-    beside = _BESIDE if binning == 1 else 1
-    return np.stack(np.meshgrid(np.arange(-beside, beside + 1.0), np.arange(-1.0, 2.0)), axis=-1).reshape(-1, 2)
+    return replace(sweep, step=1, lines=sweep.lines * sweep.step)
 
 
 def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> SampleViews:
-    binning = sweep.binning
-    patch = _patch_steps(binning)
-    middle = sample if binning == 1 else (sample + 0.5) / binning - 0.5
-    sums = np.rint(middle[:, None] + patch[:, 0]).ravel()
-    numbers = (sums[:, None] * binning + np.arange(binning)).ravel()
+    numbers = np.rint(sample[:, None] + _PATCH[:, 0]).ravel()
     slopes = np.asarray((numbers - (camera.samples - 1) / 2) * camera.ifov_rad, np.float64)
     count = len(slopes)
     return SampleViews(
         np.full(count, sweep.swath_px),
-        sweep.start_px + np.repeat((line[:, None] + patch[:, 1]).ravel(), binning),
+        sweep.start_px + (line[:, None] + _PATCH[:, 1]).ravel(),
         slopes,
         np.full(count, sweep.along == "y"),
-        binning,
     )
 
 
@@ -231,48 +211,40 @@ def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
 def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
     """Return the maxima of light (shift, view, band) [e-]."""
     camera = rig.camera
-    binning = sweeps[0].binning
     least, most = seen.min(axis=0), seen.max(axis=0)
-    darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
-    scale = unit_at(np.asarray(darkest, np.float32), rig, unit, binning)  # of each stored number [e-]
-    level = np.maximum(
-        np.abs(brightest) / unit_at(np.asarray(brightest, np.float32), rig, unit, binning), np.abs(darkest) / scale
-    )
+    scale = unit_at(least, rig, unit)  # of each stored number [e-]
+    level = np.maximum(np.abs(most) / unit_at(most, rig, unit), np.abs(least) / scale)
     low, high = least.min(axis=0), most.max(axis=0)
     span = np.maximum(most - low, high - least)
     span[span <= _ROUNDING * np.maximum(np.abs(low), np.abs(high))] = 0  # may be rounding
-    slope, curvature = _derivatives(seen, scale, binning)
+    slope, curvature = _derivatives(seen, scale)
     return Probe(
         unit=unit,
         sweeps=sweeps,
         wavelength_nm=scene.wavelength_nm,
         fwhm_nm=scene.fwhm_nm,
         level=_greatest(level),
-        span=_greatest(stored_mean(span, binning) / scale),
+        span=_greatest(span / scale),
         slope=slope,
         curvature=curvature,
-        spectral_slope=_greatest(stored_mean(steepest_difference(seen[0], scene.wavelength_nm), binning) / scale),
+        spectral_slope=_greatest(steepest_difference(seen[0], scene.wavelength_nm) / scale),
         brightest_e=float(most.max()),
         darkest_e=float(least.min()),
         unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
         lines=sum(sweep.lines for sweep in sweeps),
         seconds=CostModel().seconds(list(sweeps), camera),
         white_e=scene.white_reference_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
-        binning=binning,
     )
 
 
-def _derivatives(seen: Radiance, scale: Radiance, binning: int) -> tuple[Floats, Floats]:
-    """Return the greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
-
-    A stored number has the mean size over its samples: they may be moved one way or the other.
-    """
+def _derivatives(seen: Radiance, scale: Radiance) -> tuple[Floats, Floats]:
+    """Return the greatest first and second derivatives, (2, band) each over the unit, within half a px."""
     level = seen[0]
     high = np.abs(level).max(axis=0)
 
     def size(difference: Radiance) -> Floats:
         shown = np.where(np.abs(difference) > _ROUNDING * high, np.abs(difference), np.float32(0))
-        return _greatest(stored_mean(shown, binning) / scale)
+        return _greatest(shown / scale)
 
     slope, curvature = [], []
     for axis in (0, 1):
@@ -308,31 +280,30 @@ def _slit_errors(
     It is against the finest variant, with the rig's blurs.
     """
     rough = _roughest(scene, rig, views, unit)
-    views = views.chosen((rough[:, None] * views.binning + np.arange(views.binning)).ravel())
+    views = views.chosen(rough)
     moments = _least_blurs(rig, scene.wavelength_nm, sweeps)
     boxes = {one: _footprint(one, rig, BOXES.get(one, (1, 1)), moments, scene) for one in (*SLIT.variants, OFF)}
     finest = light_seen(scene, rig.camera, views, boxes.pop(SLIT.variants[0]), _PHASES)
-    scale = unit_at(_stored(finest, views), rig, unit, views.binning)
+    scale = unit_at(finest, rig, unit)
     return {one: float(_changes(scene, rig, views, box, finest, scale).max(initial=0.0)) for one, box in boxes.items()}
 
 
 def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
-    """Return the stored numbers that the slit, or one upright box in its place, changes most."""
+    """Return the samples that the slit, or one upright box in its place, changes most."""
     close = light_seen(scene, rig.camera, views, _footprint(SLIT.variants[0], rig, _CLOSE, None, scene), _PHASES)
-    scale = unit_at(_stored(close, views), rig, unit, views.binning)
-    most = max(FINEST_SAMPLES // views.binning, 50)
+    scale = unit_at(close, rig, unit)
     others = [_footprint(variant, rig, (1, 1), None, scene) for variant in (OFF, UPRIGHT)]
     changes = [_changes(scene, rig, views, other, close, scale) for other in others]
-    return np.unique([np.argsort(-change, kind="stable")[:most] for change in changes])
+    return np.unique([np.argsort(-change, kind="stable")[:FINEST_SAMPLES] for change in changes])
 
 
 def _changes(
     scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Radiance, scale: Radiance
 ) -> Floats:
-    """Return the greatest signed change of each stored number by another footprint, over the unit, (number,)."""
+    """Return the greatest change of each sample by another footprint, over the unit, (sample,)."""
     change = light_seen(scene, rig.camera, views, footprint, _PHASES) - finest
     change[np.abs(change) <= _ROUNDING * np.abs(finest)] = 0
-    return np.asarray((np.abs(_stored(change, views)) / scale).max(axis=(0, 2), initial=0.0), np.float64)
+    return np.asarray((np.abs(change) / scale).max(axis=(0, 2), initial=0.0), np.float64)
 
 
 def _footprint(
@@ -349,8 +320,3 @@ def _least_blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> Mo
         blurs = [blur.moments(rig, wavelength_nm, blur.variants[0], normal) for blur in _OPTICS]
         found.append(Moments.together(blurs, len(wavelength_nm)))
     return min(found, key=lambda one: float((one.spread + (0.0 if one.waves is None else one.waves**2)).sum()))
-
-
-def _stored(values: Radiance, views: SampleViews) -> Radiance:
-    """Return the means over the samples of each stored number, (..., number, band)."""
-    return np.asarray(stored_mean(values, views.binning), np.float32)

@@ -1,4 +1,4 @@
-"""The line camera: timing, rays, footprints, noise, saturation, binning and the noise of the coarse pass."""
+"""The line camera: timing, rays, footprints, noise and saturation."""
 
 from __future__ import annotations
 
@@ -9,17 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.camera import LineCamera, bin_samples, digitise, expose, footprint, footprint_kernel
+from pipeline.geometry.camera import LineCamera, digitise, expose, footprint, footprint_kernel
 
 CAMERA = LineCamera()
-
-
-def scan_pass(
-    electrons: np.ndarray, camera: LineCamera, *, step: int, rng: np.random.Generator | None = None
-) -> np.ndarray:
-    """Return the values of one pass over a scene that is aligned with the grid."""
-    return expose(footprint(electrons, camera), camera, step=step, rng=rng)
 
 
 def test_defaults_describe_the_rig():
@@ -88,39 +80,9 @@ def test_digitising_without_noise_rounds_to_even_and_clips():
     assert digitise(electrons, CAMERA, None).tolist() == [64, 66, 4095, 64, 4095]
 
 
-def test_binning_sums_and_drops_the_remainder():
-    """Seven samples binned by three give two sums. Sums of sixteen saturated samples fit into 16 bits."""
-    dn = np.arange(7, dtype=np.uint16)[None, :, None]
-    assert bin_samples(dn, 3)[0, :, 0].tolist() == [3, 12]
-    assert bin_samples(np.full((1, 16, 1), 4095, np.uint16), 16).item() == 65520
-    assert bin_samples(dn, 1) is dn
-    with pytest.raises(ShapeError, match="cannot bin 7 samples by 8"):
-        bin_samples(dn, 8)
-
-
-def test_sums_beyond_16_bits_are_refused():
-    """A sum of 65528 DN is kept. A sum of 65536 DN raises an error with the value and the remedy."""
-    full = np.full((2, 8, 3), 8191, np.uint16)
-    assert bin_samples(full, 8).max() == 65528
-    full[1, 5, 2] = 8199
-    with pytest.raises(ShapeError, match=r"sum of 8 samples reaches 65536 DN, above the 65535 .* smaller factor"):
-        bin_samples(full, 8)
-    assert bin_samples(full[:0], 8).shape == (0, 1, 3)
-
-
-@pytest.mark.parametrize("step", [1, 2, 4, 8])
-def test_coarse_pass_of_an_even_scene_lowers_noise_by_the_root_of_the_step(step: float):
-    """The coarse pass averages ``step`` samples of one exposure, so noise falls by sqrt(step), not by step."""
-    seen = scan_pass(np.full((256, 256, 2), 5000.0), CAMERA, step=step, rng=np.random.default_rng(2))
-    assert seen.shape == (256 // step, 256 // step, 2)
+def test_exposures_of_an_even_scene_have_the_noise_of_the_camera() -> None:
+    """Shot noise, read noise and rounding add up as variances, and the mean is the light's."""
+    seen = expose(footprint(np.full((256, 256, 2), 5000.0), CAMERA), CAMERA, rng=np.random.default_rng(2))
     spread = np.sqrt(5000 + 400 + 25 / 12)
-    assert seen.mean() == pytest.approx(5000, abs=5 * spread / np.sqrt(seen.size * step))
-    assert seen.std() == pytest.approx(spread / np.sqrt(step), rel=5 / np.sqrt(2 * seen.size))
-
-
-def test_a_coarse_pixel_is_the_mean_of_its_fine_pixels():
-    """Without noise a coarse pixel equals the block mean of the fine pass, to the rounding of DN."""
-    electrons = np.random.default_rng(0).uniform(100, 15_000, (16, 24, 3))
-    camera = replace(CAMERA, bits=14, electrons_per_dn=1.0)
-    fine, coarse = scan_pass(electrons, camera, step=1), scan_pass(electrons, camera, step=4)
-    assert coarse == pytest.approx(fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3)), abs=1.0)
+    assert seen.mean() == pytest.approx(5000, abs=5 * spread / np.sqrt(seen.size))
+    assert seen.std() == pytest.approx(spread, rel=5 / np.sqrt(2 * seen.size))

@@ -43,10 +43,6 @@ class Case:
     seed: int
     measured: range | None = None  # lines of every sweep that are measured; None is all
 
-    def stored_in_sums_of(self, binning: int) -> Case:
-        """Return the case with ``binning`` neighbouring samples summed to one number."""
-        return replace(self, sweeps=tuple(replace(sweep, binning=binning) for sweep in self.sweeps))
-
     def probe(self) -> Probe:
         """Return the probe of the scene, on which the decision is based."""
         probe = probe_scene(self.scene, self.rig, self.sweeps)

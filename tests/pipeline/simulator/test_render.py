@@ -249,7 +249,7 @@ def test_gains_and_changes_are_applied_in_order() -> None:
 def test_flat_scene_gives_flat_lines() -> None:
     """Far from rest all samples have the same electrons, in proportion to exposure; the mirror's throughput is off."""
     scene = image_scene(np.full((30, 30, 2), 4.0), CAMERA, [400.0, 900.0])
-    far = Sweep("far", "coarse", "y", swath_px=2000.0, start_px=-3000.0, lines=5, step=4, binning=4)
+    far = Sweep("far", "coarse", "y", swath_px=2000.0, start_px=-3000.0, lines=5, step=4)
     expected = np.broadcast_to(4 * scene.electrons, (5, 640, 2))
     for camera, times in ((CAMERA, 1), (replace(CAMERA, exposure_ms=250.0), 2.5)):
         light = expected_light(scene, sweep_block(scene, Rig(camera), far, range(5)), OPTICS)
@@ -268,7 +268,7 @@ def test_undeflected_sweep_equals_the_operator_of_training(step: int) -> None:
     scene = image_scene(values, CAMERA, [400.0])
     sweep = replace(SWEEP, lines=40 // step, step=step)
     lines = expected_light(scene, sweep_block(scene, Rig(CAMERA), sweep, range(sweep.lines)), OPTICS)
-    exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)  # four of its samples still fit uint16
-    viewed = expose(footprint(values.astype(np.float32) * scene.electrons, exact), exact, step=step, rng=None)
-    binned = lines.reshape(sweep.lines, 640 // step, step, 1).mean(axis=2)
-    assert np.abs(binned - viewed).max() < 0.02 * viewed.std()
+    exact = replace(CAMERA, electrons_per_dn=1.0, bits=16)
+    blurred = footprint(values.astype(np.float32) * scene.electrons, exact)
+    viewed = expose(blurred.reshape(sweep.lines, step, 640, 1).mean(axis=1), exact, rng=None)
+    assert np.abs(lines.reshape(viewed.shape) - viewed).max() < 0.02 * viewed.std()

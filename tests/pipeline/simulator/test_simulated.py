@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, line_positions
 from pipeline.signal.calibrate import calibrate
@@ -78,39 +78,25 @@ def test_line_has_its_time_and_position() -> None:
     assert {line.exposure_ms for line in lines} == {100.0}
 
 
-def test_binned_lines_are_sums_and_saturate_without_wrapping() -> None:
-    """Twice the light that fills the well gives sums at full scale, and dark samples beside it stay dark."""
-    values = np.zeros((40, 640, 2))
-    values[:, :320] = 1.0
-    source = source_of(values, replace(CAMERA, exposure_ms=400.0), chosen=effects_on(*QUIET))
-    raw = raw_of(source, replace(SWEEP, lines=10, step=4, binning=4))
-    assert raw.shape == (10, 160, 2)
-    assert (raw[:, :79] == 4 * 4095).all()
-    assert (raw[:, 81:] == 4 * 64).all()
-    assert raw[:, 79:81].min() >= 4 * 64
-
-
-@pytest.mark.parametrize("binning", [1, 4])
+@pytest.mark.parametrize("step", [1, 4])
 @pytest.mark.parametrize("exposure_ms", [50.0, 140.0, 400.0])
-def test_calibration_recovers_scene_values(binning: int, exposure_ms: float) -> None:
-    """Calibrated lines are scene values at any exposure and binning; saturated samples are marked, not wrong."""
+def test_calibration_recovers_scene_values(step: int, exposure_ms: float) -> None:
+    """Calibrated lines are scene values at any exposure and spacing; saturated samples are marked, not wrong."""
     values = np.random.default_rng(2).uniform(0.2, 1.0, (1, 1, 6)) * np.ones((40, 40, 1))
     source = source_of(values, replace(CAMERA, exposure_ms=exposure_ms), chosen=effects_on(*QUIET))
-    sweep = replace(SWEEP, lines=10, step=binning, binning=binning)
-    out, valid = calibrate(raw_of(source, sweep), source.references(sweep), saturated_dn=4095 * binning)
+    sweep = replace(SWEEP, lines=10, step=step)
+    out, valid = calibrate(raw_of(source, sweep), source.references(sweep), saturated_dn=4095)
     per_electron = source.scene.white_reference[0] / source.scene.white_reference_electrons[0]
-    step = per_electron * CAMERA.electrons_per_dn * 100 / exposure_ms
+    number = per_electron * CAMERA.electrons_per_dn * 100 / exposure_ms
     if valid.any():
-        np.testing.assert_allclose(out[valid], np.broadcast_to(values[0, 0], out.shape)[valid], atol=0.51 * step)
+        np.testing.assert_allclose(out[valid], np.broadcast_to(values[0, 0], out.shape)[valid], atol=0.51 * number)
     assert valid.all() == (values.max() * source.scene.electrons[0] * exposure_ms / 100 < CAMERA.full_scale_e)
 
 
 def test_impossible_settings_are_refused() -> None:
-    """The errors name the unknown variant, and the most samples whose sum fits uint16."""
+    """The error names the unknown variant."""
     with pytest.raises(SettingsError, match=r"shot has no variant 'rough'"):
         source_of(np.ones((8, 8, 1)), chosen={SHOT: "rough"})
-    with pytest.raises(ShapeError, match="bin at most 16"):
-        next(source_of(np.ones((8, 8, 1))).lines(replace(SWEEP, binning=20)))
 
 
 COST = CostModel()
@@ -197,15 +183,6 @@ def test_calibration_removes_effects_that_the_frames_show(names: tuple[str, ...]
     assert np.abs(raw.astype(int) - plain).max() > 20
 
 
-def test_binned_frames_are_sums() -> None:
-    """Frames of n samples are sums of the unbinned frames; the remainder of the line is dropped."""
-    source = white_reference_source_of("prnu", "smile", "dark-current")
-    one, three = source.references(WHITE_REFERENCE_SWEEP), source.references(replace(WHITE_REFERENCE_SWEEP, binning=3))
-    for name in ("dark", "white"):
-        sums = getattr(one, name)[:63].reshape(21, 3, BANDS).sum(axis=1)
-        np.testing.assert_allclose(getattr(three, name), sums, rtol=1e-6)
-
-
 def test_frames_show_dark_current_and_gains() -> None:
     """The dark frame has the mean dark current, the white frame both gains of every element, in 32nds of a DN."""
     found = white_reference_source_of("dark-current", "prnu", "striping").references(WHITE_REFERENCE_SWEEP)
@@ -216,7 +193,7 @@ def test_frames_show_dark_current_and_gains() -> None:
 
 
 def test_defective_elements_are_marked_bad() -> None:
-    """Dead elements have white equal to dark, hot ones are bright in the dark; a sum with one of either is bad."""
+    """Dead elements have white equal to dark, hot ones are bright in the dark."""
     rig = replace(RIG, detector=Detector(dead_fraction=0.02, hot_fraction=0.02, hot_e_per_s=2e4))
     found = white_reference_source_of("defects", rig=rig).references(WHITE_REFERENCE_SWEEP)
     dead, hot = dead_elements(rig, BANDS), hot_electrons(rig, BANDS) > 0
@@ -226,8 +203,6 @@ def test_defective_elements_are_marked_bad() -> None:
     np.testing.assert_array_equal(found.bad, dead | hot)
     np.testing.assert_array_equal(found.dark > 1000, hot)
     np.testing.assert_array_equal(found.white == found.dark, dead)
-    binned = white_reference_source_of("defects", rig=rig).references(replace(WHITE_REFERENCE_SWEEP, binning=4)).bad
-    np.testing.assert_array_equal(binned, (dead | hot).reshape(16, 4, BANDS).any(axis=1))
     assert white_reference_source_of(rig=rig).references(WHITE_REFERENCE_SWEEP).bad is None
 
 

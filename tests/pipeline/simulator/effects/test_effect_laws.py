@@ -180,11 +180,11 @@ def test_flat_scenes_show_no_shift_and_no_blur(effect: Effect):
 
 @pytest.mark.parametrize(("number", "effects"), CASES.items())
 def test_no_change_exceeds_its_bound(number: int, effects: tuple[str, ...]):
-    """A case's effects are left out, and their variants taken, with all others exact, as samples and sums of 2 to 8.
+    """A case's effects are left out, and their variants taken, with all others exact.
 
-    The last case, in sums of 4, has a mirror that swings within its exposures: that is left out with the smear.
+    The last case has a mirror that swings within its exposures: that is left out with the smear.
     """
-    found = list(trials(random_case(number), (1, 2 + (number + 5) % 7), effects))
+    found = list(trials(random_case(number), effects))
     assert set(effects or ["slit"]) <= {trial.effect for trial in found}
     assert [trial for trial in found if trial.is_broken] == []
 

@@ -6,24 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from pipeline.geometry.camera import bin_samples
 from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.probe import (
     GainRange,
     difference_rates,
     fixed_variance,
-    noise_electrons,
     rising_gaps,
     rising_runs,
     steepest_difference,
-    stored_mean,
-    unit_at,
 )
 from pipeline.simulator.optics.rays import pupil_contrast
-from pipeline.simulator.rig_model import Detector, Optics, Rig
+from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.selection.options import error_growth, light_after
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
@@ -116,25 +110,3 @@ def test_coloured_edges_keep_the_stated_slope(px: float):
 
 
 STORED_LIGHT_RIG = Rig()
-
-
-@given(binning=st.integers(1, 16), samples=st.integers(16, 70), seed=st.integers(0, 99))
-def test_stored_mean_matches_the_stored_sum(binning: int, samples: int, seed: int) -> None:
-    """Mean and raw sum use the same samples, with a remainder dropped."""
-    dn = np.random.default_rng(seed).integers(0, 4095, (2, samples, 3)).astype(np.uint16)
-    np.testing.assert_allclose(stored_mean(dn.astype(np.float64), binning) * binning, bin_samples(dn, binning))
-
-
-@given(binning=st.integers(1, 16), signal=st.floats(0, 1e6), noiseless=st.booleans())
-def test_noise_of_a_sum_adds_the_variances_of_its_samples(binning: int, signal: float, noiseless: bool) -> None:
-    """The sum has root n times the noise of a sample, so its mean has a root n-th of it."""
-    rig = Rig(detector=Detector(noiseless=noiseless))
-    light = np.full(1, signal, np.float32)
-    of_sum = binning * noise_electrons(light, rig, binning)
-    np.testing.assert_allclose(of_sum, np.sqrt(binning) * noise_electrons(light, rig), rtol=1e-6)
-
-
-def test_dn_of_a_sum_is_divided_by_its_samples() -> None:
-    """If the mean of 4 samples changes by a quarter of a DN, the stored number changes by one."""
-    unit = unit_at(np.ones(1, np.float32), STORED_LIGHT_RIG, "dn", 4)
-    np.testing.assert_allclose(unit, STORED_LIGHT_RIG.camera.electrons_per_dn / 4)

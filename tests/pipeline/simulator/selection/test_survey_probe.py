@@ -15,7 +15,7 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe, noise_electrons, stored_mean
+from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.render import EFFECTS, expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene
@@ -141,47 +141,20 @@ def test_probe_finds_a_single_bright_pixel_in_a_large_scene() -> None:
     assert probe.slope.min() > 10
 
 
-@pytest.mark.parametrize(("binning", "along"), [(2, "y"), (4, "x"), (7, "y")])
-def test_stored_sums_do_not_exceed_their_probe(binning: int, along: str) -> None:
-    """Levels of sums, and their differences from line to line, are within 1.05 of the probe for the binning."""
-    scene = mixed(binning, (96, 110))
-    sweep = replace(SWEEP, along=along, binning=binning, start_px=-20.0, lines=41)
-    probe = quick(probe_scene, scene, RIG, [sweep])
-    light = seen(scene, sweep)
-    noise = noise_electrons(stored_mean(light, binning), RIG, binning)
-    level = (stored_mean(light, binning) / noise).max(axis=(0, 1))
-    assert (level <= 1.03 * probe.level).all()
-    assert (level >= 0.9 * probe.level).all()
-    steps = np.abs(np.diff(light, axis=0))
-    least = np.minimum(noise[1:], noise[:-1])
-    assert (stored_mean(steps, binning) / least).max() <= 1.05 * probe.slope[1].max()
-    assert probe.binning == binning
-
-
-def test_level_of_a_sum_grows_with_the_root_of_its_samples() -> None:
-    """For an even scene the level of a sum of 4 is that of a sample times 2 in sigmas, and times 4 in DN."""
-    scene = scene_of(np.full((50, 60, 1), 3.0))
-    four = replace(SWEEP, binning=4)
-    for unit, growth in (("sigma", 2.0), ("dn", 4.0)):
-        probes = [quick(probe_scene, scene, RIG, [sweep], unit) for sweep in (SWEEP, four)]
-        assert probes[1].level[0] == pytest.approx(growth * probes[0].level[0], rel=1e-4)
-        assert probes[1].unit_least_dn == pytest.approx(probes[0].unit_least_dn / growth, rel=1e-4)
-
-
 def test_survey_has_a_probe_for_each_exposure() -> None:
     """Each probe is that of a rig which takes all lines with this exposure, except for the survey's time and lines."""
     scene = mixed(4)
-    coarse = replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
+    coarse = replace(SWEEP, name="c", kind="coarse", lines=15, step=4, exposure_ms=25.0)
     fast = replace(SWEEP, name="f", exposure_ms=5.0)
     probes = quick(probe_survey, scene, RIG, [coarse, SWEEP, fast])
-    assert [(one.binning, one.sweeps) for one in probes] == [(1, (fast,)), (1, (SWEEP,)), (4, (coarse,))]
-    for exposure_ms, sweep, found in ((5.0, fast, probes[0]), (25.0, coarse, probes[2])):
+    assert [one.sweeps for one in probes] == [(fast,), (coarse,), (SWEEP,)]
+    for exposure_ms, sweep, found in ((5.0, fast, probes[0]), (25.0, coarse, probes[1])):
         told = replace(RIG, camera=replace(RIG.camera, exposure_ms=exposure_ms))
         alone = quick(probe_scene, scene, told, [replace(sweep, exposure_ms=None)])
         for name in ("level", "span", "slope", "curvature", "white_e"):
             np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
         assert (found.brightest_e, found.darkest_e) == (alone.brightest_e, alone.darkest_e)
-    dim, whole = ({one.name: one for one in list_options(probe, RIG, EFFECTS)} for probe in (probes[0], probes[1]))
+    dim, whole = ({one.name: one for one in list_options(probe, RIG, EFFECTS)} for probe in (probes[0], probes[2]))
     assert dim["lag"].off.error > 0
     assert "in 5 ms" in dim["dark-current"].off.why
     assert "in 100 ms" in whole["dark-current"].off.why
