@@ -378,11 +378,6 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
             f"camera.dark_dn = {camera.dark_dn:g} leaves no room below the {camera.full_scale_dn} DN of {camera.bits} "
             "bits; use a smaller dark level"
         )
-    if settings.detector.full_well_e < camera.full_scale_e:
-        yield (
-            f"detector.full_well_e = {settings.detector.full_well_e:g} is below the {camera.full_scale_e:g} e- of the "
-            "converter's end, and full pixels would count as valid; use fewer camera.bits or electrons_per_dn"
-        )
 
 
 def _air_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:

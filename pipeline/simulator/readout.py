@@ -1,4 +1,4 @@
-"""Readout of the samples' electrons: noise, the well, the converter's numbers."""
+"""Readout of the samples' electrons: noise and the converter's numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from pipeline.simulator.effects.counting import (
     EXACT,
     LEAST_MERGED_READ_E,
     READ_NOISE,
-    SATURATION,
     SHOT,
     dark_electrons,
     dead_elements,
@@ -76,7 +75,7 @@ class Readout:
     def numbers(self, light: Radiance, number: int) -> NDArray[np.uint16]:
         """Return the converter's numbers of one line's light, (sample, band) [e-]."""
         cheap = self._variant(SHOT.name) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
-        if not cheap or self.full_well_e is not None:  # shot and read noise are draws of their own
+        if not cheap:  # shot and read noise are draws of their own
             return self.converted(self.electrons(light, number))
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
         deviate = self._deviates(SHOT.name, number)
@@ -106,8 +105,6 @@ class Readout:
             if shot != EXACT and (least := least_expected(0.0)):
                 dim = np.flatnonzero(expected < np.float32(least))
                 electrons.reshape(-1)[dim] = photon_counts(expected.take(dim), deviate.take(dim))
-        if self.full_well_e is not None:
-            np.minimum(electrons, np.float32(self.full_well_e), out=electrons)
         if self.read_noise_e:
             electrons += self._deviates(READ_NOISE.name, number) * np.float32(self.read_noise_e)
         return electrons
@@ -139,14 +136,6 @@ class Readout:
     def read_noise_e(self) -> float:
         """Return standard deviation of the amplifier's noise; 0 where it is off. [e-]"""
         return 0.0 if self._variant(READ_NOISE.name) == OFF else self.block.rig.camera.read_noise_e
-
-    @cached_property
-    def full_well_e(self) -> float | None:
-        """Return the electrons that an element holds; None where the converter ends first, or saturation is off."""
-        well_e = self.block.rig.detector.full_well_e
-        camera = self.block.rig.camera
-        end_e = (camera.full_scale_dn + 1 - camera.dark_dn) * camera.electrons_per_dn + 8 * self.read_noise_e
-        return well_e if self._variant(SATURATION.name) != OFF and well_e < end_e else None
 
     def _expected(self, light: Radiance, number: int) -> Radiance:
         """Return electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""

@@ -15,7 +15,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.setting_fields import assumed, misfits, stated
 
-Coating = Literal["aluminium", "gold", "silver", "ideal"]  # ideal: reflects everything, at any angle
+Coating = Literal["aluminium", "ideal"]  # ideal: reflects everything, at any angle
 Relief = Literal["flat", "step", "plane"]
 Cover = Literal["clear", "overcast"]
 LIGHT_UNDER: dict[Cover, float] = {"clear": 1.0, "overcast": 1 / 8}  # thick stratus passes 10 to 20 % (assumed)
@@ -60,18 +60,14 @@ class MirrorMotion:
 class Detector:
     """Noise and faults of the sensor beside the camera's own read noise, gain and well."""
 
-    dark_e_per_s: float = assumed(200.0, "Dark current at 25 deg C", "e-/s", 0.0, 1e9)
-    temperature_deg_c: float = assumed(
-        25.0, "Temperature of the sensor; the law of dark current holds from -80 to 50", "deg C", -80.0, 50.0
-    )
+    dark_e_per_s: float = assumed(200.0, "Dark current at the temperature of the sensor", "e-/s", 0.0, 1e9)
     prnu_std: float = assumed(0.01, "Standard deviation of a pixel's gain (PRNU)", "", 0.0, 0.5)
     striping_std: float = assumed(
         0.002, "Standard deviation of the gain that a sample's whole column shares", "", 0.0, 0.5
     )
     dead_fraction: float = assumed(0.0, "Fraction of dead pixels", "", 0.0, 0.5)
     hot_fraction: float = assumed(0.0, "Fraction of hot pixels", "", 0.0, 0.5)
-    hot_e_per_s: float = assumed(5e4, "Dark current of a hot pixel over a sound one, at 25 deg C", "e-/s", 0.0, 1e9)
-    full_well_e: float = assumed(math.inf, "Electrons that a pixel holds; inf: the converter clips first", "e-", 1.0)
+    hot_e_per_s: float = assumed(5e4, "Dark current of a hot pixel over a sound one", "e-/s", 0.0, 1e9)
     noiseless: bool = stated(False, "An ideal sensor, for references: no shot noise, read noise or dark current")
     unit: int = stated(0, "Number of the sensor; its fixed pattern follows from it", "", 0, 2**31 - 1)
 

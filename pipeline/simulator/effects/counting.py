@@ -167,19 +167,12 @@ def _summed_quantile(mean: Floats, z: Floats) -> Floats:
 
 REACH = 6.0  # deviations of the noise that the brightest sample may lie above its mean
 EXACT, GAUSSIAN = "exact", "gaussian"
-REFERENCE_DEG_C = 25.0
-ZERO_DEG_C_K = 273.15
-BOLTZMANN_EV_PER_K = 8.617333e-5
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class DarkCurrent(Effect):
-    """Electrons that warmth sets free, as many in every element; they take part in the shot noise.
-
-    [1] Janesick, "Scientific Charge-Coupled Devices", SPIE Press, 2001: T^1.5 exp(-Eg / 2kT), Eg by Varshni's formula.
-    [2] Widenhorn et al., "Temperature dependence of dark current in a CCD", SPIE 4669, 2002. doi:10.1117/12.463446
-    """
+    """Electrons that warmth sets free, as many in every element; they take part in the shot noise."""
 
     name = "dark-current"
     cost_ns = MappingProxyType({"exact": 0.1})
@@ -193,31 +186,15 @@ class DarkCurrent(Effect):
         spread = separable(float(np.hypot(sd, np.sqrt(electrons))), sd)
         if probe.unit == "dn":
             spread *= float(np.hypot(sd, np.sqrt(electrons))) / rig.camera.electrons_per_dn
-        warm = rig.detector.temperature_deg_c
-        why = f"{electrons:.3g} e- in {rig.camera.exposure_ms:g} ms at {warm:g} deg C, beside {sd:.3g} e- of noise"
+        why = f"{electrons:.3g} e- in {rig.camera.exposure_ms:g} ms, beside {sd:.3g} e- of noise"
         return Bound(probe.added(electrons, rig.camera.electrons_per_dn) + spread, why)
-
-
-def warmth(temperature_deg_c: float) -> float:
-    """Return the dark current over that at 25 deg C, where the rig's numbers are stated.
-
-    Electrons set free in silicon's depleted layer [1]: twice as many 8.4 deg C above 25, and 3.6 deg C above -80. Valid
-    from -80 to 50 deg C: in warmer sensors current that diffuses from the bulk, with the whole gap, takes over [2].
-    """
-    return math.exp(_log_generation(temperature_deg_c) - _log_generation(REFERENCE_DEG_C))
-
-
-def _log_generation(temperature_deg_c: float) -> float:
-    kelvin = temperature_deg_c + ZERO_DEG_C_K
-    band_gap_ev = 1.1557 - 7.021e-4 * kelvin**2 / (1108 + kelvin)  # silicon's, by Varshni's formula as in [1]
-    return 1.5 * math.log(kelvin) - band_gap_ev / (2 * BOLTZMANN_EV_PER_K * kelvin)
 
 
 def dark_electrons(rig: Rig) -> float:
     """Return the expected dark electrons of one exposure in a sound element; 0 in an ideal sensor. [e-]"""
     if rig.detector.noiseless:
         return 0.0
-    return rig.detector.dark_e_per_s * (rig.camera.exposure_ms * 1e-3) * warmth(rig.detector.temperature_deg_c)
+    return rig.detector.dark_e_per_s * (rig.camera.exposure_ms * 1e-3)
 
 
 @dataclass(frozen=True)
@@ -256,7 +233,7 @@ def most_hot_electrons(rig: Rig) -> float:
     detector = rig.detector
     if detector.noiseless or not detector.hot_fraction:
         return 0.0
-    return detector.hot_e_per_s * rig.camera.exposure_ms * 1e-3 * warmth(detector.temperature_deg_c)
+    return detector.hot_e_per_s * rig.camera.exposure_ms * 1e-3
 
 
 @lru_cache(maxsize=8)
@@ -268,7 +245,7 @@ def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) ->
 
 @dataclass(frozen=True)
 class Saturation(Effect):
-    """Light above the well or the converter's full scale is lost. Off, the converter clips all the same.
+    """Light above the converter's full scale is lost. Off, the converter clips all the same.
 
     Raw lines are numbers of so many bits, so every line is clipped whatever a probe of a few lines found.
     """
@@ -277,9 +254,9 @@ class Saturation(Effect):
     cost_ns = MappingProxyType({"exact": 0.1})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound it by how far the brightest sample, 6 deviations up, reaches above the lower of both limits."""
+        """Bound it by how far the brightest sample, 6 deviations up, reaches above full scale."""
         camera = rig.camera
-        limit = min(camera.full_scale_e, rig.detector.full_well_e)
+        limit = camera.full_scale_e
         expected = max(probe.brightest_e, 0.0) + dark_electrons(rig) + most_hot_electrons(rig)
         sd = 0.0 if rig.detector.noiseless else float(np.hypot(np.sqrt(expected), camera.read_noise_e))
         over = max(expected + REACH * sd - limit, 0.0)

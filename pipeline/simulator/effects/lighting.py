@@ -3,13 +3,11 @@
 [1] Born and Wolf, "Principles of Optics", 7th edition, 1999, section 1.5.2 (Fresnel's formulae).
 [2] Rakic, "Algorithm for the determination of intrinsic optical constants of metal films: application to aluminum",
     Applied Optics 34, 1995.
-[3] Johnson and Christy, "Optical constants of the noble metals", Physical Review B 6, 1972.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -182,23 +180,6 @@ _ALUMINIUM = np.array([  # [2]
     (999.88, 1.4359, 9.4939), (1033.2, 1.3998, 9.8914), (1127.1, 1.3281, 10.969), (1239.9, 1.3157, 12.245),
     (1377.6, 1.3899, 13.784), (1549.8, 1.5782, 15.656), (1771.2, 1.9205, 17.991), (2066.4, 2.4738, 20.982),
 ])  # fmt: skip
-_GOLD = np.array([  # [3]
-    (310.7, 1.53, 1.893), (320.4, 1.54, 1.898), (331.5, 1.48, 1.883), (342.5, 1.48, 1.871), (354.2, 1.50, 1.866),
-    (367.9, 1.48, 1.895), (381.5, 1.46, 1.933), (397.4, 1.47, 1.952), (413.3, 1.46, 1.958), (430.5, 1.45, 1.948),
-    (450.9, 1.38, 1.914), (471.4, 1.31, 1.849), (495.9, 1.04, 1.833), (520.9, 0.62, 2.081), (548.6, 0.43, 2.455),
-    (582.1, 0.29, 2.863), (616.8, 0.21, 3.272), (659.5, 0.14, 3.697), (704.5, 0.13, 4.103), (756.0, 0.14, 4.542),
-    (821.1, 0.16, 5.083), (892.0, 0.17, 5.663), (984.0, 0.22, 6.350), (1088.0, 0.27, 7.150), (1216.0, 0.35, 8.145),
-    (1393.0, 0.43, 9.519), (1610.0, 0.56, 11.21), (1937.0, 0.92, 13.78),
-])  # fmt: skip
-_SILVER = np.array([  # [3]
-    (310.7, 1.13, 0.616), (320.4, 0.81, 0.392), (331.5, 0.17, 0.829), (342.5, 0.14, 1.142), (354.2, 0.10, 1.419),
-    (367.9, 0.07, 1.657), (381.5, 0.05, 1.864), (397.4, 0.05, 2.070), (413.3, 0.05, 2.275), (430.5, 0.04, 2.462),
-    (450.9, 0.04, 2.657), (471.4, 0.05, 2.869), (495.9, 0.05, 3.093), (520.9, 0.05, 3.324), (548.6, 0.06, 3.586),
-    (582.1, 0.05, 3.858), (616.8, 0.06, 4.152), (659.5, 0.05, 4.483), (704.5, 0.04, 4.838), (756.0, 0.03, 5.242),
-    (821.1, 0.04, 5.727), (892.0, 0.04, 6.312), (984.0, 0.04, 6.992), (1088.0, 0.04, 7.795), (1216.0, 0.09, 8.828),
-    (1393.0, 0.13, 10.10), (1610.0, 0.15, 11.85), (1937.0, 0.24, 14.08),
-])  # fmt: skip
-METALS: Mapping[str, Floats] = MappingProxyType({"aluminium": _ALUMINIUM, "gold": _GOLD, "silver": _SILVER})
 
 
 @dataclass(frozen=True)
@@ -251,7 +232,7 @@ class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 
     Fresnel's equations for bare metal give it. From 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to
-    1000 nm; -5.4 % at 820 nm). Gold goes from -1.8 to +18 % in the blue. Valid for unpolarised light and a spectrograph
+    1000 nm; -5.4 % at 820 nm). Valid for unpolarised light and a spectrograph
     that takes both polarisations alike. One factor for each line and band, at mid exposure.
     """
 
@@ -300,12 +281,12 @@ def _factors_between(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> 
 def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) -> Floats:
     """Return the fraction of unpolarised light that a coating reflects, (incidence, band): both polarisations' mean.
 
-    Valid from 311 to 1937 nm, and for films that no light passes (50 nm or more). Beyond, the index of the nearest end
+    Valid from 310 to 2066 nm, and for films that no light passes (50 nm or more). Beyond, the index of the nearest end
     is held.
     """
     if coating == "ideal":
         return np.ones((len(incidence_rad), len(wavelength_nm)))
-    nm, n, k = METALS[coating].T
+    nm, n, k = _ALUMINIUM.T
     index = np.interp(wavelength_nm, nm, n) + 1j * np.interp(wavelength_nm, nm, k)
     across, within = fresnel(index, incidence_rad[:, None])
     return (across + within) / 2

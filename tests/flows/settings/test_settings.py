@@ -166,7 +166,6 @@ def test_amounts_have_units():
         ),
         ({"camera": 3}, "must be a table"),
         ({"camera": {"dark_dn": 5000}}, "leaves no room"),
-        ({"detector": {"full_well_e": 5000}}, "full pixels would count as valid"),
         ({"out": " "}, "text that is not empty"),
         ({"device": "gpu"}, "'device' must be one of auto, cpu, cuda, mps; got 'gpu'"),
         ({"out": "a\0b"}, "text without a null character"),
@@ -263,7 +262,7 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         tol=tolerance,
         sky=Sky(started=datetime(2026, 6, 1, 10, tzinfo=UTC) if posed else None, cloud_fraction=budget),
         air=Air(distance_m=exposure if posed else None),
-        detector=Detector(full_well_e=1e6 + exposure),
+        detector=Detector(hot_e_per_s=1e6 + exposure),
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings

@@ -19,7 +19,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.rig_model import Air, Coating, Detector, MirrorMotion, Optics, Relief, Rig, Sky
+from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from pipeline.simulator.selection.survey_probe import probe_scene
 
@@ -174,10 +174,9 @@ def _optics(rng: np.random.Generator, distance_m: float | None) -> Optics:
 
 
 def _mirror(rng: np.random.Generator) -> MirrorMotion:
-    metals: tuple[Coating, ...] = ("aluminium", "gold", "silver")
-    metal = metals[int(rng.uniform(0, 3))]
+    rng.uniform()  # the cases stay those of their numbers
     return MirrorMotion(
-        coating=metal if rng.random() < 0.5 else "ideal",
+        coating="aluminium" if rng.random() < 0.5 else "ideal",
         natural_hz=float(rng.uniform(5, 100)),
         damping=float(rng.choice([0.3, 0.7, 1.0, 2.0])),
         settled_s=float(rng.uniform(0.05, 0.5)),

@@ -148,7 +148,7 @@ def test_light_follows_the_clock() -> None:
 
 # fine steps: rounding does not matter
 WHITE_REFERENCE_CAMERA = LineCamera(samples=64, bits=16, electrons_per_dn=1.0)
-RIG = Rig(WHITE_REFERENCE_CAMERA, detector=Detector(prnu_std=0.05, striping_std=0.02, temperature_deg_c=45.0))
+RIG = Rig(WHITE_REFERENCE_CAMERA, detector=Detector(prnu_std=0.05, striping_std=0.02, dark_e_per_s=1000.0))
 WHITE_REFERENCE_SWEEP = Sweep("s", "fine", "x", swath_px=900.0, start_px=-1500.0, lines=6)
 BANDS = 12
 

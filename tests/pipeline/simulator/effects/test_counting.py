@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects import counting
 from pipeline.simulator.effects.probe import Probe, Unit
@@ -44,11 +43,11 @@ def test_bright_scene_needs_shot_noise_but_no_read_noise() -> None:
 
 
 def test_dim_scene_at_1_s_needs_dark_current() -> None:
-    """The current of 200 e- exceeds the noise of 24 e-; a cooled sensor at 100 ms does not need it."""
+    """The current of 200 e- exceeds the noise of 24 e-; a cooled sensor does not need it."""
     bound = counting.DARK_CURRENT.bound(probe(200, 400), replace(RIG, camera=LineCamera(exposure_ms=1000.0)))
     assert bound.value > 8
-    assert bound.why == "200 e- in 1000 ms at 25 deg C, beside 24.5 e- of noise"
-    cold = Rig(detector=Detector(temperature_deg_c=-30.0))
+    assert bound.why == "200 e- in 1000 ms, beside 24.5 e- of noise"
+    cold = Rig(detector=Detector(dark_e_per_s=1.0))
     assert counting.DARK_CURRENT.bound(probe(200, 400), cold).value < TOLERANCE
 
 
@@ -109,7 +108,6 @@ def test_bright_roof_saturates(unit: Unit) -> None:
     ideal = Rig(detector=Detector(noiseless=True))
     seen = replace(probe(100, 30_000, unit), unit_least_dn=0.29)
     assert counting.SATURATION.bound(seen, ideal).value == pytest.approx((lost - 20) / 5 / 0.29)
-    assert counting.SATURATION.bound(probe(100, 6000), Rig(detector=Detector(full_well_e=5000))).value > 0
     assert counting.SATURATION.bound(probe(100, 6000), RIG).value == 0
 
 
@@ -119,18 +117,3 @@ def test_quantisation_is_half_a_dn() -> None:
     assert counting.QUANTISATION.bound(probe(0, 1000), RIG).value == pytest.approx(0.5 / 4)
     light: NDArray[np.float32] = np.random.default_rng(0).uniform(0, 9000, (6, 640, 3)).astype(np.float32)
     assert np.abs(read_out(light, block_of(RIG, NM), {}) - (light / 5 + 64)).max() <= 0.5
-
-
-@pytest.mark.parametrize(
-    ("deg_c", "factor"), [(25.0, 1.0), (0.0, 0.1056), (-40.0, 1.12e-3), (-80.0, 1.97e-6), (50.0, 6.80)]
-)
-def test_dark_current_factor_matches_hand_calculation(deg_c: float, factor: float) -> None:
-    """Worked with a pocket calculator: at -80 deg C (193.15 / 298.15)^1.5 exp(21.629 - 34.114) = 1.97e-6."""
-    assert counting.warmth(deg_c) == pytest.approx(factor, rel=3e-3)
-
-
-@pytest.mark.parametrize("deg_c", [-80.5, 51.0])
-def test_temperature_beyond_the_range_of_the_law_is_refused(deg_c: float) -> None:
-    """Other leakage dominates below the range, and diffusion from the bulk above it."""
-    with pytest.raises(SettingsError, match=r"detector\.temperature_deg_c must be a number from -80 to 50 deg C"):
-        Rig(detector=Detector(temperature_deg_c=deg_c))

@@ -36,7 +36,7 @@ RIG = Rig(  # with every effect
     LineCamera(samples=48, exposure_ms=20.0),
     Optics(aberration_px=0.3, keystone_px=0.4, smile_nm=0.8, stray_fraction=0.02, stray_halo_px=8.0),
     MirrorMotion(positions_per_line=1.5, repeatability_urad=40.0, hysteresis_px=3.0, drift_px_per_min=50.0),
-    Detector(dead_fraction=0.02, hot_fraction=0.02, temperature_deg_c=45.0, full_well_e=15_000.0),
+    Detector(dead_fraction=0.02, hot_fraction=0.02, dark_e_per_s=1000.0),
     Air(40.0, "step", 30.0, 60.0, visibility_km=2.0, turbulence_cn2=1e-12, wind_amplitude_m=0.02),
     Sky(datetime(2026, 6, 21, 5, 34, tzinfo=UTC), cloud_fraction=0.4, cloud_size_px=40.0, hot_spot=0.1),
 )

@@ -104,15 +104,7 @@ def test_glass_matches_fresnel_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("coating", "nm", "fraction"),
-    [
-        ("aluminium", 550, 0.916),
-        ("aluminium", 800, 0.867),
-        ("aluminium", 1000, 0.94),
-        ("gold", 600, 0.919),
-        ("gold", 700, 0.97),
-        ("silver", 550, 0.983),
-    ],
+    ("coating", "nm", "fraction"), [("aluminium", 550, 0.916), ("aluminium", 800, 0.867), ("aluminium", 1000, 0.94)]
 )
 def test_metals_match_published_reflectances_at_normal_incidence(coating: str, nm: float, fraction: float) -> None:
     """Evaporated films (Hass in the American Institute of Physics Handbook, table 6g) agree within 2 points."""
