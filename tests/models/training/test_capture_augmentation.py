@@ -220,7 +220,7 @@ def test_a_condensed_crop_has_the_noise_of_a_condensed_survey(light: float, rtol
     noisy = spectra + more * rng.normal(size=spectra.shape)
     surveyed = 0.3 + (np.rint((noisy - 0.3) / sigma @ axes) @ axes.T) * sigma
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
-    seen = _seen(augmentation.scan, crop, noise, light=light, rng=rng, least_power=0.01)[..., :12]
+    seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=0.01)[..., :12]
     columns = seen @ augmentation.unwhiten * normalisation.spread + normalisation.centre
     added, wanted = (np.cov((one - spectra @ MATRIX).reshape(-1, 12).T) for one in (columns, surveyed @ MATRIX))
     np.testing.assert_allclose(np.diag(added), np.diag(wanted), rtol=rtol)
@@ -235,7 +235,7 @@ def test_a_condensed_crop_keeps_components_above_a_power(least_power: float, lef
     augmentation, normalisation = _augmentation()
     spectra, noise = _spectra(rng, (30.0, 5.0, 3.0, 2.0, 0.5), light)
     crop = normalisation.apply(spectra @ MATRIX, np.ones(12, bool))
-    seen = _seen(augmentation.scan, crop, noise, light=light, rng=rng, least_power=least_power)[..., :12]
+    seen = _seen(augmentation.scan, crop, noise, light=light, step=1, rng=rng, least_power=least_power)[..., :12]
     power = np.linalg.eigvalsh(np.cov((seen @ augmentation.unwhiten * normalisation.spread).reshape(-1, 12).T))
     assert np.count_nonzero(power > 1e-6 * power[-1]) == left
 

@@ -46,11 +46,11 @@ class Waves:
         return 0.5 + np.stack([waves[..., ::2].sum(axis=-1), waves[..., 1::2].sum(axis=-1)], axis=-1)
 
     def damping(self, along: Axis, step: int) -> NDArray[np.float64]:
-        """Return each wave's damping by pixels, slit, detector, held positions and binning, in closed form."""
+        """Return each wave's damping by pixels, slit, detector and held positions, in closed form."""
         scan, line = self.frequency.T if along == "x" else self.frequency.T[::-1]
         held = np.arange(step) - (step - 1) / 2
-        smear, binned = (np.cos(2 * np.pi * np.outer(f, held)).mean(axis=1) for f in (scan, line))
-        left: NDArray[np.float64] = np.sinc(scan * CAMERA.slit_px) * np.sinc(line) * smear * binned
+        smear = np.cos(2 * np.pi * np.outer(scan, held)).mean(axis=1)
+        left: NDArray[np.float64] = np.sinc(scan * CAMERA.slit_px) * np.sinc(line) * smear
         left *= (np.sinc(scan) * np.sinc(line)) ** 2  # light is linear between pixels
         return left
 
@@ -80,15 +80,15 @@ def rectified_swath(scene: Waves, swath: float, along: Axis, step: int) -> Mosai
     length = scene.shape[0] if along == "x" else scene.shape[1]
     margin = (3 + int(abs(swath) * 330 * CAMERA.ifov_rad / step)) * step  # for the line's rotation, and for taps
     lines = (length + 2 * margin) // step
-    sweep = Sweep(f"strip {swath}", "fine", along, swath, -(length - 1) / 2 - margin, lines, step, step)
+    sweep = Sweep(f"strip {swath}", "fine", along, swath, -(length - 1) / 2 - margin, lines, step)
     lines = list(source.lines(sweep))
     raw = np.stack([line.data for line in lines])
     position = np.array([(line.mirror_x, line.mirror_y) for line in lines])
-    values, valid = calibrate(raw, source.references(sweep), saturated_dn=CAMERA.full_scale_dn * step)
+    values, valid = calibrate(raw, source.references(sweep), saturated_dn=CAMERA.full_scale_dn)
     origin = (step - scene.shape[0]) / 2, (step - scene.shape[1]) / 2
     rows, columns = scene.shape[0] // step, scene.shape[1] // step
     points = PixelGrid(origin, step, (rows, columns)).points(slice(0, rows), slice(0, columns)).reshape(-1, 2)
-    at = geolocation(position, CAMERA, points, along=along, binning=step)
+    at = geolocation(position, CAMERA, points, along=along)
     return MosaicPart(*resample(values, valid, at), edge_distance(at, raw.shape[0], raw.shape[1]))
 
 

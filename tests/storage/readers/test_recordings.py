@@ -28,7 +28,7 @@ from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 from tests.storage.readers.test_envi_cubes import write_envi
 from tests.storage.small_archive import flip
 
-COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
 
 
 def write_raw(folder: Path, source: SimulatedSource, sweep: Sweep) -> RawCube:
