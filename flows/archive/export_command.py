@@ -34,15 +34,11 @@ from flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json, stderr
 from pipeline.errors import ArchiveError, PipelineError
-from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.manifests import read_manifest
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers, to_json, write_whole
 from storage.export.image_files import write_cog
-
-pystac: Any = deferred("pystac")
-rio_stac: Any = deferred("rio_stac")
 
 COLLECTION = "collection.json"
 COG, CSV = "image/tiff; application=geotiff; profile=cloud-optimized", "text/csv"
@@ -147,6 +143,8 @@ class Export:
 
     def add(self, key: str, path: Path, title: str, kind: str, roles: Sequence[str], **more: Any) -> None:
         """Add a file to the catalogue, by its address relative to the item."""
+        import pystac
+
         href = quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
         self.assets[key] = pystac.Asset(href, title, media_type=kind, roles=[*roles], extra_fields=more)
         if path.resolve().is_relative_to(self.out):
@@ -184,6 +182,8 @@ def write_catalogue(export: Export) -> tuple[Path, Path]:
 
     Raises ArchiveError: an item of an earlier export cannot be read.
     """
+    import pystac
+
     items = [_describe(export)]
     for path in sorted(export.out.glob("*/*.json")):  # earlier exports, each in the folder of its own name
         if path.stem == path.parent.name and path.stem != export.run.id:
@@ -208,6 +208,8 @@ def write_catalogue(export: Export) -> tuple[Path, Path]:
 
 def _describe(export: Export) -> Any:
     """Return the run's item, with the place of its class map."""
+    import rio_stac
+
     receipt = export.run.receipt
     start, end = (datetime.fromisoformat(text) for text in export.run.observed)
     with warnings.catch_warnings():
@@ -233,6 +235,8 @@ def _describe(export: Export) -> Any:
 
 def _extent(items: Sequence[Any]) -> Any:
     """Return the extent of all items; the whole earth if none has a place."""
+    import pystac
+
     found = pystac.Extent.from_items(items)
     if all(one.bbox is None for one in items):
         found.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])

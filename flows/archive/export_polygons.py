@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import shapely
 from affine import Affine
 
 from flows.archive.export_layers import ExportedRun, ProductChoice
 from pipeline.errors import ArchiveError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import geopandas, pyogrio, rasterio_features, shapely
 from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import legend_of
 from storage.arrays.ground_maps import open_image
@@ -36,6 +36,10 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     Outlines follow the sides of pixels. Columns are class, name and colour, with a place on the earth also hectares,
     and with ``doses`` also dose, 0 for other classes. Raises ArchiveError: GDAL or the disk refuses.
     """
+    import geopandas
+    import pyogrio
+    import rasterio.features as rasterio_features
+
     stored = open_image(run.path(run.map_product), "classes")
     classes = np.concatenate([rows for _, rows in stored.rows()])
     legend = legend_of(stored.group)

@@ -9,13 +9,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from odc.geo.geobox import GeoBox
+
 from flows.settings.load import anchor_paths
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import EXTENT_PART
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import OFF_GRID_PX, shift_px
-from pipeline.lazy import GeoBox
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive, run_stem

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from odc.geo.geobox import GeoBox
 
 from flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
 from flows.tasks.scene import FieldSource
@@ -16,7 +17,7 @@ from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.capture.straight_scans import EDGE_PX, covered_field
 from pipeline.errors import SceneError, SettingsError
-from pipeline.lazy import GeoBox, Once
+from pipeline.once import Once
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
 from pipeline.source import Source
 from storage.archive.keys import stage_key

@@ -55,7 +55,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.ground.field_places import PosedField
 from pipeline.ground.map_grid import GroundGrid
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.planning.fine_pass import FinePlan, SecondPass
 from pipeline.planning.uniform_scans import ScanPerformance
 from pipeline.rectify.placed import PixelGrid, place

@@ -20,7 +20,7 @@ from models.weights.files import Description
 from pipeline.errors import NoSceneYet, SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.built_in import built_in_scene
 from pipeline.simulator.scenes.daylight import sun_elevation_deg

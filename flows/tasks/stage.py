@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from flows.tasks.prefect_tasks import as_task
 from models.network.machine import give_back_freed_memory
 from pipeline.errors import ArchiveError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.georeference import georeference_record
-from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, array_digest, stage_key
 from storage.archive.manifests import is_cleared, try_manifest

@@ -26,7 +26,7 @@ from models.weights.files import (
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import median_footprint_m
 from pipeline.ground.view import GroundView
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.land import sun_over_farm
 from pipeline.simulator.scenes.scene import RasterScene

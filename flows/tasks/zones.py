@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from flows.settings.survey_settings import Settings, ZoneChoice
 from pipeline.errors import ZoneError
@@ -16,7 +18,6 @@ from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, Place
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.ground.zones import Mask, extent_deg, on_field, patch_means, pixels_inside
-from pipeline.lazy import BaseGeometry, shapely
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import array_digest
 from storage.readers.polygons import ZoneFile, place_on_earth, read_zones

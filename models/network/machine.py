@@ -8,7 +8,6 @@ from contextlib import contextmanager, suppress
 from typing import Literal, get_args
 
 from pipeline.errors import SettingsError
-from pipeline.lazy import torch
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Present = Literal["cpu", "cuda", "mps"]
@@ -22,8 +21,10 @@ def choose_device(asked: str) -> Present:
 
     Raises SettingsError: torch cannot use this device here; the message lists the available ones.
     """
-    if asked == PROCESSOR:  # without loading torch
+    if asked == PROCESSOR:
         return PROCESSOR
+    import torch
+
     kinds: tuple[tuple[Present, bool], ...] = (
         ("cuda", torch.cuda.is_available()),
         ("mps", torch.backends.mps.is_available()),
@@ -40,12 +41,16 @@ def choose_device(asked: str) -> Present:
 
 def use_one_thread() -> None:
     """Limit torch to one thread: on a shared machine more threads wait for each other."""
+    import torch
+
     torch.set_num_threads(1)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread within the context."""
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -27,10 +27,11 @@ from models.network.spectral import (
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.lazy import Tensor, torch
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from models.network.segmenter import Overview
 
 ROWS_DRAWN = 64  # at once
@@ -159,6 +160,8 @@ def read_coarse_prediction(
     weights: Weights, coarse_pass: CoarsePass, overview: Overview | None = None
 ) -> CoarsePrediction:
     """Predict class probabilities from a coarse pass, or from its ``overview`` where that is known."""
+    import torch
+
     with torch.inference_mode():
         overview = overview_of(weights, coarse_pass) if overview is None else overview
         return CoarsePrediction(
@@ -170,6 +173,8 @@ def read_coarse_prediction(
 
 def save_overview(path: Path, overview: Overview) -> None:
     """Store features and logits of an overview."""
+    import torch
+
     content = io.BytesIO()  # an error that numpy has with a file does not say that the disk is full
     np.save(content, torch.cat([overview.features, overview.logits], dim=1).cpu().numpy())
     path.write_bytes(content.getbuffer())
@@ -177,6 +182,8 @@ def save_overview(path: Path, overview: Overview) -> None:
 
 def load_overview(path: Path, weights: Weights) -> Overview | None:
     """Read an overview by the same weights; None where there is no file."""
+    import torch
+
     if not path.exists():
         return None
     stored = torch.from_numpy(np.load(path)).to(weights.segmenter.device)
@@ -204,6 +211,8 @@ def segment(
 
     Raises ShapeError for a patch given twice or outside the grid.
     """
+    import torch
+
     numbers = np.ascontiguousarray(patch_index, np.int64)
     check_patch_index(numbers, seen.grid)
     own, numbers = captured(patches, numbers)
@@ -233,6 +242,8 @@ def patch_logits(
 
     Chunks fit the processor's caches. Values that are not finite count as 0, the median.
     """
+    import torch
+
     network = weights.segmenter
     for some in cuts(len(patches), PATCHES_AT_ONCE):
         planes = CaptureMap(capture.specs, capture.number[some]) if isinstance(capture, CaptureMap) else capture
@@ -281,6 +292,8 @@ def check_patch_index(patch_index: NDArray[np.int64], grid: SceneGrid) -> None:
 
 def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
     """Return the overview of a coarse pass; a coarse prediction has it already."""
+    import torch
+
     if isinstance(coarse_pass, CoarsePrediction) and coarse_pass.overview is not None:
         return coarse_pass.overview
     network = weights.segmenter.eval()
@@ -307,5 +320,7 @@ def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:
 
 def decide(logits: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """Return the largest probability and its class, uint8; NaN and 255 where a logit is not finite."""
+    import torch
+
     confidence, classes = logits.softmax(dim=dim).max(dim=dim)
     return confidence, torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8)

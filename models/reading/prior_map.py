@@ -19,9 +19,10 @@ from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, overall_accuracy
 from models.network.sizes import CELL_PX
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.lazy import Tensor, torch
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from models.network.temporal_reader import TemporalReader
 
 FAINTEST = -12.7  # least log-probability that is stored: one in 330 000
@@ -54,6 +55,8 @@ class ClassProbabilities:
 
 def likeliest(log_probability: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Return the most probable class (..., class) -> (...) and its log-probability; 0 and NaN for unknown pixels."""
+    import torch
+
     sure, found = torch.from_numpy(log_probability).max(dim=-1)
     return found.numpy(), sure.numpy()
 
@@ -218,6 +221,8 @@ def _read(
     rows: slice,
 ) -> Floats:
     """Return the reader's log-probabilities of some rows; the first row begins a coarse pixel."""
+    import torch
+
     y, x = images[2].shape
     down, across = -(-y // CELL_PX), -(-x // CELL_PX)
     cells = slice(rows.start // CELL_PX, rows.start // CELL_PX + down)
@@ -244,6 +249,8 @@ def _finite(values: Floats) -> NDArray[np.bool_]:
 
 def _image(values: NDArray[np.generic]) -> Tensor:
     """Return (y, x) or (y, x, channel) as a batch of one image, (1, channel, y, x)."""
+    import torch
+
     deep = values[..., None] if values.ndim == 2 else values
     # not deep[None], as in `models.reading.inference.overview_of`
     return torch.from_numpy(np.ascontiguousarray(deep, np.float32))[None].permute(0, 3, 1, 2)

@@ -11,12 +11,14 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError, safe_open
 
 from pipeline.errors import WeightsError
-from pipeline.lazy import Tensor, safetensors_torch, torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 KEY_DIGITS = 20
 ABOUT = "about"  # name of the text in the file
@@ -32,6 +34,8 @@ def write_checksummed(path: Path, about: Mapping[str, Any], tensors: Mapping[str
 
     Raises WeightsError for an error of the disk.
     """
+    import safetensors.torch as safetensors_torch
+
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     hashed = {**about, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
     text = json.dumps({**hashed, SEAL: _seal(hashed)}, sort_keys=True)
@@ -90,6 +94,8 @@ def read_tensors(
 
 def hash_of(tensor: Tensor) -> str:
     """Return the SHA-256 of a tensor's type, shape and numbers, in hexadecimal digits."""
+    import torch
+
     digest = hashlib.sha256(f"{tensor.dtype} {tuple(tensor.shape)}\n".encode())
     digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()

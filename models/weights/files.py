@@ -19,11 +19,12 @@ from models.network.sizes import SegmenterConfig, TemporalSizes
 from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
 from pipeline.errors import WavelengthError, WeightsError
-from pipeline.lazy import Tensor, torch
 from pipeline.readings import readings_alone
 from pipeline.signal.components import Components
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from models.network.segmenter import Segmenter
     from models.network.temporal_reader import TemporalReader
 
@@ -159,6 +160,8 @@ class Weights:
 
 def save_weights(weights: Weights, path: Path) -> None:
     """Write a checksummed file by a temporary name and a rename. Raises WeightsError for an error of the disk."""
+    import torch
+
     tensors = {name: one for name, one in weights.segmenter.state_dict().items() if one.is_floating_point()}
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
@@ -195,6 +198,8 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
 
 def load_reader(weights: Path) -> TemporalReader:
     """Load the temporal reader of weights. WeightsError: their file has none, or it is damaged."""
+    import torch
+
     described = describe_weights(weights)
     if described.reader is None:
         raise WeightsError(
@@ -218,6 +223,8 @@ def load_weights(path: Path) -> Weights:
     Raises WeightsError: it is missing or of another format, or a tensor is damaged, does not fit the config, or has a
     value that is not finite.
     """
+    import torch
+
     from models.network.segmenter import Segmenter
 
     described = describe_weights(path)
@@ -282,6 +289,8 @@ def with_record(weights: Weights, **entries: Any) -> Weights:
 
 def _check_numbers(tensors: Mapping[str, Tensor]) -> None:
     """Raise ValueError for tensors that are not of float32 (colours: uint8), or not finite."""
+    import torch
+
     for name, value in tensors.items():
         kind = torch.uint8 if name == COLOURS else torch.float32
         if value.dtype != kind:

@@ -6,10 +6,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import odc.geo.geobox as odc_geobox
+import pyproj
 from affine import Affine
 from numpy.typing import NDArray
-
-from pipeline.lazy import GeoBox, odc_geobox, pyproj
+from odc.geo.geobox import GeoBox
 
 Floats = NDArray[np.float64]
 WGS84 = 4326  # by EPSG

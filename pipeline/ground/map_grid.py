@@ -13,12 +13,14 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
+import odc.geo.geobox as odc_geobox
+import pyproj
 from numpy.typing import ArrayLike, NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import WGS84, Floats
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
-from pipeline.lazy import GeoBox, odc_geobox, pyproj
 from pipeline.rectify.resample import resample
 
 Pixel = TypeVar("Pixel", bound=np.generic)

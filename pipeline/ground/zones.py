@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyproj
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
 from pipeline.ground.field_places import FieldPlace, GroundPlace
 from pipeline.ground.georeference import WGS84, Floats
-from pipeline.lazy import BaseGeometry, pyproj, rasterio, rasterio_features, shapely
 
 Mask = NDArray[np.bool_]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted
@@ -70,6 +72,9 @@ def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
 
 def pixels_inside(shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0)) -> Mask:
     """Return which of (y, x) ``size`` pixels from row and column ``origin`` on have their centres in polygons."""
+    import rasterio
+    import rasterio.features as rasterio_features
+
     given = [one for one in shapes if not one.is_empty]
     if not given:
         return np.zeros(size, bool)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import SettingsError, WavelengthError
-from pipeline.lazy import spyndex
 
 Floats = NDArray[np.float32]
 
@@ -69,6 +68,8 @@ def find_index(name: str) -> SpectralIndex:
 
     Raises SettingsError: the name is unknown, or the index needs an input that no camera has; lists similar names.
     """
+    import spyndex
+
     listed = {one.lower(): one for one in spyndex.indices}
     if name.lower() not in listed:
         near = get_close_matches(name.lower(), listed, n=3, cutoff=0.5)
@@ -104,6 +105,8 @@ def find_index(name: str) -> SpectralIndex:
 
 def _centre_nm(index: str, symbol: str) -> float:
     """Return the wavelength of an index's band: by its paper, else of Sentinel-2, else the middle of its range."""
+    import spyndex
+
     band = spyndex.bands[symbol]
     satellite = getattr(band, "sentinel2a", None)
     usual = (band.min_wavelength + band.max_wavelength) / 2 if satellite is None else satellite.wavelength

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import torch
+if TYPE_CHECKING:
+    import torch
 
 Kernel = Literal["catmull-rom", "bilinear", "nearest"]
 Rows: TypeAlias = NDArray[np.intp]
@@ -59,6 +60,8 @@ class Windows:
 
     def joint_weight(self) -> torch.Tensor:
         """Return (n, tap * tap) products of the weights along both axes, lines first."""
+        import torch
+
         down, across = _spread(self.taps)
         along_lines, along_samples = (torch.from_numpy(part) for part in self.weight)
         # Products with zeros and ones are exact, in whatever order they are summed, and much faster than broadcasting
@@ -67,6 +70,8 @@ class Windows:
 
     def flat_index(self, shape: tuple[int, int]) -> torch.Tensor:
         """Return (n, tap * tap) rows of a (line * sample) table of this shape, for windows that lie inside."""
+        import torch
+
         lines, samples = shape
         kind = np.int32 if lines * samples < 2**31 else np.int64  # half the bytes
         first = (self.corner[0] * samples + self.corner[1]).astype(kind)
@@ -114,6 +119,8 @@ def weighted_rows(
 
     Each sum runs over its taps in order, whatever the other points are.
     """
+    import torch
+
     count, taps = index.shape
     size = max(BAG_VALUES // max(table.shape[1], 1), 64)
     starts = torch.arange(0, min(size, count) * taps, taps, dtype=index.dtype)
@@ -146,6 +153,8 @@ def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
 @cache
 def _spread(taps: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return matrices (tap, tap * tap) of zeros and ones that repeat weights for every tap of the other axis."""
+    import torch
+
     one = np.eye(taps, dtype=np.float32)
     row = np.ones((1, taps), np.float32)
     return torch.from_numpy(np.kron(one, row)), torch.from_numpy(np.kron(row, one))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import torch
 from pipeline.rectify.kernels import TAPS, Kernel, Rows, Unlocked, Windows, weighted_rows, windows
+
+if TYPE_CHECKING:
+    import torch
 
 LEAST_WEIGHT = 0.5
 ROUNDING = 1e-6
@@ -37,6 +40,8 @@ class LineTable:
 
     def read(self, placed: Windows, out: Floats32, fraction: Floats32) -> None:
         """Write the points' values (n, band), and (n,) the usable fraction of the kernel's weight."""
+        import torch
+
         whole = placed.inside(self.shape)
         if self.whole is not None and whole.any():
             line, sample = np.where(whole, placed.corner, 0).astype(np.intp)
@@ -97,6 +102,8 @@ class LineTable:
 
 def _table(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
     """Make a table of lines (line, sample, band), valid by sample or by element."""
+    import torch
+
     shape = (values.shape[0], values.shape[1])
     elements = None
     rows = np.ascontiguousarray(values, np.float32).reshape(-1, values.shape[2])

@@ -12,11 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.source import References
-
-compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
 FILL_REACH = 8  # samples; elements farther away have seen something else
 
@@ -187,6 +184,8 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
+    from pipeline.signal import compiled_loops
+
     fill = elements.fill
     dark, gain = (np.ascontiguousarray(frame, np.float32) for frame in (elements.references.dark, elements.gain))
     gains = np.ones(len(raw), np.float32) if line_gain is None else line_gain

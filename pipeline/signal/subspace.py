@@ -11,17 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
 from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.signal.components import Components, Floats
-
-compiled_loops: Any = deferred("pipeline.signal.compiled_loops")
 
 BLOCK = 4  # spectra a side of a mean
 SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more add time and little accuracy
@@ -81,6 +77,8 @@ class SignalStatistics:
 
     def add(self, values: Values, valid: Bools) -> None:
         """Add some neighbouring lines: (line, sample, band) scene values, and their validity by `calibrate`."""
+        from pipeline.signal import compiled_loops
+
         if not values.size or not valid.any():
             return
         spectra = np.ascontiguousarray(values, np.float32)

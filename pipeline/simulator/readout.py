@@ -13,7 +13,6 @@ import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
@@ -77,6 +76,8 @@ class Readout:
         cheap = self._variant(SHOT.name) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
         if not cheap:  # shot and read noise are draws of their own
             return self.converted(self.electrons(light, number))
+        from pipeline.simulator import compiled_loops
+
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
         deviate = self._deviates(SHOT.name, number)
         camera = self.block.rig.camera

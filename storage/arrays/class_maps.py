@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
@@ -30,7 +31,6 @@ from storage.arrays.layout import (
     tile_place,
     write_counts,
     write_image,
-    zarr,
 )
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}

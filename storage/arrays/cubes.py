@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import IncompleteStoreError
@@ -27,7 +28,6 @@ from storage.arrays.layout import (
     write_bands,
     write_counts,
     write_small,
-    zarr,
 )
 
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"

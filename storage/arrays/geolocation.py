@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from pipeline.rectify.placed import TieTable
 from pipeline.rectify.scan_paths import ScanPath
 from storage.archive.keys import KEY_LENGTH
-from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small, zarr
+from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 

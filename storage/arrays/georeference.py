@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import odc.geo.crs as odc_crs
+import odc.geo.geobox as odc_geobox
+import zarr
 from affine import Affine
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError
 from pipeline.ground.georeference import zoomed_out
-from pipeline.lazy import GeoBox, odc_crs, odc_geobox, odc_xr
-from storage.arrays.layout import SmallArray, create_group, damage_named, open_group, zarr
+from storage.arrays.layout import SmallArray, create_group, damage_named, open_group
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
@@ -144,6 +147,8 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
 
 def grid_mapping(geobox: GeoBox) -> SmallArray:
     """Return CRS and transform of a map as CF's grid mapping."""
+    import odc.geo.xr as odc_xr
+
     mapping = odc_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
     return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
 

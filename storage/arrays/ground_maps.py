@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_places import M2_PER_HECTARE
-from pipeline.lazy import GeoBox
 from storage.arrays.class_maps import (
     CHANGED,
     CONFIDENCE,
@@ -33,7 +34,6 @@ from storage.arrays.layout import (
     image_spec,
     open_group,
     read_array,
-    zarr,
 )
 
 PICTURE = "picture"

@@ -15,23 +15,18 @@ from functools import cache, lru_cache, wraps
 from itertools import product
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, cast
+from typing import Any, Literal, NamedTuple, TypeVar, cast
 
 import numpy as np
+import zarr
+import zarr.codecs as zarr_codecs
+import zarr.storage as zarr_storage
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.lazy import deferred
 from pipeline.signal.components import Components
 from pipeline.signal.condense import whole_steps
-
-if TYPE_CHECKING:
-    import zarr
-    import zarr.codecs as zarr_codecs
-    import zarr.storage as zarr_storage
-else:  # a sixth of a second, which commands on manifests do not need
-    zarr, zarr_codecs, zarr_storage = map(deferred, ("zarr", "zarr.codecs", "zarr.storage"))
 
 CHUNK_PX = 32
 SHARD_ROWS = 64

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
@@ -35,7 +36,6 @@ from storage.arrays.layout import (
     write_components,
     write_counts,
     write_image,
-    zarr,
 )
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways

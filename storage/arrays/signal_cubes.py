@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
 from pipeline.geometry.mirror import mirror_throughput
@@ -51,7 +52,6 @@ from storage.arrays.layout import (
     write_components,
     write_counts,
     write_small,
-    zarr,
 )
 
 FRAMES_OF = "frames_of"  # attribute: the sweep beside it that holds the dark and white frames of both

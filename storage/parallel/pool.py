@@ -20,7 +20,6 @@ from operator import call
 from typing import Any, TypeVar
 
 from pipeline.errors import SettingsError, WorkerError
-from pipeline.lazy import dask, dask_distributed
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 RESTART_S = 60.0  # time limit until a process of this machine replaces one that died
@@ -193,6 +192,9 @@ def _in_order(
 
 def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any, None, None]:
     """Yield the results of blocks on the workers of dask, which runs blocks of a dead worker again on others."""
+    import dask
+    import dask.distributed as dask_distributed
+
     cluster = _clusters[pool] = _clusters[pool] or Cluster(pool)
     lost = (WorkerError, CancelledError, dask_distributed.KilledWorker)
     try:
@@ -205,7 +207,7 @@ def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]
         _dismiss(pool)
         if isinstance(error, WorkerError):
             raise
-        if isinstance(error, CancelledError):
+        if isinstance(error, CancelledError) and pool.elsewhere:
             advice = "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
         else:
             advice = (
@@ -229,8 +231,11 @@ class Cluster:
 
     def __init__(self, pool: WorkerPool) -> None:
         """Connect to the scheduler, or start processes (SettingsError: none answers, or none start)."""
+        import dask.distributed as dask_distributed
+
         self.name = f"--scheduler {pool.scheduler}"
-        for name in ("distributed", "distributed.client"):  # an error reports lost connections once
+        # an error reports lost connections once
+        for name in ("distributed", "distributed.client", "tornado.application"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             self._own: Any = None if pool.elsewhere else start(pool.count)
@@ -261,6 +266,9 @@ class Cluster:
 
 def start(workers: int) -> Any:
     """Start a dask cluster of processes of this machine, with one arithmetic thread each, deaf to Ctrl-C."""
+    import dask
+    import dask.distributed as dask_distributed
+
     make_cluster = dask_distributed.LocalCluster  # imported before its settings are changed for a while
     resource_tracker.ensure_running()  # started later it would unblock signals
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

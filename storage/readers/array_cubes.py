@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from pipeline.errors import SceneError
-from pipeline.lazy import GeoBox
 from storage.arrays.georeference import find_geobox
 from storage.readers.cube_sources import (
     BLOCK_LINES,

@@ -16,11 +16,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.lazy import h5py
 from storage.readers.array_cubes import Arrays, FileArray
 from storage.readers.cube_sources import DEFLATE_RATIO
 

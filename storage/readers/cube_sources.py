@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import SceneError
-from pipeline.lazy import GeoBox
 from pipeline.signal.calibrate import calibrate
 from pipeline.source import References
 

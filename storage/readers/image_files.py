@@ -17,11 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import odc.geo.crs as odc_crs
+import odc.geo.geobox as odc_geobox
+import pyproj
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.envi_headers import finite_number, wavelengths_nm
 from pipeline.errors import SceneError
-from pipeline.lazy import GeoBox, odc_crs, odc_geobox, pyproj
 from storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,

@@ -13,8 +13,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from odc.geo.geobox import GeoBox
+
 from pipeline.errors import SceneError, list_some
-from pipeline.lazy import GeoBox
 from storage.readers.labels import Labels, found_classes, load_labels
 from storage.readers.open_cubes import CUBE_ENDINGS
 from storage.readers.polygons import POLYGON_ENDINGS, is_polygon_file, load_polygon_labels, polygon_classes, split_layer

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from pipeline.lazy import GeoBox, odc_warp
 from storage.readers.open_cubes import open_labels
 from storage.readers.scene_toml import ClassValue, Colour
 
@@ -180,6 +180,8 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
 
 def _on_grid(codes: NDArray[np.int64], own: GeoBox, grid: GeoBox, address: str | Path) -> NDArray[np.int64]:
     """Return the nearest code to each pixel of a grid, `NO_VALUE` beside the labels (SceneError: all pixels are)."""
+    import odc.geo.warp as odc_warp
+
     values, index = np.unique(codes, return_inverse=True)
     found = np.full(tuple(grid.shape), -1, np.int32)
     odc_warp.rio_reproject(index.reshape(codes.shape).astype(np.int32), found, own, grid, "nearest", -1, -1)

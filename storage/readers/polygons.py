@@ -9,17 +9,24 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pyproj
+import shapely
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from shapely.geometry.base import BaseGeometry
 
 from pipeline.errors import PipelineError, SceneError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture
 from pipeline.ground.zones import on_field
-from pipeline.lazy import BaseGeometry, GeoBox, geopandas, pyogrio, pyproj, rasterio_features, shapely
 from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
+
+if TYPE_CHECKING:
+    import geopandas
 
 ZONE_ENDINGS = (".geojson", ".json", ".gpkg", ".shp")
 POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels; a .json file may hold anything
@@ -58,6 +65,9 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
 
     GeoJSON without a CRS is WGS 84. The index has the rows of the layer, from 0. Raises ZoneError: as `read_zones`.
     """
+    import geopandas
+    import pyogrio
+
     path, layer = split_layer(source)
     if path.suffix.lower() not in ZONE_ENDINGS:
         raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
@@ -259,6 +269,8 @@ def _moved(table: geopandas.GeoDataFrame, place: FieldPlace, address: str | Path
 
 def _burn(polygons: Sequence[tuple[BaseGeometry, int | None]], shape: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the (y, x) class index at each pixel's centre; the last polygon wins."""
+    import rasterio.features as rasterio_features
+
     if not polygons:
         return np.full(shape, UNLABELLED, np.uint8)
     return np.asarray(rasterio_features.rasterize(polygons, out_shape=shape, fill=UNLABELLED, dtype="uint8"))

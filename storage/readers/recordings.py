@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
 from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
@@ -32,7 +33,6 @@ from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
 from pipeline.ground.georeference import geobox_of_record
-from pipeline.lazy import GeoBox
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest, is_archive, store_at
 from storage.archive.manifests import check_files, manifest_sha256

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import EmptySceneError, SceneError
 from pipeline.geometry.grid import SceneGrid, cuts
-from pipeline.lazy import GeoBox
 from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from storage.archive.staging import file_hash
 from storage.parallel.pool import RESERVED_BYTES, memory_refusal

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zarr
 
 from pipeline.errors import SceneError
-from storage.arrays.layout import zarr
 from storage.readers.array_cubes import FileArray
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")

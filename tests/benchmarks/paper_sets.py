@@ -27,7 +27,7 @@ from models.weights.files import Weights, load_encoder, load_weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, block_means
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
 

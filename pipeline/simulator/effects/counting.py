@@ -15,7 +15,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.effect import Bound, Effect, Radiance, unit_stream
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Rig
@@ -36,6 +35,8 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
     [1] Box, Muller, "A note on the generation of random normal deviates", Ann. Math. Stat. 29, 1958.
            doi:10.1214/aoms/1177706645
     """
+    from pipeline.simulator import compiled_loops
+
     drawn = np.empty(count + count % 2, np.float32)
     compiled_loops.draw_pairs(rng.bit_generator.random_raw(len(drawn) // 2).view(np.uint32), PIECE, drawn)
     return drawn[:count]

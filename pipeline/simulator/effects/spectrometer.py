@@ -11,7 +11,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator import compiled_loops
 from pipeline.simulator.effects.counting import EXACT, Floats, normal_deviates
 from pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, unit_stream
 from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
@@ -151,6 +150,8 @@ class Smile(LightChange):
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
+        from pipeline.simulator import compiled_loops
+
         wavelength = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(wavelength, float(block.rig.optics.smile_nm), block.rig.camera.samples)
         out = np.empty(light.shape, np.float32)

@@ -10,14 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator import compiled_loops
 from pipeline.simulator.optics.kernel_fit import TAIL, Floats, Footprint, TapTable, disc_points
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
+
+if TYPE_CHECKING:
+    from pipeline.simulator import compiled_loops
 
 Radiance = NDArray[np.float32]
 MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
@@ -36,6 +39,8 @@ class _Mixing:
     @staticmethod
     def of(fractions: Radiance, between: Floats, spectra: Radiance) -> _Mixing:
         """Return the mixing of spectra (component, band): bands between the same nodes are made at once."""
+        from pipeline.simulator import compiled_loops
+
         bands = spectra.shape[1]
         cuts = [0]
         for cut in (np.flatnonzero(np.diff((between > 0).argmax(axis=0))) + 1).tolist():
@@ -51,6 +56,8 @@ class _Mixing:
 
     def write(self, parts: Radiance, light: Radiance) -> None:
         """Write light (n, band) of components through kernels, (kernel, n, component)."""
+        from pipeline.simulator import compiled_loops
+
         nodes = np.empty((len(self.fractions), *parts.shape[1:]), np.float32)
         if self.fractions.size == 1:
             np.multiply(parts, self.fractions[0, 0], out=nodes)
@@ -123,6 +130,8 @@ class SceneSampler:
         They are sums over the parts, times ``gains`` (kernel, component). ``planes`` (y, x, component), by level, are
         C-contiguous. ``numbers`` (kernel,) say where in ``out`` kernels belong.
         """
+        from pipeline.simulator import compiled_loops
+
         for views in steps:
             for level, some, one in self.tables:
                 pixels = planes[level]
@@ -139,6 +148,8 @@ class KernelTables:
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
         """Take ``views`` that include the extremes of all that will be sampled."""
+        from pipeline.simulator import compiled_loops
+
         self.kernels = kernels_of(footprint)
         self.parts = int(self.kernels.place.shape[1])  # boxes that each kernel is summed over
         table = views.table()
@@ -159,6 +170,8 @@ class KernelTables:
 
 def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
+    from pipeline.simulator import compiled_loops
+
     across, along = footprint.parts
     slit, pixel = footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12

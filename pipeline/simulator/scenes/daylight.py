@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.lazy import pvlib
 from pipeline.simulator.rig_model import Sky
 
 Floats = NDArray[np.float64]
@@ -87,6 +86,8 @@ def _table(latitude: float, longitude: float, hour: int) -> Floats:
 
 
 def _elevation_deg(latitude: float, longitude: float, moments: Floats) -> Floats:
+    import pvlib
+
     at_ground = {"elev": 0.0, "pressure": 1013.25, "temp": 12.0, "delta_t": 69.0, "atmos_refract": 0.5667}
     found = pvlib.spa.solar_position(np.asarray(moments, np.float64), latitude, longitude, **at_ground)
     return 90.0 - np.asarray(found[0], np.float64)  # of the zenith angle with refraction
@@ -94,6 +95,8 @@ def _elevation_deg(latitude: float, longitude: float, moments: Floats) -> Floats
 
 def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats | float) -> tuple[Floats, Floats]:
     """Return SPECTRL2's wavelengths [nm] and light on level ground (wavelength, sun) [W/m^2/nm]."""
+    import pvlib
+
     turned = {"apparent_zenith": zenith_deg, "aoi": zenith_deg, "surface_tilt": 0.0, "relative_airmass": airmass}
     air = {"surface_pressure": 101325.0, "precipitable_water": 1.5, "ozone": 0.31, "aerosol_turbidity_500nm": 0.1}
     sky = pvlib.spectrum.spectrl2(**turned, **air, ground_albedo=0.2, dayofyear=day)  # Pa, cm, atm cm
@@ -102,6 +105,8 @@ def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats |
 
 def _light_of(elevation_deg: Floats, moments: Floats) -> Floats:
     """Return light on level ground by the sun's height, (time, wavelength of the model); 0 at the horizon and below."""
+    import pvlib
+
     zenith = 90.0 - np.maximum(elevation_deg, 0.0)
     moment = np.asarray(moments * 1e6, "datetime64[us]")
     start_of_year = moment.astype("datetime64[Y]").astype("datetime64[us]")

@@ -12,11 +12,12 @@ from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, cuts
-from pipeline.lazy import GeoBox, Once
+from pipeline.once import Once
 from pipeline.readings import MOST_VALUE, find_beyond
 from pipeline.simulator.scenes.scratch import scratch
 

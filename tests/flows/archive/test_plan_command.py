@@ -124,7 +124,7 @@ def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, mo
 
 def test_a_plan_imports_no_heavy_library() -> None:
     """Their import takes seconds, so it is deferred to their first use."""
-    heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy.stats", "pandas", "prefect", "distributed"}
+    heavy = {"torch", "matplotlib", "xarray", "rasterio", "scipy.stats", "pandas", "prefect", "distributed"}
     code = "import sys, flows.cli.main, flows.archive.plan_command; print(*sys.modules)"
     assert not heavy & set(python(code).stdout.split())
 

@@ -14,7 +14,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep, points_of_scan, sweep_to_scene
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.planning.coverage import full_sweeps, uniform_sweeps
 from pipeline.rectify.registration.alignment import no_shifts
 from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows

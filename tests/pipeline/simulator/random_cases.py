@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from pipeline.geometry.camera import LineCamera
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.effects.counting import GAUSSIAN, SHOT
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.render import BY_NAME, EFFECTS, Choice

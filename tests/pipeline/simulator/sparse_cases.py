@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from tests.pipeline.simulator.random_cases import Case, random_rig

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import cuts
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.scenes.farm.farm_plan import (
     CLASS_COLOURS,
     CLASSES,

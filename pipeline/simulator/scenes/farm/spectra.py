@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import WavelengthError
 from pipeline.geometry.camera import LineCamera
-from pipeline.lazy import prosail
 from pipeline.simulator.scenes.daylight import clear_sky
 
 Spectrum = NDArray[np.float64]
@@ -159,6 +158,7 @@ def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.floa
 @lru_cache(maxsize=1)
 def _known_spectra() -> dict[str, Spectrum]:
     """Return the reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm, by models or laws."""
+    import prosail
 
     def stand(one: Canopy) -> Spectrum:
         leaf = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm)

@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.errors import SceneError, ShapeError
 from pipeline.geometry.camera import LineCamera
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes import scratch as scratch_module
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
+from pipeline.once import Once
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.render import EFFECTS, expected_light
