@@ -96,11 +96,6 @@ class OpenedRun:
         """Name in the archive: time of publication, and the field."""
         return self.folder.name
 
-    @property
-    def archive_name(self) -> str:
-        """The address that opens its archive."""
-        return self._archive.name
-
     @cached_property
     def receipt(self) -> Mapping[str, Any]:
         """Receipt of the run: settings, stages, savings, accuracy, products.

@@ -189,17 +189,12 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     found = find_product(catalogue, product)
     if isinstance(found, Run):
         below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
-        row = _run_row(catalogue, found, sum(archive.sizes([found.uri, *found.names]).values()))
-        row |= {"problem": found.problem, "command": command(found.settings, archive.name)}
         shown: set[str] = set()
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
-        return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
-    return {
-        "archive": archive.name,
-        "product": found,
-        "runs": [run.uri for run in catalogue.named_by(found)],
-        "lineage": [_tree(catalogue, found, set())],
-    }
+        told = {"problem": found.problem, "command": command(found.settings, archive.name)}
+        return {"archive": archive.name, "product": found.uri, **told, "lineage": trees}
+    runs = [run.uri for run in catalogue.named_by(found)]
+    return {"archive": archive.name, "product": found, "runs": runs, "lineage": [_tree(catalogue, found, set())]}
 
 
 def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
@@ -214,8 +209,6 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
         "version": store.version,
         "cleared": store.cleared,
         "called": sorted(catalogue.roles(uri)),
-        "created": store.created,
-        "bytes": store.size,
         "problem": store.problem,
         "inputs": [],
     }
@@ -337,18 +330,14 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
 
 def show_explanation(content: dict[str, Any], console: Console) -> None:
     """Print a product's lineage."""
-    run = content.get("run")
-    if run is not None:
-        where = f"{content['product']}: {run['scene']}, seed {run['seed']}, budget {run['budget']}, {run['state']}"
-        show_text(run["problem"] or where, console)
-        if run["command"]:
-            show_text(run["command"], console)
+    for text in (content["product"], content.get("problem"), content.get("command")):
+        if text:
+            show_text(text, console)
     for node in content["lineage"]:
         console.print(_branch(node, None))
-    if run is None:
-        show_text(
-            f"named by {', '.join(content['runs']) or 'no run: gc --dry-run lists what it would remove'}", console
-        )
+    if "runs" in content:
+        named = ", ".join(content["runs"]) or "no run: gc --dry-run lists what it would remove"
+        show_text(f"named by {named}", console)
 
 
 def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
@@ -369,9 +358,8 @@ def _format_node(node: Mapping[str, Any]) -> str:
         return f"{name} [bold red]damaged: {escape(node['problem'])}[/]"
     if "see" in node:
         return f"{name} [dim]{node['see']}[/]"
-    when = escape(node["created"][:16].replace("T", " ")) or DASH
-    size = "cleared away, made again if needed" if node["cleared"] else format_bytes(node["bytes"])
-    return f"{name} version {escape(node['version'])}, {when}, {size}"
+    cleared = ", cleared away, made again if needed" if node["cleared"] else ""
+    return f"{name} version {escape(node['version'])}{cleared}"
 
 
 def show_verdict(content: dict[str, Any], console: Console) -> None:

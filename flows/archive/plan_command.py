@@ -19,8 +19,8 @@ from flows.publish.findings import field_figures
 from flows.publish.receipt_table import finding_rows
 from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
 from flows.settings.load import load_settings
-from flows.settings.survey_settings import ALWAYS, BUILT_IN_SCENES, Settings
-from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
+from flows.settings.survey_settings import ALWAYS, Settings
+from flows.settings.values import EXTENT_WHOLE
 from flows.tasks.capture_plan import as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
@@ -35,7 +35,6 @@ from pipeline.geometry.scan import exposing
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan, frontier
-from pipeline.signal.subspace import SMALL_FIELD
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, is_archive, store_at
 
@@ -239,7 +238,7 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
     if (zoomed := scans["two_passes"]) is not None:
         first = format_scan(zoomed["step"], zoomed["exposure_ms"])
         mark = "this survey, two passes" if zoomed["taken"] else "two passes"
-        words = [format_estimate(name, zoomed[name]) for name in LABELS if name not in ("bytes_kept", "miou")]
+        words = [format_estimate(name, zoomed[name]) for name in LABELS if name != "miou"]
         score = DASH if zoomed["miou"]["at_most"] else format_estimate("miou", zoomed["miou"])  # no score by the record
         cells.append((zoomed["capture_s"]["value"], [first, mark, *words, score]))
     columns = ("scan or first pass", "", "capture time", "bytes captured", "multiply-adds", "mIoU, about")
@@ -249,16 +248,9 @@ def scan_table(scans: Mapping[str, Any]) -> Table:
 LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "capture_s": ("capture time", format_seconds),
     "bytes_captured": ("bytes captured", format_bytes),
-    "bytes_kept": ("bytes kept", format_bytes),
     "multiply_adds": ("model's multiply-adds", format_count),
     "miou": ("mIoU", lambda score: format_prediction(score, None) or DASH),
 }
-# Bytes kept, fitted to five surveys (docs/background/signal.md): records of the stores; the map, by its pixels; and the
-# scores of a spectrum, by the bands of a file.
-RECORDS, MAP_PIXEL = 150_000, 5.0
-FARM_SCORES, LARGE_FARM_SCORES, FILE_SCORES = 17.0, 4.5, 2.4
-BANDS_POWER = 0.57
-KEPT_FROM = "pixels, spectra and bands, by surveys of five fields, which kept 0.5 to 2 times as much"
 
 
 @dataclass(frozen=True)
@@ -283,17 +275,7 @@ def estimate_survey(run: SurveyRun, fine: FinePlan | None) -> dict[str, dict[str
     every = format_count(run.work_done(run.kept_patches).total)
     source = f"the patches that other scenes needed; {every} with every patch" if expected else "network and field"
     work = Estimate(run.work_done(patch_index).total, source, fine is None and run.chooses and not expected)
-    captured = (camera["bytes_captured"].value or 0.0) if camera else 0.0
-    kept_bytes = estimated_bytes(
-        math.prod(run.scene.shape),
-        len(run.scene.wavelength_nm),
-        captured,
-        is_farm=run.settings.scene in BUILT_IN_SCENES,
-    )
-    kept = Estimate(kept_bytes, KEPT_FROM)
-    if run.settings.keep != KEEP_SIGNAL:
-        kept = Estimate(kept_bytes + captured, f"{KEPT_FROM}, and raw lines as they are captured", at_most=True)
-    found = {**camera, "bytes_kept": kept, "multiply_adds": work, "miou": _score(run)}
+    found = {**camera, "multiply_adds": work, "miou": _score(run)}
     return {name: asdict(one) for name, one in found.items()}
 
 
@@ -336,17 +318,6 @@ def _score(run: SurveyRun) -> Estimate:
         return Estimate(None, "no scene was kept for validation when the weights were trained")
     source = f"these weights on {counted(int(validation['scenes']), 'scene')} kept for validation, read whole"
     return Estimate(whole, source, at_most=run.chooses or not run.plan.plain)
-
-
-def estimated_bytes(pixels: int, bands: int, captured: float, *, is_farm: bool) -> float:
-    """Return the bytes that a run keeps of a field without its raw lines, by a fit to surveys.
-
-    ``captured`` is the size of the raw lines, 0 for a raster.
-    """
-    spectra = pixels + captured / (BYTES_PER_SAMPLE * bands)  # of the mosaic and of the lines
-    of_farm = FARM_SCORES if pixels < SMALL_FIELD else LARGE_FARM_SCORES
-    scores = spectra * (of_farm if is_farm else FILE_SCORES * bands**BANDS_POWER)
-    return RECORDS + MAP_PIXEL * pixels + scores
 
 
 def format_estimate(name: str, one: Mapping[str, Any]) -> str:

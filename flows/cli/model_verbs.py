@@ -77,12 +77,6 @@ class TrainFlags(SceneFlags):
         Time limit of the steps [min]; reading scenes and validation are not included.
     patch
         Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
-    width
-        Channels of the full network at full resolution.
-    overview_width
-        Channels of the overview network.
-    columns
-        Number of spectral features per pixel, for any camera. Default: 24 for built-in scenes, 48 for files.
     start
         Weights from which the training starts. Bands, classes and sizes must be theirs, and DATASET must contain the
         scenes that they know. The result is the mean of both networks, or the trained one where it reads the
@@ -117,9 +111,6 @@ class TrainFlags(SceneFlags):
     steps: int = TrainingSettings.steps
     minutes: float = TrainingSettings.minutes
     patch: int | None = None
-    width: int = TrainRequest.width
-    overview_width: int = TrainRequest.overview_width
-    columns: int | None = None
     start: Path | None = None
     learning_rate: float | None = None
     train_temporal: Path | None = None
@@ -147,9 +138,6 @@ class TrainFlags(SceneFlags):
             self.validation,
             self.scenes,
             self.patch,
-            self.columns,
-            self.width,
-            self.overview_width,
             tokens={"dim": self.dim, "heads": self.heads} | ({} if self.layers is None else {"layers": self.layers}),
             choices=self.choices(),
             settings=TrainingSettings(

@@ -41,8 +41,7 @@ class TrainRequest:
     scenes: int | None = None  # of a built-in farm; None: its default
     patch: int | None = None
     columns: int | None = None  # of spectral features; None: 24 of built-in scenes, 48 of files
-    width: int = 20
-    overview_width: int = 8
+    width: int = SegmenterConfig.width
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
     settings: TrainingSettings = field(default_factory=TrainingSettings)
@@ -201,7 +200,6 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             columns=common.basis.columns,
             patch=common.patch,
             width=request.width,
-            overview_width=request.overview_width,
             deep=deep,
             **{"layers": 1 if deep else SegmenterConfig.layers, **request.tokens},
         )

@@ -63,7 +63,7 @@ def test_opening_an_archive_does_not_load_torch(run: OpenedRun) -> None:
     code = (
         "import sys, spectralzoom; print(spectralzoom.open(sys.argv[1]).latest.class_map.dtype, 'torch' in sys.modules)"
     )
-    command = [sys.executable, "-W", "error", "-c", code, run.archive_name]
+    command = [sys.executable, "-W", "error", "-c", code, str(run.folder.parents[1])]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "uint8 False"
 
 
@@ -85,7 +85,7 @@ def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_p
 def test_class_map_and_confidence_are_those_of_the_store(run: OpenedRun) -> None:
     """Classes stay uint8 with their names; 255 is nodata."""
     found = run.class_map
-    stored = load_class_map(Path(run.archive_name) / run.receipt["products"]["class_map"])
+    stored = load_class_map(run.folder.parents[1] / run.receipt["products"]["class_map"])
     assert (found.dtype, found.attrs["nodata"]) == (np.uint8, 255)
     np.testing.assert_array_equal(found, stored.classes)
     assert found.attrs["flag_meanings"].split() == list(run.class_names) == list(stored.names)
@@ -106,7 +106,7 @@ def test_mosaic_and_class_map_share_their_coordinates(run: OpenedRun) -> None:
 def test_the_ground_map_has_its_crs(run: OpenedRun) -> None:
     """The CRS follows rioxarray's convention, and the transform is that of the store."""
     drawn = run.ground_map
-    geobox = load_geobox(Path(run.archive_name) / run.receipt["products"]["ground_map"])
+    geobox = load_geobox(run.folder.parents[1] / run.receipt["products"]["ground_map"])
     assert drawn["classes"].dtype == np.uint8
     assert (drawn["classes"].rio.crs.to_epsg(), drawn["classes"].rio.nodata) == (32632, 255)
     here = drawn["classes"].rio.transform()
@@ -123,7 +123,7 @@ def test_progress_rises_to_1_in_every_stage(surveyed: tuple[OpenedRun, Heard]) -
 
 def test_surveying_prints_nothing(asked: dict[str, object], run: OpenedRun, capfd: pytest.CaptureFixture[str]) -> None:
     """A survey of stored results publishes a new run without output on stdout or stderr."""
-    again = spectralzoom.survey(asked, out=run.archive_name)
+    again = spectralzoom.survey(asked, out=str(run.folder.parents[1]))
     assert {row["state"] for row in again.receipt["stages"]} <= {"cached", "skipped"}
     assert again.name != run.name
     assert capfd.readouterr() == ("", "")
@@ -131,7 +131,7 @@ def test_surveying_prints_nothing(asked: dict[str, object], run: OpenedRun, capf
 
 def test_a_plan_counts_only_missing_stores(asked: dict[str, object], run: OpenedRun, tmp_path: Path) -> None:
     """The arguments of a finished survey have nothing to make; for a new archive there is, and no file is written."""
-    assert spectralzoom.plan(asked, out=run.archive_name)["to_make"] == 0
+    assert spectralzoom.plan(asked, out=str(run.folder.parents[1]))["to_make"] == 0
     elsewhere = spectralzoom.plan(asked, out=tmp_path / "archive")
     assert elsewhere["to_make"] > 5
     assert not (tmp_path / "archive").exists()

@@ -106,7 +106,7 @@ def test_explain_covers_captures_and_runs(two_budgets: Path, capsys: pytest.Capt
     (first, _) = (run["id"] for run in contents(Archive.open(two_budgets))["runs"])
     content = _json(capsys, lambda: explain(two_budgets, first, as_json=True))
     assert [tree["stage"] for tree in content["lineage"]] == ["evaluate"]
-    assert "--budget 0.8" in content["run"]["command"]
+    assert "--budget 0.8" in content["command"]
     explain(two_budgets, first)
     out = capsys.readouterr().out
     assert "spectralzoom survey --scene" in " ".join(out.split())
