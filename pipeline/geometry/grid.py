@@ -65,24 +65,19 @@ def cuts(size: int, step: int) -> Iterator[slice]:
     return (slice(first, min(first + step, size)) for first in range(0, size, step))
 
 
-def patch_pixels(grid: SceneGrid, image: NDArray[Kind], beyond: int = 0) -> NDArray[Kind]:
-    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; ``beyond`` fills the rest."""
+def patch_pixels(grid: SceneGrid, image: NDArray[Kind]) -> NDArray[Kind]:
+    """Cut a (y, x) image of the scene into patches, (patch, y, x) by their numbers; 0 fills the rest."""
     rows, columns = grid.patch_shape
     p = grid.patch
-    padded = np.full(grid.padded_shape, beyond, image.dtype)
+    padded = np.zeros(grid.padded_shape, image.dtype)
     padded[: grid.height, : grid.width] = image
     return padded.reshape(rows, p, columns, p).transpose(0, 2, 1, 3).reshape(rows * columns, p, p)
 
 
 def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
     """Extend the first two axes to ``shape`` by reflection; one single pixel is repeated."""
-    for axis, size in enumerate(shape):
-        while image.shape[axis] < size:
-            have = image.shape[axis]
-            pad = [(0, 0)] * image.ndim
-            pad[axis] = (0, size - have if have < 2 else min(size - have, have - 1))
-            image = np.pad(image, pad, mode="edge" if have < 2 else "reflect")
-    return image
+    beyond = [(0, max(size - have, 0)) for size, have in zip(shape, image.shape, strict=False)]
+    return np.pad(image, [*beyond, *[(0, 0)] * (image.ndim - len(shape))], mode="reflect")
 
 
 def block_means(values: NDArray[np.float32], times: int) -> NDArray[np.float32]:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError
+from pipeline.geometry.grid import cuts
 from pipeline.ground.georeference import WGS84, Floats
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
 from pipeline.rectify.resample import resample
@@ -218,9 +219,7 @@ def _between(exact: Floats, pixels: slice, axis: int) -> Floats:
 
 def map_blocks(shape: tuple[int, int], block: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
     """Cut a map of (y, x) px into blocks of at most ``block`` px, row by row."""
-    for top in range(0, shape[0], block[0]):
-        for left in range(0, shape[1], block[1]):
-            yield slice(top, min(top + block[0], shape[0])), slice(left, min(left + block[1], shape[1]))
+    return ((rows, columns) for rows in cuts(shape[0], block[0]) for columns in cuts(shape[1], block[1]))
 
 
 def nearest_at(image: NDArray[Pixel], pixels: Floats, nothing: float, *, factor: int = 1) -> NDArray[Pixel]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,13 +133,11 @@ def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overl
     across, scan = field_px(grid, along)
     cells = -(-across // step)
     low, high = -across / 2, cells * step - across / 2
-    kind: Literal["coarse", "fine"] = "fine" if step == 1 else "coarse"
-    name = "full" if step == 1 else "coarse"
     sweeps = []
     for number, swath in enumerate(_swath_centres((low, high), scan, camera, step, overlap_px)):
         seen = np.clip(swath + reach_px(swath, scan, camera, step), low + step / 2, high - step / 2)
         start, lines = _scan_range(float(swath), seen, scan, camera, step)
-        sweeps.append(Sweep(f"{name}-{number}", kind, along, float(swath), start, lines, step))
+        sweeps.append(Sweep(f"full-{number}", "fine", along, float(swath), start, lines, step))
     check_reach(sweeps, camera)
     return sweeps
 
