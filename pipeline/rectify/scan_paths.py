@@ -1,6 +1,5 @@
-"""Find scan paths: the places of a sweep's lines, as runs in one direction, and the line numbers of its frames.
-
-The time stamp of a frame gives its line of the plan.
+"""Find scan paths: the places of a sweep's lines, as runs in one direction, and the frames whose time
+stamps can be trusted.
 """
 
 from __future__ import annotations
@@ -184,24 +183,21 @@ def _dwell_starts(scan: Floats, reach: float) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True)
-class LineNumbers:
-    """Line numbers of the frames of a sweep, by their time stamps."""
+class JudgedStamps:
+    """Frames of a sweep with a trusted time stamp, and the faults of the others."""
 
-    number: NDArray[np.intp]  # (frame,) line of the plan from the first trusted frame; of a repeated frame that of the
-    # first, of a frame without a trusted stamp that of the line before
     usable: NDArray[np.bool_]  # (frame,)
     lost: int  # lines between the first and the last without a frame
     repeated: int  # frames with a stamp that came before
     backward: int  # frames whose stamp goes back, lies far off all others, or is not finite
 
 
-def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
-    """Find the line of each frame from time stamps (frame,), of mid exposure in the order of arrival [s].
+def judge_stamps(time_s: Floats, frame_s: float) -> JudgedStamps:
+    """Judge time stamps (frame,) of mid exposure, in the order of arrival [s]; gaps above 1.5 periods lose lines.
 
-    A gap of more than 1.5 periods skips line numbers. The first of frames with equal stamps is used. Stamps that go
-    back are not trusted: the longest ascending row of stamps is, the one with the earlier frames if several are equally
-    long. So one wild stamp costs one line, also at either end. A late frame is used, with the position at its own time.
-    ``frame_s`` is the planned frame period.
+    The first of frames with equal stamps is used. Stamps that go back are not trusted: the longest ascending row of
+    stamps is, the one with the earlier frames if several are equally long. So one wild stamp costs one line, also at
+    either end. A late frame is used, with the position at its own time. ``frame_s`` is the planned frame period.
     """
     known = np.isfinite(time_s)
     first = np.zeros(len(time_s), np.bool_)
@@ -215,18 +211,11 @@ def number_lines(time_s: Floats, frame_s: float) -> LineNumbers:
         far = max(WILD_FRAMES * frame_s, float(stamps[-2] - stamps[1]))
         row = row[int(stamps[1] - stamps[0] > far) : len(row) - int(stamps[-1] - stamps[-2] > far)]
     usable[row] = True
-    count = _numbers(time_s[usable], frame_s)
-    number = np.zeros(len(time_s), np.intp)
-    if len(count):
-        same = np.minimum(np.searchsorted(time_s[usable], time_s), len(count) - 1)
-        number = np.where(time_s[usable][same] == time_s, count[same], count[np.maximum(np.cumsum(usable) - 1, 0)])
-    return LineNumbers(
-        number=number,
-        usable=usable,
-        lost=int(count[-1]) + 1 - len(count) if len(count) else 0,
-        repeated=repeated,
-        backward=int((~usable).sum()) - repeated,
-    )
+    steps = np.ceil(np.diff(time_s[usable]) / frame_s - 0.5).astype(np.intp)  # half a period rounds down
+    # A frame that comes late by more than half a period looks like the next line; the one after shows that it is not.
+    missing = np.append(0, np.cumsum(steps - 1))
+    lost = int(missing[-1] - missing.min())
+    return JudgedStamps(usable, lost, repeated, backward=int((~usable).sum()) - repeated)
 
 
 def _longest_ascent(values: Floats) -> NDArray[np.intp]:
@@ -246,13 +235,3 @@ def _longest_ascent(values: Floats) -> NDArray[np.intp]:
         row.append(index)
         index = int(below[index])
     return np.array(row, np.intp)
-
-
-def _numbers(time_s: Floats, frame_s: float) -> NDArray[np.intp]:
-    """Return the line numbers of ascending stamps, the first being 0."""
-    steps = np.ceil(np.diff(time_s) / frame_s - 0.5).astype(np.intp)  # half a period rounds down: 1.5 lose nothing
-    count = np.concatenate([np.zeros(min(len(time_s), 1), np.intp), np.cumsum(steps)])
-    # A frame that comes late by more than half a period looks like the next line; the one after shows that it is not.
-    order = np.arange(len(count))
-    count = order + np.minimum.accumulate((count - order)[::-1])[::-1]
-    return count - count[:1]

@@ -14,7 +14,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing, merged_ms
 from pipeline.rectify.placed import PixelGrid, PlacedSweep, place
 from pipeline.rectify.registration.alignment import SweepShift
-from pipeline.rectify.scan_paths import LineNumbers, number_lines
+from pipeline.rectify.scan_paths import JudgedStamps, judge_stamps
 from pipeline.signal.components import Components
 from pipeline.signal.lines import CondensedLines, Raw
 from pipeline.source import References, SweepLines
@@ -36,14 +36,14 @@ class SweepPath:
     """A captured sweep, its trusted lines, and its corrections."""
 
     lines: StoredLines
-    numbers: LineNumbers
+    stamps: JudgedStamps
     shift: SweepShift
     gain: NDArray[np.float32] | None
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Return (line,) valid lines with a time stamp and a position of their own."""
-        return np.asarray(self.lines.valid_line & self.numbers.usable & np.isfinite(self.lines.position.sum(axis=1)))
+        return np.asarray(self.lines.valid_line & self.stamps.usable & np.isfinite(self.lines.position.sum(axis=1)))
 
     @property
     def shift_px(self) -> NDArray[np.float64]:
@@ -56,7 +56,7 @@ class SweepPath:
 
     def facts(self) -> dict[str, int]:
         """Count lines that were lost, sent twice or out of order; a rig's lost lines are rows that are not valid."""
-        counts = {name: getattr(self.numbers, name) for name in ("lost", "repeated", "backward")}
+        counts = {name: getattr(self.stamps, name) for name in ("lost", "repeated", "backward")}
         counts["lost"] *= self.lines.source != "rig"  # which pauses while it loads positions
         return counts | {"invalid": int(np.count_nonzero(~self.lines.valid_line))}
 
@@ -75,7 +75,7 @@ def sweep_paths(
         one = (found or {}).get(name, {"offset_px": (0.0, 0.0), "drift_px_per_line": (0.0, 0.0), "gain": None})
         shift = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
         gain = None if one["gain"] is None else np.array(one["gain"], np.float32)
-        paths.append(SweepPath(lines, number_lines(lines.time_s, period_s), shift, gain))
+        paths.append(SweepPath(lines, judge_stamps(lines.time_s, period_s), shift, gain))
     return paths
 
 
