@@ -56,11 +56,6 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
         return self._archive.name
 
     @property
-    def runs(self) -> Mapping[str, OpenedRun]:
-        """The runs by name, the latest first: the archive itself."""
-        return self
-
-    @property
     def latest(self) -> OpenedRun:
         """The run published last. Raises NoRunError without one."""
         return self[LATEST]
@@ -141,8 +136,6 @@ class OpenedRun:
         from spectralzoom.spectra import open_lazy_mosaic
 
         return open_lazy_mosaic(self._place("mosaic"))
-
-    cube = mosaic  # beside `lines`
 
     @property
     def lines(self) -> dict[str, xarray.DataArray]:

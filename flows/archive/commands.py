@@ -6,7 +6,6 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Any
 
@@ -18,23 +17,23 @@ from flows.settings.flags import ArchiveName, AsJson, Switch
 from flows.settings.load import OF_THE_PLAN
 from flows.settings.survey_settings import ALWAYS, RECORDED, Settings
 from flows.tasks.scores import score_of
-from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds, known_number
+from flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue, find_product
-from storage.archive.records import Run, moment_of
+from storage.archive.records import Run
 from storage.archive.whole_files import to_json
-from storage.maintenance.garbage import DAY_S, clear_up
+from storage.maintenance.garbage import clear_up
 from storage.maintenance.verification import Finding, verify_everything
 
 SHORT_KEY = 12
-WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "age", "stage", "what")  # never folded
+WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "stage", "what")  # never folded
 MOST_ROWS = 20  # stores of a stage, removals
 
 
 def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
-    """List the runs and stores of an archive with their age, scene, score and size."""
+    """List the runs and stores of an archive with their scene, score and size."""
     put_out(contents(Archive.open(archive, create=False, write=False)), show_contents, as_json=as_json)
     return DONE
 
@@ -119,7 +118,6 @@ def gc(
 def contents(archive: Archive) -> dict[str, Any]:
     """Return the runs of an archive, newest last, and its stores by stage, oldest first."""
     catalogue = Catalogue.read(archive.root)
-    now = datetime.now(UTC)
     of_runs = (uri for run in catalogue.runs for uri in (run.uri, *run.names))  # also of stores that are missing
     sizes = archive.sizes(sorted({*catalogue.stores, *of_runs}))
     stages: dict[str, list[dict[str, Any]]] = {}
@@ -128,7 +126,6 @@ def contents(archive: Archive) -> dict[str, Any]:
             "key": store.ref.key,
             "version": store.version,
             "created": store.created,
-            "age_s": _age_s(store.created, now),
             "bytes": sizes[store.ref.uri],  # with its manifest
             "cleared": store.cleared,
             "runs": len(catalogue.named_by(store.ref.uri)),
@@ -141,8 +138,7 @@ def contents(archive: Archive) -> dict[str, Any]:
             _run_row(catalogue, run, sum(sizes[uri] for uri in (run.uri, *run.names)))
             | {
                 # would go with the run: its folder, and the stores that no other run needs
-                "own_bytes": sizes[run.uri] + sum(sizes[uri] for uri in run.names if len(catalogue.named_by(uri)) == 1),
-                "age_s": _age_s(run.created, now),
+                "own_bytes": sizes[run.uri] + sum(sizes[uri] for uri in run.names if len(catalogue.named_by(uri)) == 1)
             }
             for run in catalogue.runs
         ],
@@ -173,11 +169,6 @@ def _run_state(catalogue: Catalogue, run: Run) -> str:
     damaged = sum(store is not None and store.problem is not None for store in stores)
     counts = ((stores.count(None), "missing"), (damaged, "damaged"))
     return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
-
-
-def _age_s(created: str, now: datetime) -> float | None:
-    made = moment_of(created)
-    return None if made is None else (now - made).total_seconds()
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
@@ -276,13 +267,13 @@ def command(settings: Mapping[str, Any], out: str) -> str:
 
 def show_contents(content: dict[str, Any], console: Console) -> None:
     """Print the content of an archive."""
-    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "own", "age", "state")
+    columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "own", "state")
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
     if any(run["training_scene"] and known_number(run["miou"]) is not None for run in content["runs"]):
         console.print("* on a scene that the weights were trained on", highlight=False)
     rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
-    columns = ("stage", "key", "version", "size", "age", "named by")
+    columns = ("stage", "key", "version", "size", "named by")
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
     count = counted(sum(map(len, content["stages"].values())), "store")
     shared = f", {format_bytes(content['shared_bytes'])} shared by several runs" if content["shared_bytes"] else ""
@@ -298,7 +289,6 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
         *map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)),
         format_points(miou) + learned,
         format_bytes(run["own_bytes"]),
-        _age(run["age_s"]),
         state,
     ]
 
@@ -308,7 +298,7 @@ def _shown_stores(stage: str, stores: Sequence[Mapping[str, Any]]) -> Iterator[l
         size = "cleared" if row["cleared"] else format_bytes(row["bytes"])
         size = "[bold red]damaged[/]" if row["problem"] else size
         name = escape(stage) if number == 0 else ""
-        yield [name, escape(row["key"]), escape(row["version"]), size, _age(row["age_s"]), str(row["runs"] or "none")]
+        yield [name, escape(row["key"]), escape(row["version"]), size, str(row["runs"] or "none")]
     if len(stores) > MOST_ROWS:
         yield ["", f"[dim]and {len(stores) - MOST_ROWS} older[/]"]
 
@@ -373,9 +363,3 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
     for survey in content.get("surveys", ()):
         show_text(f"this makes the stores of {survey['run']} again: {survey['command']}", console)
     show_text(f"{content['whole']} stores and runs are as published, out of {content['checked']}", console)
-
-
-def _age(seconds: float | None) -> str:
-    if seconds is not None and seconds >= 2 * DAY_S:
-        return f"{seconds // DAY_S:.0f} days"
-    return DASH if seconds is None else format_seconds(max(seconds, 0))

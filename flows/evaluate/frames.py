@@ -101,9 +101,8 @@ class Candidate:
         return cast(dict[str, Any], self.described.record.get("split", {}))
 
     def validated_on(self, scene: RasterScene) -> bool:
-        """Return whether the scene was one for validation; older files record only names, and give False."""
-        known = self.split.get("validation", ())
-        return isinstance(known, dict) and scene.clear_key in known.values()
+        """Return whether the scene was one for validation."""
+        return scene.clear_key in self.split.get("validation", {}).values()
 
 
 @dataclass(frozen=True)

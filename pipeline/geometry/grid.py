@@ -78,22 +78,3 @@ def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDA
     """Extend the first two axes to ``shape`` by reflection; one single pixel is repeated."""
     beyond = [(0, max(size - have, 0)) for size, have in zip(shape, image.shape, strict=False)]
     return np.pad(image, [*beyond, *[(0, 0)] * (image.ndim - len(shape))], mode="reflect")
-
-
-def block_means(values: NDArray[np.float32], times: int) -> NDArray[np.float32]:
-    """Return the mean of ``times`` x ``times`` pixels without NaN, (y, x, band); NaN where a block has no value.
-
-    Blocks at the end may be smaller.
-    """
-    beyond = [(0, -size % times) for size in values.shape[:2]]
-    if any(more for _, more in beyond):
-        values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
-    blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        total: NDArray[np.float32] = blocks.sum(axis=(1, 3), dtype=np.float32)
-    if np.isfinite(total).all():  # the usual case: all pixels have a value
-        return np.asarray(total / np.float32(times**2))
-    seen = np.isfinite(blocks)
-    count = seen.sum(axis=(1, 3), dtype=np.float32)
-    total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
-    return np.asarray(np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0))

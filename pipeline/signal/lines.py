@@ -166,13 +166,13 @@ def signal_of(lines: SweepLines, gain: NDArray[np.float32] | None = None) -> Sig
     return CondensedSignal(lines, gain) if isinstance(lines, CondensedLines) else Signal(lines, gain)
 
 
-def broad_bands(references: References, bands: int = BROAD_BANDS) -> NDArray[np.intp]:
+def broad_bands(references: References) -> NDArray[np.intp]:
     """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
     good = references.white > references.dark
     if references.bad is not None:
         good = good & ~references.bad
     known = np.flatnonzero(good.mean(axis=0) >= 0.9)
-    return spread_bands(known if len(known) else np.arange(len(references.white_reference)), bands)
+    return spread_bands(known if len(known) else np.arange(len(references.white_reference)), BROAD_BANDS)
 
 
 @runtime_checkable

@@ -5,7 +5,6 @@ Find products by name. A damaged manifest gives a store with a problem, a missin
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -175,11 +174,5 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
         raise ArchiveError(f"{text} begins {len(found)} stores: {list_some(found, 3)}; give more of it")
     if newest is not None and text in products:
         raise ArchiveError(f"the {text} of {newest.uri} lacks its store {wanted}; survey again to make it")
-    near = difflib.get_close_matches(text, products, n=1)
-    if near:
-        known = f"did you mean {near[0]}?"
-    elif products:
-        known = f"products of the newest run: {', '.join(products)}"
-    else:
-        known = f"no run has products; there is {list_some(sorted(catalogue.stores), 3) or 'nothing in it'}"
-    raise NoRunError(f"{text!r} is no product, store or run of this archive; {known}")
+    known = ", ".join(products) or list_some(sorted(catalogue.stores), 3) or "nothing in it"
+    raise NoRunError(f"{text!r} is no product, store or run of this archive; there is {known}")

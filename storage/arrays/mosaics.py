@@ -12,7 +12,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.grid import block_means, cuts
+from pipeline.geometry.grid import cuts
 from pipeline.signal.components import Components, broad_weights
 from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
 from storage.arrays.layout import (
@@ -42,7 +42,6 @@ CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several 
 RGB_NM = (640.0, 550.0, 460.0)  # shown as red, green and blue
 FAR_NM = 60.0  # largest distance of a band from the colour that shows it
 MID_GREY = 0.42  # of the median of a picture
-HALF = 0.5  # least fraction of its finer pixels with which a pixel has a value
 
 
 class MosaicWriter:
@@ -197,20 +196,10 @@ class Mosaic:
         blocks = (self.scores(rows)[-rows.start % step :: step, ::step] for rows in cuts(self.shape[0], SHARD_ROWS))
         return np.concatenate([self.spectra(block, bands) for block in blocks])
 
-    def brightness(self, factor: int = 1, bands: int | None = None) -> NDArray[np.float32]:
-        """Return the mean over the bands, (y, x), of ``factor`` x ``factor`` px each; ``factor`` divides 64.
-
-        Pixels are means of the captured ones, NaN where fewer than half are. ``bands`` limits the mean to so many
-        bands, spread over all.
-        """
+    def brightness(self, bands: int | None = None) -> NDArray[np.float32]:
+        """Return the mean over the bands, (y, x), NaN where not captured; ``bands`` limits it to so many of them."""
         weights, offset = broad_weights(self.components, bands or self.components.bands)
-
-        def means(block: NDArray[np.float32]) -> NDArray[np.float32]:
-            bright = np.asarray(block @ weights + offset, np.float32)[..., None]
-            fraction = block_means(np.isfinite(bright).astype(np.float32), factor)
-            return np.where(fraction < HALF, np.float32(np.nan), block_means(bright, factor))[..., 0]
-
-        return np.concatenate([means(block) for block in self.row_blocks()])
+        return np.concatenate([np.asarray(block @ weights + offset, np.float32) for block in self.row_blocks()])
 
     def row_blocks(self, rows: slice = slice(None), columns: slice = slice(None)) -> Iterator[NDArray[np.float32]]:
         """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards."""

@@ -26,10 +26,11 @@ from models.training.train import LabelledPixels, Progress, TrainingSettings, li
 from models.weights.files import Weights, load_encoder, load_weights
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid, block_means
+from pipeline.geometry.grid import SceneGrid
 from pipeline.once import Once
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
+from tests.blocks import block_means
 
 SIDE = 1024  # px
 INPUTS = (4, 2)  # fine pixels a side of a coarse one

@@ -25,7 +25,7 @@ from flows.survey_command import run_survey
 from flows.terminal.processes import DONE, PARTLY
 from models.weights.files import save_weights
 from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.grid import UNLABELLED, block_means
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -36,6 +36,7 @@ from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import open_mosaic
 from storage.maintenance.verification import verify_everything
+from tests.blocks import block_means
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.envi_files import write_recorded_files
 from tests.flows.conftest import CommandLine, be_version, command_line

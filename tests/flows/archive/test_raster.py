@@ -22,10 +22,11 @@ from flows.survey_command import run_survey
 from flows.tasks.patch_budget import ReadingCosts
 from models.weights.files import describe_weights
 from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.grid import SceneGrid, block_means
+from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive
 from storage.arrays.mosaics import open_mosaic
 from storage.maintenance.verification import verify_everything
+from tests.blocks import block_means
 from tests.conftest import QUIET, RGB_NM, WeightsMaker, patchy_scene
 from tests.storage.readers.test_raster_tags import write
 

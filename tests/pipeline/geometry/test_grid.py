@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
-from pipeline.geometry.grid import SceneGrid, block_means, pad_by_reflection
+from pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
 sizes = st.integers(1, 200)
 
@@ -50,28 +50,3 @@ def test_reflection_padding_repeats_periodically(size: int, more: int):
     grown = pad_by_reflection(np.arange(size)[:, None], (size + more, 1))[:, 0]
     place = np.arange(size + more) % (2 * size - 2)
     assert grown.tolist() == np.where(place < size, place, 2 * size - 2 - place).tolist()
-
-
-@pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2)])
-def test_block_means_ignore_nan(shape: tuple[int, int]) -> None:
-    """Each mean is over the finite pixels of its block, also of smaller blocks at the border; NaN without any."""
-    values = np.random.default_rng(4).normal(size=(*shape, 2)).astype(np.float32)
-    values[0, 0], values[: min(4, shape[0]), : min(4, shape[1]), 1] = np.nan, np.nan
-    means = block_means(values, 4)
-    for y in range(means.shape[0]):
-        for x in range(means.shape[1]):
-            block = values[4 * y : 4 * y + 4, 4 * x : 4 * x + 4]
-            for band in range(2):
-                seen = block[..., band][np.isfinite(block[..., band])]
-                expected = seen.mean() if seen.size else np.nan
-                np.testing.assert_allclose(means[y, x, band], expected, rtol=1e-5, atol=1e-6)
-
-
-def test_block_means_do_not_depend_on_holes_in_other_blocks() -> None:
-    """A hole changes the bits of its own block and band alone; the means stay finite."""
-    values = np.random.default_rng(5).lognormal(size=(8, 12, 3)).astype(np.float32)
-    whole = block_means(values, 4)
-    values[0, 0, 1], values[7, 11] = np.nan, np.inf
-    torn = block_means(values, 4)
-    assert set(zip(*np.nonzero(torn != whole), strict=True)) == {(0, 0, 1), (1, 2, 0), (1, 2, 1), (1, 2, 2)}
-    assert np.isfinite(torn).all()

