@@ -1,7 +1,7 @@
 """Train the temporal reader on sequences of visits to one land.
 
 The prior map of each visit is the reader's own output for the visits before, as in surveys. Some visits capture a part
-of the land. Some prior maps are of another land, or shifted, and the reader learns to reject them.
+of the land.
 """
 
 from __future__ import annotations
@@ -29,10 +29,7 @@ from pipeline.geometry.grid import UNLABELLED
 FAINT = 1e-5  # least probability of a pass
 PARTLY_SEEN = 0.3  # fraction of later visits that capture a part of the land
 INCOMPARABLE = 0.1  # fraction of visits whose spectral features are not comparable
-OTHER_LAND, BESIDE = 0.06, 0.06  # fraction of batches with prior maps of another land, or shifted
 UNDATED = 0.1  # fraction of sequences of visits whose days are unknown
-WRONG = 0.4  # fraction of the prior maps of such a batch
-BESIDE_CELLS = 6  # at most, in coarse pixels
 WARM_UP = 50  # steps
 
 
@@ -115,7 +112,7 @@ def train_reader(
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * rate
         optimiser.zero_grad()
-        value = _learn(reader, _sequences(lands, settings, rng), weight, rng)
+        value = _learn(reader, _sequences(lands, settings, rng), weight)
         torch.nn.utils.clip_grad_norm_(reader.parameters(), 1.0)
         optimiser.step()
         step += 1
@@ -128,7 +125,7 @@ def train_reader(
     return averaged, step
 
 
-def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
+def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor) -> float:
     """Carry prior maps through visits, learn from the labels of each but the first, and return the mean loss."""
     start = visits[0]
     state, coarse = start.observation, start.coarse
@@ -139,9 +136,8 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
         age = age + now.days
         rests_on = rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
         small = now.seen[:, :, CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
-        before_map, coarse_before = _wrong(state, coarse, rng)
-        images = before_map, now.observation, now.seen, age, rests_on
-        found = reader(*images, now.light, now.step, now.season, coarse_before, now.coarse, small * now.comparable)
+        images = state, now.observation, now.seen, age, rests_on
+        found = reader(*images, now.light, now.step, now.season, coarse, now.coarse, small * now.comparable)
         losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
         loss = map_loss(found, losses, now.labels, weight, soft_dice=True)
         torch.autograd.backward(loss)
@@ -152,20 +148,6 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor, rng
         rests_on = rests_on + now.seen * (now.light / now.step**2)[:, None, None, None]
         coarse = now.coarse.where(small > 0, coarse)
     return total
-
-
-def _wrong(state: Tensor, coarse: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Replace some prior maps by those of another land, or shift them, in a fraction of the batches."""
-    drawn = rng.random()
-    if drawn >= OTHER_LAND + BESIDE:
-        return state, coarse
-    those = torch.from_numpy(rng.random(len(state)) < WRONG)[:, None, None, None]
-    if drawn < OTHER_LAND:
-        by = int(rng.integers(1, max(len(state), 2)))
-        return state.roll(by, 0).where(those, state), coarse.roll(by, 0).where(those, coarse)
-    down, across = (int(by) for by in rng.integers(-BESIDE_CELLS, BESIDE_CELLS + 1, 2))
-    moved = state.roll((CELL_PX * down, CELL_PX * across), (2, 3))
-    return moved.where(those, state), coarse.roll((down, across), (2, 3)).where(those, coarse)
 
 
 def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng: np.random.Generator) -> list[_Batch]:
