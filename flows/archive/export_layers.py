@@ -27,7 +27,7 @@ from pipeline.products.indices import SpectralIndex, find_index
 from storage.archive.archive import Archive
 from storage.archive.keys import LATEST, StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, legend_of
+from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
 from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import open_group
@@ -270,27 +270,16 @@ def _picture(run: ExportedRun) -> Layer:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return what a prior map adds: changes, and earlier classes.
-
-    Raises IncompleteStoreError: class probabilities cannot be read.
-    """
-    layers = []
-    if run.store(PROBABILITIES) is not None:
-        ProbabilityStore(run.path(PROBABILITIES))
-    if (product := _product_with(run, "changed")) is not None:
-        title = "Fraction of the patch's pixels with another class than in the prior map"
-        make = image_layer if product == "ground_map" else patch_layer
-        layers.append(replace(make(run, product, "changed", "changed", title), unit="1"))
-    if (product := _product_with(run, OLD_CLASS)) is not None:
-        legend = legend_of(open_group(run.path(product)))
-        title = "Class of the prior map, where the map is sure of another one"
-        layers.append(
-            image_layer(run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend, band="class")
-        )
-    return layers
-
-
-def _product_with(run: ExportedRun, array: str) -> str | None:
-    """Return the product that has an image: the map on the ground, else class probabilities."""
-    products = (name for name in ("ground_map", PROBABILITIES) if run.store(name) is not None)
-    return next((name for name in products if array in open_group(run.path(name))), None)
+    """Return what a prior map adds: changes, and earlier classes."""
+    product = "ground_map" if run.map_product == "ground_map" else PROBABILITIES
+    if run.store(product) is None or OLD_CLASS not in (group := open_group(run.path(product))):
+        return []
+    make = image_layer if product == "ground_map" else patch_layer
+    changed = make(
+        run, product, "changed", "changed", "Fraction of the patch's pixels with another class than in the prior map"
+    )
+    title = "Class of the prior map, where the map is sure of another one"
+    old = image_layer(
+        run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend_of(group), band="class"
+    )
+    return [replace(changed, unit="1"), old]
