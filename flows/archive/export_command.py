@@ -101,7 +101,7 @@ def run_export(
             _export_images(export, layers, console)
             areas = export.folder / "areas.csv"
             write_areas(opened, areas)
-            export.add("areas", areas, "Areas of the classes", CSV, ["data", "metadata"])
+            export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
             if choice.polygons:
                 with console.status("drawing polygons"):
                     for key, path, kind in write_polygons(opened, export.folder, choice.doses):

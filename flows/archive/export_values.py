@@ -14,34 +14,55 @@ from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
 from flows.publish.receipt import hectares_of_classes
+from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import class_counts
 from storage.arrays.georeference import grid_of, load_geobox
 from storage.arrays.ground_maps import open_image
 from storage.arrays.layout import open_group, read_bands
 from storage.arrays.mosaics import Mosaic, open_mosaic
 from storage.export.image_files import CogImage
 
+COLUMNS = (
+    *("class", "pixels", "hectares", "fraction", "mean_confidence"),
+    *("estimated_fraction", "standard_error"),  # by the labels
+)
+DIGITS = 6
 BYTES_AT_ONCE = 1 << 27
 COLUMNS_AT_ONCE = 640
 SAMPLED = 4  # step in pixels for finding the white level
 
 
 def write_areas(run: ExportedRun, path: Path) -> None:
-    """Write the table with a row for each class; hectares are empty where the size of a pixel is not known."""
-    image = open_image(run.path(run.map_product), "classes")
-    names = tuple(image.about["class_names"])
-    pixels = sum(class_counts(classes, len(names)) for _, classes in image.rows())
-    hectares = hectares_of_classes(run.receipt)
+    """Write the table with a row for each class; unknown values are empty."""
+    path_of_map = run.path(run.map_product)
+    names = tuple(open_image(path_of_map, "classes").about["class_names"])
+    counts, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
+    for (_, classes), (_, sure) in zip(
+        open_image(path_of_map, "classes").rows(), open_image(path_of_map, "confidence").rows(), strict=True
+    ):
+        counts += np.bincount(classes.ravel(), minlength=256)
+        known = np.isfinite(sure)
+        sums += np.bincount(classes[known], sure[known], 256)
+        sure_pixels += np.bincount(classes[known], minlength=256)
+    confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
+    pixels = counts[: len(names)]
+    areas = hectares_of_classes(run.receipt)
+    hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
+    fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
+    unknown = np.full(len(names), np.nan)
+    own = unknown if hectares is None else hectares
+    confusion = run.receipt.get("accuracy", {}).get("confusion")
+    estimate = (unknown, unknown) if confusion is None else stratified_fractions(fraction, confusion)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(("class", "pixels", "hectares"))
-    for name, count in zip(names, np.atleast_1d(pixels).tolist(), strict=True):
-        table.writerow([name, count, "" if hectares is None else f"{hectares.get(name, 0.0):.6g}"])
+    table.writerow(COLUMNS)
+    for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
+        figures = [column[number] for column in (own, fraction, confidence, *estimate)]
+        table.writerow([name, count, *(f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in figures)])
     write_whole(path, text.getvalue())
 
 

@@ -1,4 +1,4 @@
-"""Judge new weights on validation scenes: placements, cascade, uniform scans and readings."""
+"""Judge new weights on validation scenes: placements, cascade, uniform scans and baselines."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.linear_model import LogisticRegression
 
 from flows.training.data import Report
 from models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
@@ -30,7 +33,7 @@ from models.policies.placement import ReadTwice
 from models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from models.training.examples import Example
-from models.training.train import halfway, with_linear
+from models.training.train import LabelledPixels, halfway, with_linear
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.planning.coverage import frame_patches
@@ -189,3 +192,33 @@ def _miou(weights: Weights, examples: Sequence[Example]) -> float:
         drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
         counts += confusion(labels, drawn.classes, weights.config.classes)
     return mean_iou(counts)
+
+
+def judge_baselines(
+    train: Sequence[Example], validation: Sequence[Example], classes: int, seed: int, report: Report
+) -> dict[str, float] | None:
+    """Return the mIoU of LDA, logistic regression and a random forest on the same pixels of validation scenes.
+
+    Without such scenes they learn from a random half of the training pixels, and the other half judges them. Features
+    are those of `linear_classifier`. None with a single class, or if each has one pixel to learn from.
+    """
+    rng = np.random.default_rng([seed, 0xBA5])
+    learnt = LabelledPixels.drawn(train, rng)
+    if validation:
+        judged = LabelledPixels.drawn(validation, rng)
+    else:
+        half = rng.permutation(len(learnt.labels)) % 2 == 0
+        learnt, judged = (LabelledPixels(learnt.features[part], learnt.labels[part]) for part in (half, ~half))
+    if not 1 < len(np.unique(learnt.labels)) < len(learnt.labels):
+        return None
+    found: dict[str, float] = {}
+    for name, classifier in {
+        "LDA": LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"),
+        "logistic regression": LogisticRegression(max_iter=200),
+        "random forest": RandomForestClassifier(100, min_samples_leaf=2, random_state=seed),
+    }.items():
+        report("fitting baseline classifiers", len(found) / 3, name)
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a single pixel
+            classifier.fit(learnt.features, learnt.labels)
+        found[name] = mean_iou(confusion(judged.labels, classifier.predict(judged.features).astype(np.uint8), classes))
+    return found

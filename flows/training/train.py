@@ -16,14 +16,22 @@ from rich.console import Console
 from flows.tasks.scene import masks_contain
 from flows.terminal.progress import one_after_the_other, table
 from flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
-from flows.training.figures import FEW_PIXELS, better_reading, judge_calibration, judge_scans, read_twice, validate
+from flows.training.figures import (
+    FEW_PIXELS,
+    better_reading,
+    judge_baselines,
+    judge_calibration,
+    judge_scans,
+    read_twice,
+    validate,
+)
 from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from models.network.machine import PROCESSOR, choose_device
 from models.network.spectral import Normalisation
 from models.policies.placement import CascadeTable
 from models.training.capture_augmentation import REFERENCE_MS
 from models.training.examples import measured_normalisation
-from models.training.train import LabelledPixels, linear_classifier, train
+from models.training.train import PIXELS, LabelledPixels, linear_classifier, train
 from models.weights.checksummed_files import load_checkpoint
 from models.weights.files import (
     CALIBRATION,
@@ -180,6 +188,7 @@ def _learned(
     weights, found["readings"] = better_reading(
         weights, start, frames, few=begun is None and labelled < FEW_PIXELS, begun=begun
     )
+    found["baselines"] = judge_baselines(examples, frames, config.classes, settings.seed, report)
     if frames:
         report("validating", 0.0, f"{len(frames)} scenes")
         found[CALIBRATION] = judge_calibration(weights, frames, settings.seed)
@@ -230,9 +239,19 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     steps = record["training"]["steps"]
     console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
     readings = record["readings"]
-    of_readings = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in readings["miou"].items())
+    of_readings, of_baselines = (
+        ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
+        for scores in (readings["miou"], record["baselines"] or {})
+    )
     text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
     console.print(f"{text}kept: {readings['kept']}", soft_wrap=True)
+    if of_baselines:
+        console.print(
+            f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}"
+            if of_readings
+            else f"mIoU of classifiers of a random half of the training pixels, on the other half: {of_baselines}",
+            soft_wrap=True,
+        )
     figures = record["validation"]
     if figures is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, cuts
@@ -166,3 +166,28 @@ def _error(maps: list[JudgedMap], temperature: float) -> float:
         probability = scipy.special.softmax(one.log_probability / np.float32(temperature), axis=1)
         counts += confidence_counts(probability.max(axis=1), probability.argmax(axis=1) == one.labels)
     return calibration_error(counts)
+
+
+def stratified_fractions(mapped: ArrayLike, confusion: ArrayLike) -> tuple[Floats, Floats]:
+    """Estimate fractions (class,) and their standard errors from a map and the confusion matrix of judged pixels.
+
+    ``mapped`` is (class,) fractions of the map, ``confusion`` (label, mapped class) counts, as `confusion` above
+    returns them. The judged pixels count as a random sample of each mapped class. The result is NaN if a mapped
+    class has fewer than the two judged pixels that an error needs.
+
+    References
+    ----------
+    .. [1] Olofsson et al., "Good practices for estimating area and assessing accuracy of land change", Remote Sensing
+       of Environment 148, 2014. doi:10.1016/j.rse.2014.02.015
+    """
+    weight = np.asarray(mapped, np.float64)
+    counts = np.asarray(confusion, np.float64)
+    there = weight > 0
+    strata = weight[there]
+    number = counts[:, there].sum(axis=0)
+    if (number < 2).any():
+        return np.full(len(weight), np.nan), np.full(len(weight), np.nan)
+    of_map = counts[:, there] / number
+    fractions = (strata * of_map).sum(axis=1)  # [1] Eq. 9
+    variance = (strata**2 * of_map * (1 - of_map) / (number - 1)).sum(axis=1)  # [1] Eq. 10, squared
+    return fractions, np.sqrt(variance)

@@ -110,7 +110,7 @@ def test_polygons_cover_the_map_without_gap_or_overlap(posed: Exported) -> None:
 
 
 def test_the_table_of_areas_is_consistent_with_map_and_receipt(posed: Exported) -> None:
-    """Pixels are those of the map, hectares those of the receipt."""
+    """Pixels are those of the map, hectares those of the receipt, fractions sum to 1, errors are not negative."""
     with posed.file("areas").open() as text:
         table = list(csv.DictReader(text))
     names = [row["class"] for row in table]
@@ -118,6 +118,11 @@ def test_the_table_of_areas_is_consistent_with_map_and_receipt(posed: Exported) 
     assert [int(row["pixels"]) for row in table] == counts[: len(names)].tolist()
     hectares = posed.receipt["areas"]["ha"]
     np.testing.assert_allclose([float(row["hectares"]) for row in table], [hectares[name] for name in names], rtol=1e-5)
+    for column in ("fraction", "estimated_fraction"):
+        assert sum(float(row[column]) for row in table) == pytest.approx(1, abs=1e-4)
+    assert all(float(row["standard_error"]) >= 0 for row in table)
+    by_labels = np.array(posed.receipt["accuracy"]["confusion"])
+    assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
 
 
 def test_the_catalogue_lists_every_product(posed: Exported) -> None:

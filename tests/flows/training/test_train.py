@@ -22,11 +22,13 @@ from flows.tasks.run import open_run
 from flows.training import figures, train_scenes
 from flows.training import train as flow
 from flows.training.data import TrainingData
+from flows.training.figures import judge_baselines
 from flows.training.train import run_train, train_weights
 from flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
 from models.evaluation.metrics import mean_iou
 from models.network.spectral import SpectralBasis
 from models.policies.placement import ReadTwice
+from models.training.examples import Example
 from models.training.train import TrainingSettings
 from models.weights.files import TrainedOn, describe_weights, load_weights
 from pipeline.errors import SceneError, SettingsError
@@ -130,7 +132,7 @@ def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: boo
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
-    """The table has rows of no, some and all patches; the readings have their mIoU."""
+    """The table has rows of no, some and all patches, the baselines and the readings with their mIoU."""
     shown = io.StringIO()
     rows = {"none", "gain", "all"}
     judged = run_train(_request(folder, out, validation=1), Console(file=shown, width=100))["validation"]
@@ -139,8 +141,10 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
         assert all(0 <= judged[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
     record = describe_weights(out).record
+    assert set(record["baselines"]) == {"LDA", "logistic regression", "random forest"}
     assert set(record["readings"]["miou"]) == {"network", "mean of both", "linear classifier"}
-    assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in record["readings"]["miou"].items())
+    beside = record["baselines"] | record["readings"]["miou"]
+    assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in beside.items())
 
 
 @pytest.mark.parametrize(("few", "validation", "kept"), [(2000, 1, "mean of both"), (0, 1, None), (0, 0, "network")])
@@ -164,6 +168,26 @@ def test_counts_of_validation_scenes_add_up() -> None:
     assert found["none"]["miou"] == mean_iou(np.array([[2, 2], [2, 2]]))
     assert found["gain"]["miou"] == mean_iou(np.array([[3, 1], [2, 2]]))  # one patch of four, by the highest gain
     assert found["all"]["miou"] == mean_iou(np.array([[4, 0], [2, 2]]))
+
+
+@pytest.mark.parametrize("validation", [True, False])
+def test_baselines_separate_classes_of_different_spectra(validation: bool) -> None:
+    """Distant classes score above 0.95, those of one distribution near chance; a class or few pixels give none."""
+    rng = np.random.default_rng(0)
+    labels = np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
+    values = rng.normal(0, 1, (40, 40, 3))
+
+    def judged(spectra: np.ndarray, truth: np.ndarray) -> dict[str, float] | None:
+        one = Example("e", np.asarray(spectra, np.float32), truth, truth.shape)
+        return judge_baselines([one], [one] * validation, 2, 0, lambda what, done, figure: None)
+
+    mixed = rng.permutation(labels.ravel()).reshape(labels.shape)
+    far, alike = judged(values + 9 * labels[..., None], labels), judged(values, mixed)
+    assert min(far.values()) > 0.95
+    assert max(alike["LDA"], alike["logistic regression"]) < 0.45
+    assert validation or alike["random forest"] < 0.45
+    assert judged(values, np.zeros_like(labels)) is None
+    assert judged(values[:1, :2], np.array([[0, 1]], np.uint8)) is None
 
 
 def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
@@ -241,11 +265,12 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
 
 @pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
 def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
-    """Weights have none without validation scenes; after short exposures training reports that."""
+    """Weights have none without validation scenes; after short exposures training reports that, and its baselines."""
     shown = io.StringIO()
     request = _request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms))
     assert "scans" not in run_train(request, Console(file=shown, width=100))
     assert ("the file has no scan performance" in shown.getvalue()) == said
+    assert "of a random half of the training pixels, on the other half: LDA " in shown.getvalue()
 
 
 def test_whitening_uses_the_noise_of_short_exposures(folder: Path, out: Path):

@@ -1,10 +1,11 @@
-"""Products of maps: spectral indices worked out by hand, bands by wavelength, and refusals."""
+"""Products of maps: spectral indices worked out by hand, bands by wavelength, refusals, and areas with errors."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError, WavelengthError
 from pipeline.products.indices import find_index, index_values, pick_bands, white_level
 
@@ -64,3 +65,28 @@ def test_an_index_of_ratios_needs_no_reflectance() -> None:
     assert white_level(np.linspace(0, 255, 500)) > 250
     assert white_level(np.full(4, np.nan)) == 1.0
     assert white_level(np.linspace(0, 0.01, 500)) < 0.01  # radiance
+
+
+# Olofsson et al. 2014, table 8: rows are mapped classes there, columns reference classes
+EXAMPLE = np.array([[66, 0, 5, 4], [0, 55, 8, 12], [1, 0, 153, 11], [2, 1, 9, 313]])
+MAPPED = np.array([200_000, 150_000, 3_200_000, 6_450_000]) / 1e7
+HECTARES_A_PIXEL = 0.09
+
+
+def test_stratified_area_estimate_equals_the_paper() -> None:
+    """Deforestation is 21158 ha with a 95 % interval of 6158 ha, as printed in the paper."""
+    fractions, errors = stratified_fractions(MAPPED, EXAMPLE.T)
+    hectares, intervals = fractions * 1e7 * HECTARES_A_PIXEL, 1.96 * errors * 1e7 * HECTARES_A_PIXEL
+    assert hectares[0] == pytest.approx(21_158, abs=1)
+    assert intervals[0] == pytest.approx(6_158, abs=2)
+    assert hectares.sum() == pytest.approx(900_000)
+
+
+def test_a_mapped_class_with_one_reference_pixel_has_no_estimate() -> None:
+    """One pixel has no variance for an error estimate. A class that is not mapped needs none."""
+    counts = np.array([[8, 1], [2, 0]])
+    for estimate in stratified_fractions([0.9, 0.1], counts):
+        assert np.isnan(estimate).all()
+    fractions, errors = stratified_fractions([1.0, 0.0], counts)
+    np.testing.assert_allclose(fractions, [0.8, 0.2])
+    np.testing.assert_allclose(errors, np.sqrt(0.8 * 0.2 / 9))
