@@ -72,10 +72,9 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
 
 def _kind_of(panels: QuicklookData) -> object:
     """Return the properties that decide how a picture is drawn, without the values that it shows."""
-    there = panels.truth is None, panels.confidence is None, panels.class_colours is None
-    holes = tuple(bool(np.isnan(shown).any()) for shown in (panels.rectified, panels.score))
-    none = np.size(panels.patch_index) == 0
-    return "picture", panels.class_map.shape, panels.class_names, there, holes, none
+    there = panels.truth is None, panels.chosen is None, panels.class_colours is None
+    holes = bool(np.isnan(panels.rectified).any())
+    return "picture", panels.class_map.shape, panels.class_names, there, holes
 
 
 @contextmanager

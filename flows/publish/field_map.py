@@ -16,11 +16,8 @@ from flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
 from flows.publish.quicklook import QuicklookData
 from flows.publish.receipt_table import format_days
 from flows.tasks.prior_maps import Prior
-from flows.tasks.run import SurveyRun
-from flows.terminal.figures import format_percent
+from flows.terminal.figures import format_percent, spaced
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Sweep
-from pipeline.planning.fine_pass import FinePlan
 from storage.arrays.class_maps import class_counts
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.mosaics import develop
@@ -77,8 +74,8 @@ def prior_map(prior: Prior | None) -> PriorMapField | None:
     return PriorMapField(prior.days, names[before])
 
 
-def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
-    """Return the map of a run; ``shown`` are the data of its quicklook."""
+def field_map(shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
+    """Return the map of a run from the data of its quicklook and the prior map."""
     thin = thinned(shown.class_map)
     palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
     palette[: len(shown.class_colours)] = shown.class_colours
@@ -89,8 +86,7 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
     picture = Image.fromarray(np.rint(255 * develop(shown.rectified, shown.caption)).astype(np.uint8))
     layers = [MapLayer(shown.caption.capitalize(), data_address(webp(picture, quality=QUALITY)), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
-    if shown.confidence is not None:
-        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence)))
+    layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence)))
     errors = None
     if shown.truth is not None:
         layers.append(MapLayer("Truth", classes(shown.truth)))
@@ -102,21 +98,13 @@ def field_map(run: SurveyRun, plan: FinePlan, shown: QuicklookData, before: Prio
         differs = (shown.was[thin] != UNLABELLED).astype(np.uint8)
         table = np.array([(0, 0, 0, 0), (*DIFFERS_RGB, 255)], np.uint8)
         layers.append(MapLayer("Captured and differing", layer_address(differs, table), opacity=0.8))
-    if not run.plan.plain:
-        patch_index = np.zeros(run.grid.patch_shape, np.uint8)
-        patch_index.ravel()[plan.patch_index] = 1
-        p = run.grid.patch
-        pixels = patch_index.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
+    if shown.chosen is not None:
         table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
-        layers.append(MapLayer("Captured again", layer_address(pixels[thin], table), opacity=0.6))
+        layers.append(MapLayer(shown.choice, layer_address(shown.chosen.astype(np.uint8), table), opacity=0.6))
     counts = class_counts(shown.class_map, len(shown.class_names))
     covered = np.append(counts / max(counts.sum(), 1), 1 - counts.sum() / max(shown.class_map.size, 1))
     rows = [
-        {
-            "name": name.replace("_", " "),
-            "fraction": format_percent(fraction),
-            "colour": "#" + bytes(colour.tolist()).hex(),
-        }
+        {"name": spaced(name), "fraction": format_percent(fraction), "colour": "#" + bytes(colour.tolist()).hex()}
         for name, fraction, colour in zip((*shown.class_names, NO_CLASS), covered, palette, strict=False)
         if fraction
     ]
@@ -148,13 +136,3 @@ def _ramp_address(values: NDArray[np.floating]) -> str:
     known = np.isfinite(values)
     levels = np.rint(LEVELS * np.clip(np.where(known, values, 0), 0, 1))
     return layer_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)
-
-
-def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
-    """Return rows and columns (y0, y1, x0, x1) that a sweep's line centres and samples span, cut to the scene."""
-    size = (run.grid.width, run.grid.height) if sweep.along == "x" else (run.grid.height, run.grid.width)
-    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.swath_px + size[0] / 2
-    scan = np.array([0, sweep.lines * sweep.step]) + sweep.start_px + size[1] / 2 - 0.5
-    x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
-    y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
-    return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)

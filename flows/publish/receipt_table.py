@@ -42,7 +42,6 @@ LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those 
 LEAST_REFERENCE = 100_000  # bytes; with a smaller reference, rows are not in MB
 SMALL_RUN = 2_000_000  # bytes kept, most of which do not depend on the field
 MOST_NAMED = 4  # changes of class in a row
-LEADING_CLASSES = 3  # of a plot
 LEAST_LOSS = 0.0005  # of expected mIoU, below which it rounds to 0.0 points
 FOREIGN = 0.2  # fraction of patches unlike the training data above which the weights do not fit the field
 FOREIGN_WORDS = "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET)"
@@ -263,26 +262,6 @@ def format_days(days: float) -> str:
     if days < 1:
         return f"{24 * days:.1f} hours earlier"
     return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
-
-
-def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Return the table of plots: name, area, leading classes, confidence."""
-
-    def leading(fractions: Mapping[str, float | None]) -> str:
-        known = sorted(((fraction, name) for name, fraction in fractions.items() if fraction), key=lambda one: -one[0])
-        return ", ".join(f"{spaced(name)} {format_percent(fraction)}" for fraction, name in known[:LEADING_CLASSES])
-
-    return [
-        {
-            "plot": plot["plot"],
-            "area": f"{format_count(plot['pixels'])} px"
-            if plot["area_m2"] is None
-            else format_area(plot["area_m2"] / M2_PER_HECTARE),
-            "classes": leading(plot["fractions"]) if plot["mapped_pixels"] else "not mapped",
-            "confidence": format_percent(plot["confidence"]),
-        }
-        for plot in plots
-    ]
 
 
 def _scan(scan: Mapping[str, Any]) -> str:

@@ -9,8 +9,7 @@ import base64
 import hashlib
 import posixpath
 import shlex
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -23,7 +22,7 @@ from markupsafe import Markup
 from flows.publish.field_map import ERROR_COLOURS, FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import finding_rows, format_reference, headline, plot_rows, saving_rows, shown_accuracy
+from flows.publish.receipt_table import finding_rows, format_reference, headline, saving_rows, shown_accuracy
 from flows.tasks.scores import error_matrix, format_false_classes
 from flows.terminal.figures import format_percent, format_points
 from pipeline.errors import visible
@@ -94,28 +93,14 @@ def _plain(value: object) -> object:
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A PNG or WebP with its caption."""
-
-    content: bytes
-    caption: str
-
-
 def render_report(
-    receipt: Receipt,
-    quicklook: bytes,
-    pictures: Iterable[Picture] = (),
-    *,
-    captured_again: float | None = None,
-    field: FieldMap | None = None,
+    receipt: Receipt, quicklook: bytes, *, captured_again: float | None = None, field: FieldMap | None = None
 ) -> str:
-    """Return the report as HTML; the same receipt, pictures and map give the same bytes.
+    """Return the report as HTML; the same receipt, picture and map give the same bytes.
 
     ``captured_again`` is the fraction of the field captured at full resolution, 0..1, or None. ``field`` is the map
     with layers; without it the quicklook is shown first and the page has no script.
     """
-    shown = [Picture(quicklook, "The survey at a glance."), *pictures]
     scene = split_variable(receipt["settings"]["scene"])[0].name
     accuracy = shown_accuracy(receipt)
     scripts = () if field is None else MAP_SCRIPTS
@@ -136,10 +121,9 @@ def render_report(
         field=field,
         leaflet=LEAFLET,
         error_colours=ERROR_COLOURS,
-        pictures=[{"address": data_address(one.content), "caption": one.caption} for one in shown],
+        quicklook=data_address(quicklook),
         **_savings(receipt),
         findings=finding_rows(receipt),
-        plots=plot_rows(receipt.get("plots", [])),
         accuracy=accuracy,
         error_matrix=None if accuracy is None else error_matrix(accuracy),
         false_classes="" if accuracy is None else format_false_classes(accuracy),

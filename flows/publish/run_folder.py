@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.field_map import block_of, field_map, prior_map
+from flows.publish.field_map import field_map, prior_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import draw_ground, thinned
+from flows.publish.panels import thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
-from flows.publish.report import Picture, render_report
+from flows.publish.report import render_report
 from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
 from flows.tasks.capture_plan import as_figures
@@ -35,7 +35,7 @@ from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.maps import STORE
 from flows.tasks.stages.placement import SIGNAL_RECORD, load_registration
 from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.grid import patch_pixels
+from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.uniform_scans import format_scan
@@ -45,7 +45,7 @@ from storage.archive.records import RECEIPT, read_run
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ProbabilityStore, load_class_map
 from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.mosaics import choose_bands, load_attention, open_mosaic
+from storage.arrays.mosaics import choose_bands, open_mosaic
 
 REPORT = "report.html"
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
@@ -75,12 +75,10 @@ def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
     again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
     shown = quicklook_data(run, products, plan)
     quicklook = draw_quicklook(shown)
-    maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
-    pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}", count_bytes(survey, plan, rests_on))
-        field = field_map(run, plan, shown, prior_map(run.prior))
-        page = render_report(receipt, quicklook, pictures, captured_again=again, field=field)
+        field = field_map(shown, prior_map(run.prior))
+        page = render_report(receipt, quicklook, captured_again=again, field=field)
         draft.write_file("quicklook.png", quicklook)
         if "plots" in receipt:
             draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
@@ -158,35 +156,38 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     moment = run.settings.moment
     when = "" if moment is None else f"; day {moment[0]}, {moment[1]:g} h"
     bands, caption = choose_bands(run.scene.wavelength_nm)
-    decided = products["segment"].path / READING
-    attention = load_attention(decided if decided.exists() else products["score"].path / READING)
-    changed = attention.changed
-    order = np.argsort(attention.rank.ravel(), kind="stable")
     found = load_class_map(products["segment"].path / "class_map.zarr")
+    thin = thinned(found.classes)
+    chosen, choice = None, ""
+    if not run.plan.plain or run.chooses:
+        patches = plan.patch_index if not run.plan.plain else read_in_full(products["score"], products["segment"])
+        what = "Read by the full network" if run.plan.plain else "Captured again"
+        chosen = pixels_of_patches(run.grid, patches)[thin]
+        choice = f"{what}: {len(patches)} patches by {run.settings.policy}"
     prior = prior_map_figures(products["segment"].path)
     drawn = products["segment"].path / "class_probabilities.zarr"
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
         about=f"{_format_asked(run, plan)}{when}",
-        policy=run.settings.policy if run.chooses else None,
-        scan=run.plan.plain,
-        raster=run.raster is not None,
-        rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thinned(found.classes)[0].step, [*bands]),
+        rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
-        score=attention.score if changed is None else np.where(attention.rank >= 0, changed, np.nan),
-        changed=changed is not None,
-        patch_px=run.grid.patch,
-        patch_index=order[attention.rank.ravel()[order] >= 0],
-        blocks=tuple(block_of(sweep, run) for sweep in plan.sweeps),
         class_map=found.classes,
         class_names=found.names,
         class_colours=found.colours,
+        confidence=np.ascontiguousarray(found.confidence[thin]),
+        chosen=chosen,
+        choice=choice,
         truth=run.labels,
-        confidence=np.ascontiguousarray(found.confidence[thinned(found.classes)]),
         was=None if prior is None else ProbabilityStore(drawn).old_class(),
-        days=0.0 if prior is None else prior["days"],
     )
+
+
+def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which (y, x) pixels of the scene lie in these patches."""
+    patches = np.zeros(grid.patch_shape, bool)
+    patches.ravel()[patch_index] = True
+    return patches.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)[: grid.height, : grid.width]
 
 
 def _format_asked(run: SurveyRun, plan: FinePlan) -> str:

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from flows.publish.field_map import FieldMap, MapLayer, layer_address
-from flows.publish.report import LEAFLET, Picture, render_report
+from flows.publish.report import LEAFLET, render_report
 from tests.flows.publish.test_receipt import make_receipt
 from tests.users.browser import Tab, chromium, needs_browser
 
@@ -52,7 +52,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Image.new("L", (1800, 1400), 128).save(file, "PNG")
     picture = file.getvalue()
     path = tmp_path_factory.mktemp("report") / "report.html"
-    path.write_text(render_report(receipt, picture, [Picture(picture, "a picture")], field=field), "utf-8")
+    path.write_text(render_report(receipt, picture, field=field), "utf-8")
     return path
 
 
