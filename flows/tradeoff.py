@@ -6,28 +6,24 @@ Settings of a stage run in turn on one thread. A loaded machine then slows all o
 from __future__ import annotations
 
 import gc
-import math
 import os
 import platform
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import numpy as np
 from cyclopts import Parameter
 from cyclopts.validators import Number
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from scipy.ndimage import gaussian_filter
 
-from flows.publish.panels import GRID, INK, PAPER, png
 from flows.settings.flags import AsJson, OutFile
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import RASTER, Settings, SignalChoice
@@ -35,7 +31,7 @@ from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scene import check_labels
 from flows.terminal.figures import format_bytes
 from flows.terminal.processes import writing
-from flows.terminal.progress import on_stdout, print_json, stderr, table
+from flows.terminal.progress import on_stdout, print_json, show_text, stderr, table
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory, one_thread
 from models.network.sizes import TOKEN_PX
@@ -46,14 +42,13 @@ from models.weights.files import Weights
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, cheapest_full, frame_patches, raw_bytes, uniform_sweeps
 from pipeline.planning.uniform_scans import format_scan
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import mosaic_rows
 from pipeline.rectify.resample import resample
 from pipeline.signal.calibrate import calibrate
-from pipeline.signal.components import Components
 from pipeline.signal.condense import score_lines, whole_steps
 from pipeline.signal.lines import BLOCK_LINES
 from pipeline.signal.subspace import SignalStatistics, find_components
@@ -85,12 +80,16 @@ class Figures:
     camera_s: float | None = None
 
 
+Run = Callable[[Any], Any]
+Judge = Callable[[Any, Any], Figures]
+
+
 @dataclass(frozen=True)
 class Tradeoff:
-    """Define the measurement of one stage. Only ``run`` is timed.
+    """Define the measurement of one stage.
 
-    ``prepare`` takes a seed, a scene and weights; the last two are None without a scene of one's own. Its state is
-    passed to ``run`` with a setting, and to ``judge`` with a setting and the result of ``run``.
+    ``prepare`` takes a seed, a scene and weights; the last two are None without a scene of one's own. It returns a
+    function of a setting, which is timed, and another one that judges a setting by the result.
     """
 
     stage: str
@@ -98,9 +97,7 @@ class Tradeoff:
     error: str  # with its unit
     bytes: str  # whose they are
     settings: tuple[Setting, ...]
-    prepare: Callable[[int, str | None, Path | None], Any]
-    run: Callable[[Any, Setting], Any]
-    judge: Callable[[Any, Setting, Any], Figures]
+    prepare: Callable[[int, str | None, Path | None], tuple[Run, Judge]]
     default: Setting | None = None  # setting of a survey by its defaults
     takes_scene: bool = False
 
@@ -114,7 +111,6 @@ class Point:
     time_s: float  # of the camera where the setting scans, else by the wall clock
     processor_s: float
     bytes: int
-    pareto: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,7 +124,6 @@ class Result:
     default: Setting | None
     repeats: int
     seed: int
-    notes: tuple[str, ...]  # on labels
     machine: Mapping[str, object]
     points: tuple[Point, ...]
 
@@ -162,7 +157,7 @@ def measure_tradeoff(
 
     Every round begins with another setting.
     """
-    state = tradeoff.prepare(seed, scene, weights)
+    run, judge = tradeoff.prepare(seed, scene, weights)
     settings = list(tradeoff.settings)
     figures: dict[Setting, Figures] = {}
     clocks: dict[Setting, list[tuple[float, float]]] = {one: [] for one in settings}
@@ -173,27 +168,17 @@ def measure_tradeoff(
             for one in settings[first:] + settings[:first]:
                 gc.collect()
                 wall, processor = time.perf_counter(), time.process_time()
-                result = tradeoff.run(state, one)
+                result = run(one)
                 clocks[one].append((time.perf_counter() - wall, time.process_time() - processor))
                 if turn == 0:
-                    figures[one] = tradeoff.judge(state, one, result)
+                    figures[one] = judge(one, result)
         machine = describe_machine(threads=1) | {"load_before": load_before, "load_after": mean_load()}
     points = []
     for one, found in figures.items():
         wall, processor = (min(times) for times in zip(*clocks[one], strict=True))
         points.append(Point(one, found.error, found.camera_s or wall, processor, found.bytes))
     about = tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.bytes, tradeoff.default
-    return Result(*about, repeats, seed, getattr(state, "notes", ()), machine, mark_pareto(points))
-
-
-def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
-    """Mark the points that no other beats: as good in error, time and bytes, and better in one of them."""
-    rows = [(point.error, point.time_s, point.bytes) for point in points]
-    marked = []
-    for point, row in zip(points, rows, strict=True):
-        beaten = any(other != row and all(a <= b for a, b in zip(other, row, strict=True)) for other in rows)
-        marked.append(replace(point, pareto=math.isfinite(point.error) and not beaten))
-    return tuple(marked)
+    return Result(*about, repeats, seed, machine, tuple(points))
 
 
 # rectify: kernels, between the pixels of a blurred farm
@@ -204,26 +189,22 @@ RECTIFY_SHAPE = (1024, 1024)  # of the truth
 POINTS = 40_000
 
 
-@dataclass(frozen=True)
-class Scattered:
-    """Samples on a grid, points between them, and the truth there."""
+def scatter_points(seed: int, _scene: str | None = None, _weights: Path | None = None) -> tuple[Run, Judge]:
+    """Resample a blurred farm, sampled at every fourth pixel, at its other pixels in the order of a grid's rows.
 
-    samples: Values  # (line, sample, band)
-    coordinates: NDArray[np.float64]  # (n, 2)
-    truth: Values  # (n, band)
-
-    def judge(self, _kernel: Setting, found: Values) -> Figures:
-        """Return the root mean square error over the standard deviation of the scene."""
-        return Figures(float(np.sqrt(np.mean((found - self.truth) ** 2)) / np.std(self.truth)), found.nbytes)
-
-
-def scatter_points(seed: int, _scene: str | None = None, _weights: Path | None = None) -> Scattered:
-    """Sample a blurred farm at every fourth pixel; draw points of its other pixels in the order of a grid's rows."""
+    The error is the root mean square one over the standard deviation of the scene.
+    """
     values = farm_scene(seed, RECTIFY_SHAPE).values()[..., ::4]
     fine = gaussian_filter(values, (FINE * BLUR, FINE * BLUR, 0))
     pixels = np.random.default_rng(seed).integers(2 * FINE, np.array(fine.shape[:2]) - 3 * FINE, (POINTS, 2))
     pixels = pixels[np.lexsort((pixels[:, 1], pixels[:, 0] // FINE))]
-    return Scattered(fine[::FINE, ::FINE].copy(), pixels / FINE, fine[tuple(pixels.T)])
+    samples, truth = fine[::FINE, ::FINE].copy(), fine[tuple(pixels.T)]
+    valid = np.ones(samples.shape[:2], bool)
+
+    def judge(_kernel: Kernel, found: Values) -> Figures:
+        return Figures(float(np.sqrt(np.mean((found - truth) ** 2)) / np.std(truth)), found.nbytes)
+
+    return lambda kernel: resample(samples, valid, pixels / FINE, kernel)[0], judge
 
 
 RECTIFY = Tradeoff(
@@ -234,10 +215,6 @@ RECTIFY = Tradeoff(
     settings=("nearest", "bilinear", "catmull-rom"),
     default=Settings().resampling,
     prepare=scatter_points,
-    run=lambda state, kernel: resample(
-        state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
-    )[0],
-    judge=Scattered.judge,
 )
 
 
@@ -250,40 +227,8 @@ EXACT = "exact"
 TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma
 
 
-@dataclass(frozen=True)
-class FarmLines:
-    """Lines of an outer sweep over a farm, and the decision for every tolerance."""
-
-    scene: RasterScene
-    rig: Rig
-    blocks: tuple[SweepBlock, ...]
-    decisions: Mapping[Setting, Decision]
-
-    def simulate(self, setting: Setting) -> tuple[Values, NDArray[np.uint16]]:
-        """Return expected electrons before the readout, and raw numbers, (line, sample, band) each."""
-        chosen = self.decisions[setting].chosen
-        light = [expected_light(self.scene, block, chosen) for block in self.blocks]
-        raw = [read_out(one, block, chosen) for one, block in zip(light, self.blocks, strict=True)]
-        return np.concatenate(light), np.concatenate(raw)
-
-    def judge(self, setting: Setting, made: tuple[Values, NDArray[np.uint16]]) -> Figures:
-        """Return the greatest change against all exact effects, in deviations of the sample's noise."""
-        off = (self._electrons(setting, made[0]) - self.exact) / noise_electrons(self.exact, self.rig)
-        return Figures(float(np.abs(off).max()), packed_size(made[1]))
-
-    @cached_property
-    def exact(self) -> Values:
-        """Exact electrons of the samples, (line, sample, band)."""
-        return self._electrons(EXACT, self.simulate(EXACT)[0])
-
-    def _electrons(self, setting: Setting, light: Values) -> Values:
-        """Add the dark signal to light. [e-]"""
-        per_dn = np.float32(self.rig.camera.electrons_per_dn)
-        return light + dark_frame(self.blocks[0], self.decisions[setting].chosen) * per_dn
-
-
-def decide_for_lines(seed: int, _scene: str | None = None, _weights: Path | None = None) -> FarmLines:
-    """Plan the full scan of a farm, decide on effects for every tolerance, and take lines of the first sweep."""
+def decide_for_lines(seed: int) -> tuple[RasterScene, tuple[SweepBlock, ...], dict[Setting, Decision]]:
+    """Return a farm, lines of the first sweep of its full scan, and the decision on effects for every tolerance."""
     scene = farm_scene(seed, LAND_SHAPE)
     rig = Rig()
     _, sweeps, _ = cheapest_full(SceneGrid(*LAND_SHAPE, PATCH), rig.camera, CostModel())
@@ -291,7 +236,35 @@ def decide_for_lines(seed: int, _scene: str | None = None, _weights: Path | None
     starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
     blocks = tuple(sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts)
     limits: dict[Setting, float] = {EXACT: 0.0} | {one: one for one in TOLERANCES}
-    return FarmLines(scene, rig, blocks, {one: decide(probe, rig, EFFECTS, limit) for one, limit in limits.items()})
+    return scene, blocks, {one: decide(probe, rig, EFFECTS, limit) for one, limit in limits.items()}
+
+
+def simulate_lines(seed: int, _scene: str | None = None, _weights: Path | None = None) -> tuple[Run, Judge]:
+    """Simulate lines of a farm with the effects that a tolerance leaves.
+
+    The error is the greatest change against all exact effects, in deviations of the sample's noise.
+    """
+    scene, blocks, decisions = decide_for_lines(seed)
+    rig = blocks[0].rig
+
+    def simulate(setting: Setting) -> tuple[Values, NDArray[np.uint16]]:
+        """Return expected electrons before the readout, and raw numbers, (line, sample, band) each."""
+        chosen = decisions[setting].chosen
+        light = [expected_light(scene, block, chosen) for block in blocks]
+        raw = [read_out(one, block, chosen) for one, block in zip(light, blocks, strict=True)]
+        return np.concatenate(light), np.concatenate(raw)
+
+    def electrons(setting: Setting, light: Values) -> Values:
+        per_dn = np.float32(rig.camera.electrons_per_dn)
+        return light + dark_frame(blocks[0], decisions[setting].chosen) * per_dn
+
+    exact = electrons(EXACT, simulate(EXACT)[0])
+
+    def judge(setting: Setting, made: tuple[Values, NDArray[np.uint16]]) -> Figures:
+        off = (electrons(setting, made[0]) - exact) / noise_electrons(exact, rig)
+        return Figures(float(np.abs(off).max()), packed_size(made[1]))
+
+    return simulate, judge
 
 
 SIMULATE = Tradeoff(
@@ -301,9 +274,7 @@ SIMULATE = Tradeoff(
     bytes="raw numbers, packed",
     settings=(EXACT, *TOLERANCES),
     default=Settings().tol.value,
-    prepare=decide_for_lines,
-    run=FarmLines.simulate,
-    judge=FarmLines.judge,
+    prepare=simulate_lines,
 )
 
 
@@ -316,34 +287,12 @@ STEPS = (0.5, 1.0, 2.0, 3.0)  # deviations of the noise
 SIGNAL = SignalChoice()
 
 
-@dataclass(frozen=True)
-class CalibratedLines:
-    """Scene values of a sweep with and without noise, the noise's deviation, and the components of the field."""
+def condense_farm(seed: int, _scene: str | None = None, _weights: Path | None = None) -> tuple[Run, Judge]:
+    """Condense a scan of a farm of one swath by every line at 10 ms.
 
-    raw: NDArray[np.uint16]
-    values: Values  # (line, sample, band)
-    valid: NDArray[np.bool_]
-    truth: Values
-    sigma: Values
-    components: Components
-
-    def condense(self, step: Setting) -> NDArray[Any]:
-        """Return the raw numbers, or the scores in whole steps, (line, sample, component)."""
-        if step == RAW:
-            return self.raw
-        scores = score_lines(self.values, self.valid, self.components).scores
-        return whole_steps(scores, float(step)).astype(np.int16)
-
-    def judge(self, step: Setting, kept: NDArray[Any]) -> Figures:
-        """Return the root mean square error of restored spectra, and the bytes of the numbers as stores pack them."""
-        restored = self.values if step == RAW else self.components.restore(kept.astype(np.float32) * np.float32(step))
-        planes = kept if step == RAW else np.ascontiguousarray(kept.transpose(2, 0, 1))
-        off = (restored - self.truth) / self.sigma
-        return Figures(float(np.sqrt(np.mean(np.square(off), dtype=np.float64))), packed_size(planes))
-
-
-def scan_farm(seed: int, _scene: str | None = None, _weights: Path | None = None) -> CalibratedLines:
-    """Scan a farm of one swath by every line at 10 ms; the simulator also gives the values without noise."""
+    The error is the root mean square one of restored spectra, in deviations of the simulator's noise. The bytes are
+    those of the numbers as stores pack them.
+    """
     rig = Rig()
     scene = farm_scene(seed, FIELD_SHAPE)
     along, _, _ = cheapest_full(SceneGrid(*FIELD_SHAPE, PATCH), rig.camera, CostModel())
@@ -365,7 +314,20 @@ def scan_farm(seed: int, _scene: str | None = None, _weights: Path | None = None
     components = find_components(statistics, false_alarm=SIGNAL.false_alarm, least=SIGNAL.least)
     truth = calibrated(light / per_dn + dark)[0]
     sigma = calibrated(noise_electrons(light, block.rig) / per_dn + dark)[0]
-    return CalibratedLines(raw, values, valid, truth, sigma, components)
+
+    def condense(step: Setting) -> NDArray[Any]:
+        """Return the raw numbers, or the scores in whole steps, (line, sample, component)."""
+        if step == RAW:
+            return raw
+        return whole_steps(score_lines(values, valid, components).scores, float(step)).astype(np.int16)
+
+    def judge(step: Setting, kept: NDArray[Any]) -> Figures:
+        restored = values if step == RAW else components.restore(kept.astype(np.float32) * np.float32(step))
+        planes = kept if step == RAW else np.ascontiguousarray(kept.transpose(2, 0, 1))
+        off = (restored - truth) / sigma
+        return Figures(float(np.sqrt(np.mean(np.square(off), dtype=np.float64))), packed_size(planes))
+
+    return condense, judge
 
 
 CONDENSE = Tradeoff(
@@ -375,9 +337,7 @@ CONDENSE = Tradeoff(
     bytes="kept numbers, packed",
     settings=(RAW, *STEPS),
     default=SIGNAL.step,
-    prepare=scan_farm,
-    run=CalibratedLines.condense,
-    judge=CalibratedLines.judge,
+    prepare=condense_farm,
 )
 
 
@@ -396,30 +356,30 @@ class PlannedPass:
 
     coarse: CoarsePrediction
     patch_index: NDArray[np.intp]
-    weights: Weights
     bytes: int
     seconds: float | None = None  # of the camera
 
 
-@dataclass(frozen=True)
-class PlannedField:
-    """A field with labels, scanned or read by several plans."""
+def reading_of(run: SurveyRun, passes: Mapping[Setting, PlannedPass]) -> tuple[Run, Judge]:
+    """Segment a field with labels by several plans; the overview is read anew, whose time counts.
 
-    labels: NDArray[np.uint8]
-    passes: Mapping[Setting, PlannedPass]
-    notes: tuple[str, ...]  # on the labels
+    The error is 1 - mIoU of the map; bytes and seconds are those of the scan.
+    """
+    labels = run.labels
+    assert labels is not None
+    for note in check_labels(run.scene, run.described):
+        show_text(f"note: {note}")
 
-    def read(self, plan: Setting) -> DrawnMap:
-        """Return the class map of a plan; the overview is read anew, whose time counts."""
-        one = self.passes[plan]
+    def read(plan: Setting) -> DrawnMap:
+        one = passes[plan]
         coarse = replace(one.coarse, overview=None)
-        return segment(one.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
+        return segment(run.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
 
-    def judge(self, plan: Setting, drawn: DrawnMap) -> Figures:
-        """Return 1 - mIoU of a map, and the bytes and seconds of its scan."""
-        one = self.passes[plan]
-        miou = mean_iou(confusion(self.labels, drawn.classes, one.weights.config.classes))
-        return Figures(1 - miou, one.bytes, one.seconds)
+    def judge(plan: Setting, drawn: DrawnMap) -> Figures:
+        miou = mean_iou(confusion(labels, drawn.classes, run.weights.config.classes))
+        return Figures(1 - miou, passes[plan].bytes, passes[plan].seconds)
+
+    return read, judge
 
 
 def coarse_of_sweeps(
@@ -433,16 +393,6 @@ def coarse_of_sweeps(
     """Rectify sweeps over a scene to its pixels, and predict from them."""
     blocks = mosaic_rows(sweeps, camera, grid, rows=ROWS)
     return read_coarse_prediction(weights, read_coarse_pass(weights, blocks, wavelength_nm, grid, capture=capture))
-
-
-def uniform_pass(
-    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel, capture: LineSpec
-) -> PlannedPass:
-    """Plan to read all patches of a uniform scan."""
-    seen = [SimulatedSweep(source, sweep) for sweep in sweeps]
-    coarse = coarse_of_sweeps(seen, source.camera, source.wavelength_nm, grid, weights, capture)
-    size = raw_bytes(sweeps, source.camera, len(source.wavelength_nm))
-    return PlannedPass(coarse, grid.every_patch(), weights, size, cost.seconds(sweeps, source.camera))
 
 
 def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
@@ -460,20 +410,24 @@ def open_field(seed: int, scene: str | None, weights: Path | None, source: str) 
     return run
 
 
-def plan_scans(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
+def plan_scans(seed: int, scene: str | None = None, weights: Path | None = None) -> tuple[Run, Judge]:
     """Scan a farm or another scene by every uniform scan."""
     run = open_field(seed, scene, weights, "sim")
     grid = SceneGrid(*run.scene.shape, run.described.config.patch)
     along, _, _ = cheapest_full(grid, run.camera, run.settings.cost)
+    bands = run.scene.wavelength_nm
     passes: dict[Setting, PlannedPass] = {}
     for name, (step, exposure_ms) in SCANS.items():
         sweeps = uniform_sweeps(grid, run.camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        passes[name] = uniform_pass(run.weights, run.simulated, sweeps, grid, run.settings.cost, scan)
-    return _planned(run, passes)
+        seen = [SimulatedSweep(run.simulated, sweep) for sweep in sweeps]
+        coarse = coarse_of_sweeps(seen, run.camera, bands, grid, run.weights, scan)
+        size, seconds = raw_bytes(sweeps, run.camera, len(bands)), run.settings.cost.seconds(sweeps, run.camera)
+        passes[name] = PlannedPass(coarse, grid.every_patch(), size, seconds)
+    return reading_of(run, passes)
 
 
-def plan_fractions(seed: int, scene: str | None = None, weights: Path | None = None) -> PlannedField:
+def plan_fractions(seed: int, scene: str | None = None, weights: Path | None = None) -> tuple[Run, Judge]:
     """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
     run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
     grid, raster, wavelength_nm = run.grid, run.raster, run.scene.wavelength_nm
@@ -491,13 +445,8 @@ def plan_fractions(seed: int, scene: str | None = None, weights: Path | None = N
     for fraction in FRACTIONS:
         chosen = frame_patches(scores, fraction) if fraction < 1 else grid.every_patch()
         pixels = grid.height * grid.width // TOKEN_PX**2 + len(chosen) * grid.patch**2
-        passes[fraction] = PlannedPass(coarse, chosen, run.weights, pixels * len(wavelength_nm) * BYTES_PER_SAMPLE)
-    return _planned(run, passes)
-
-
-def _planned(run: SurveyRun, passes: Mapping[Setting, PlannedPass]) -> PlannedField:
-    assert run.labels is not None
-    return PlannedField(run.labels, passes, check_labels(run.scene, run.described))
+        passes[fraction] = PlannedPass(coarse, chosen, pixels * len(wavelength_nm) * BYTES_PER_SAMPLE)
+    return reading_of(run, passes)
 
 
 SURVEY = Tradeoff(
@@ -507,8 +456,6 @@ SURVEY = Tradeoff(
     bytes="raw numbers",
     settings=tuple(SCANS),
     prepare=plan_scans,
-    run=PlannedField.read,
-    judge=PlannedField.judge,
     takes_scene=True,
 )
 SEGMENT = replace(
@@ -546,7 +493,7 @@ def tradeoff(
     weights
         Weights for the classes of the scene.
     out
-        Folder of tradeoff.json and tradeoff.png.
+        Folder of tradeoff.json.
     repeats
         Rounds that time every setting once.
     seed
@@ -563,8 +510,7 @@ def tradeoff(
     content = {"tradeoffs": [asdict(result) for result in results]}
     with writing(out):
         (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
-        (out / "tradeoff.png").write_bytes(png(tradeoff_figure(results)))
-    stderr.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", markup=False, soft_wrap=True)
+    show_text(str(out / "tradeoff.json"))
     if as_json:
         print_json(content)
     return 0
@@ -587,41 +533,19 @@ def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None)
 
 
 def print_tradeoff(result: Result, console: Console) -> None:
-    """Print the four measures of all settings, from the least error up, with the Pareto front marked."""
+    """Print the four measures of all settings, from the least error up."""
     rows = []
     for point in sorted(result.points, key=lambda point: point.error):
         name = f"{point.setting} (default)" if point.setting == result.default else str(point.setting)
         times = [f"{seconds:.3g} s" for seconds in (point.time_s, point.processor_s)]
-        cells = ["●" if point.pareto else "○", name, f"{point.error:.3g}", *times, format_bytes(point.bytes)]
-        rows.append([f"{'' if point.pareto else '[dim]'}{escape(cell)}" for cell in cells])
+        rows.append([escape(name), f"{point.error:.3g}", *times, format_bytes(point.bytes)])
     headings = ("error", "time", "processor\ntime", "bytes")
     title = f"{result.stage}: what accuracy costs"
-    console.print(table(("", escape(result.knob), *headings), rows, left=2, title=title, whole=("", *headings)))
+    console.print(table((escape(result.knob), *headings), rows, title=title, whole=headings))
     machine = result.machine
     caption = (
-        f"error: {result.error}; bytes: {result.bytes}; ● Pareto front\n"
+        f"error: {result.error}; bytes: {result.bytes}\n"
         f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn, {machine['threads']} thread, "
         f"load {machine['load_before']} to {machine['load_after']}, {machine['processor']}"
     )
-    console.print(escape("\n".join((caption, *result.notes))))
-
-
-def tradeoff_figure(results: Sequence[Result]) -> Figure:
-    """Draw error against time and against bytes for each trade-off; points of the Pareto front are filled."""
-    figure = Figure(figsize=(10, 4 * len(results)), dpi=110, layout="constrained", facecolor=PAPER)
-    for row, result in zip(figure.subplots(len(results), 2, squeeze=False), results, strict=True):
-        points = [point for point in result.points if math.isfinite(point.error)]
-        errors = [point.error for point in points]
-        for axes, label, costs in (
-            (row[0], "time [s]", [point.time_s for point in points]),
-            (row[1], f"bytes of {result.bytes}", [point.bytes for point in points]),
-        ):
-            for point, cost in zip(points, costs, strict=True):
-                axes.plot(cost, point.error, "o", color=INK, fillstyle="full" if point.pareto else "none")
-                axes.annotate(str(point.setting), (cost, point.error), (5, 4), textcoords="offset points", size=7)
-            axes.set_xscale("log")
-            axes.set_yscale("symlog", linthresh=min((one for one in errors if one > 0), default=1.0))  # 0 is exact
-            axes.set_title(f"{result.stage}: {result.knob}", loc="left", color=INK)
-            axes.set(xlabel=label, ylabel=result.error, facecolor=PAPER, axisbelow=True)
-            axes.grid(visible=True, color=GRID, linewidth=0.8)
-    return figure
+    console.print(escape(caption))

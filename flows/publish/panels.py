@@ -18,7 +18,6 @@ from pipeline.geometry.grid import UNLABELLED
 COLOURS = 256  # of a PNG
 MOST_PX = 2048  # of a picture's longer side; larger fields are subsampled
 INK = "#22241f"
-PAPER, GRID = "#fbfaf7", "#e3e1d8"  # of plots
 STYLE: Any = {
     "font.size": 12,
     "text.parse_math": False,  # names of surveys and classes may hold dollar signs

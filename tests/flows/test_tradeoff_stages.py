@@ -18,9 +18,10 @@ from pipeline.errors import SceneError
 from tests.conftest import QUIET
 
 
-def errors(entry: Tradeoff, state: object) -> dict[object, float]:
+def errors(entry: Tradeoff) -> dict[object, float]:
     """Return the error of every setting."""
-    return {setting: entry.judge(state, setting, entry.run(state, setting)).error for setting in entry.settings}
+    run, judge = entry.prepare(0, None, None)
+    return {setting: judge(setting, run(setting)).error for setting in entry.settings}
 
 
 def test_kernels_differ_by_their_taps():
@@ -46,9 +47,8 @@ def test_chosen_effects_keep_bound_and_tolerance(monkeypatch):
     """The exact choice has no error; for others the error is within its bound and the bound within its tolerance."""
     monkeypatch.setattr(stages, "LAND_SHAPE", (96, 640))
     monkeypatch.setattr(stages, "LINES", 1)
-    state = stages.SIMULATE.prepare(0)
-    found = errors(stages.SIMULATE, state)
-    bounds = {one: state.decisions[one].error for one in stages.SIMULATE.settings}
+    found = errors(stages.SIMULATE)
+    bounds = {one: decision.error for one, decision in stages.decide_for_lines(0)[2].items()}
     assert found[stages.EXACT] == bounds[stages.EXACT] == 0
     assert all(found[one] <= bounds[one] <= one for one in stages.TOLERANCES)
     assert found[stages.TOLERANCES[-1]] > 0
@@ -57,7 +57,7 @@ def test_chosen_effects_keep_bound_and_tolerance(monkeypatch):
 def test_reading_all_patches_gives_a_better_map(monkeypatch):
     """Its error is below that of a map without patches."""
     monkeypatch.setattr(stages, "FARM_SHAPE", (96, 128))
-    found = errors(stages.SEGMENT, stages.SEGMENT.prepare(0))
+    found = errors(stages.SEGMENT)
     assert 0 < found[1.0] < found[0.0] < 1
 
 
