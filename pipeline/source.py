@@ -32,8 +32,8 @@ class Line:
 class References:
     """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value by band.
 
-    A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``, divided by ``flat`` if there is one.
-    With ``by_mirror`` it is also divided by the mirror's throughput, which falls off with its tilt. ``bad`` marks
+    A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``.
+    With ``by_mirror`` it is divided by the mirror's throughput, which falls off with its tilt. ``bad`` marks
     unreliable elements of the detector.
     """
 
@@ -41,12 +41,11 @@ class References:
     white: NDArray[np.float32]
     white_reference: NDArray[np.float32]
     bad: NDArray[np.bool_] | None = None  # (sample, band)
-    flat: NDArray[np.float32] | None = None  # (sample, band) relative response left over by the white frame
     by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another fraction of the light
 
     def same_as(self, other: References) -> bool:
         """Return whether all frames of two references are equal bit for bit."""
-        frames = ("dark", "white", "white_reference", "bad", "flat")
+        frames = ("dark", "white", "white_reference", "bad")
         pairs = [(getattr(self, name), getattr(other, name)) for name in frames]
         return self.by_mirror == other.by_mirror and all(
             (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs

@@ -40,13 +40,13 @@ def write_recorded_files(cube: RawCube, folder: Path) -> Path:
     known = cube.references
     white = {"white_reference": listed(known.white_reference)} | ({"mirror at rest": 1} if known.by_mirror else {})
     bad = np.zeros(known.dark.shape, np.bool_) if known.bad is None else known.bad
-    frames: dict[str, tuple[NDArray[Any] | None, str, dict[str, Any]]] = {
-        **{"dark": (known.dark, "f4", {}), "white": (known.white, "f4", white)},
-        **{"bad": (bad, "u1", {}), "flat": (known.flat, "f4", {})},
+    frames: dict[str, tuple[NDArray[Any], str, dict[str, Any]]] = {
+        "dark": (known.dark, "f4", {}),
+        "white": (known.white, "f4", white),
+        "bad": (bad, "u1", {}),
     }
     for kind, (frame, dtype, more) in frames.items():
-        if frame is not None:
-            write_cube(folder / f"{name}.{kind}.hdr", frame[None], dtype, **bands, **more)
+        write_cube(folder / f"{name}.{kind}.hdr", frame[None], dtype, **bands, **more)
     rows = ["line,time,mirror_x,mirror_y,exposure_ms,valid"]
     columns = (cube.time_s, *cube.position.T, cube.exposure_ms)
     for number, values in enumerate(zip(*(column.tolist() for column in columns), strict=True)):

@@ -510,9 +510,9 @@ def _scene_for(
         scene, notes = recorded.scene()
         scene = scene.in_light(settings.sky.fraction_of_clear)
     elif settings.is_map:
-        pixels, scene, notes = open_map(settings, model.described.class_names)
+        pixels, scene, notes = open_map(settings)
     else:
-        scene, notes = open_scene(settings, model.described.class_names)
+        scene, notes = open_scene(settings)
     if not planning:  # before the stages, whose time is measured
         scene.raster.drawn()
         scene.light()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -70,9 +70,9 @@ def check_scene_there(scene: str) -> None:
         raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()}){many}")
 
 
-def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
+def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene in the light of the settings' sky; arguments, notes and errors as in `_in_clear_light`."""
-    scene, notes = _in_clear_light(settings, known)
+    scene, notes = _in_clear_light(settings)
     if settings.source == SIM and settings.sky.started is not None:
         height = float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
         if height <= 0:
@@ -80,10 +80,10 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
     return scene.in_light(settings.sky.fraction_of_clear), notes
 
 
-def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[RasterScene, tuple[str, ...]]:
+def _in_clear_light(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene, and return it with notes on assumptions.
 
-    Labels that were found beside the scene are used if all of their classes are ``known``. Raises SceneError,
+    Raises SceneError,
     WavelengthError: the file is not valid; SettingsError: a setting is not for a built-in scene.
     """
     if settings.scene == RIG_FIELD:
@@ -98,13 +98,8 @@ def _in_clear_light(settings: Settings, known: Sequence[str] | None) -> tuple[Ra
         farm = built_in_scene(settings.scene, settings.seed, shape, camera=settings.camera, **moment, **more)
         return farm if settings.bands is None else _some_bands(farm, settings.bands), ()
     file = load_scene_file(
-        settings.scene,
-        labels=settings.labels,
-        bands=settings.bands,
-        wavelengths=settings.wavelengths,
-        labels_needed=False,
+        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
-    file = _judged_by_known(file, known)
     return _with_notes(scene_of_file(file, settings.camera), file, settings, "given their band's median")
 
 
@@ -125,7 +120,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
 
 
-def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
+def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
     """Open a raster: its file, a scene without light, and notes. Labels beside it are used as in `open_scene`.
 
     Raises SceneError, WavelengthError: a file is not valid.
@@ -133,7 +128,6 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
     file = open_scene_file(
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
-    file = _judged_by_known(file, known)
     missing = file.missing if file.missing.any() else None
     labels = file.labels
     bands = len(file.wavelength_nm)
@@ -156,19 +150,6 @@ def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[Sc
         content=file.content,
     )
     return file, *_with_notes(scene, file, settings, "whose other bands are used")
-
-
-def _judged_by_known(file: SceneFile, known: Sequence[str] | None) -> SceneFile:
-    """Return the file without labels that were found beside it and have a class that is not ``known``."""
-    out_of_range = [name for name in file.class_names if known is not None and name not in known]
-    if not (file.labels_found and out_of_range):
-        return file
-    note = (
-        f"the labels beside the scene are left out: the weights know {', '.join(known or ())}, not {out_of_range[0]!r};"
-        " give the classes these names in a scene.toml to use them"
-    )
-    nothing: dict[str, Any] = {"labels": None, "class_names": (), "class_values": ()}
-    return replace(file, **nothing, class_colours=file.class_colours[:0], provenance=(*file.provenance, note))
 
 
 def _with_notes(
@@ -245,7 +226,7 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
         known = ", ".join(weights.class_names)
-        hint = "use weights for these"
+        hint = 'use weights for these, leave the labels out (labels = "" in a scene.toml beside the scene)'
         if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # it has no name
             value = found[1] or list(bytes.fromhex(found[2]))
             hint += (

@@ -64,7 +64,6 @@ class Elements:
             dark=whole.dark[samples],
             white=whole.white[samples],
             bad=None if whole.bad is None else whole.bad[samples],
-            flat=None if whole.flat is None else whole.flat[samples],
         )
         return replace(self, references=references, gain=self.gain[samples], out=self.out[samples])
 
@@ -77,8 +76,6 @@ def judge_elements(references: References) -> Elements:
     calibrated in does not count, and nothing in it is out.
     """
     span = references.white - references.dark
-    if references.flat is not None:
-        span = np.where(references.flat > 0, span * references.flat, np.nan)
     gain = np.full(span.shape, np.nan, np.float32)
     known = np.isfinite(span) & (span > 0)
     with np.errstate(over="ignore"):
@@ -127,7 +124,7 @@ def calibrate(
     saturated_dn: float,
     position: ArrayLike | None = None,
 ) -> tuple[Floats32, Bools]:
-    """Return scene values ``(raw - dark) / (white - dark) * white_reference / flat / throughput``, and their validity.
+    """Return scene values ``(raw - dark) / (white - dark) * white_reference / throughput``, and their validity.
 
     ``raw`` is (line, sample, band) uint16 DN. ``position`` (line, 2) mirror X and Y is needed for references with
     ``by_mirror``; a line without a finite position is then NaN. A bad element takes the value between the nearest good
@@ -166,7 +163,6 @@ def of_bands(references: References, bands: Sequence[int]) -> References:
         white=references.white[:, chosen],
         white_reference=references.white_reference[chosen],
         bad=None if references.bad is None else references.bad[:, chosen],
-        flat=None if references.flat is None else references.flat[:, chosen],
     )
 
 
@@ -221,7 +217,7 @@ def _judged(raw: NDArray[np.integer[Any]], references: References | Elements) ->
     plain = references.references if isinstance(references, Elements) else references
     if raw.ndim != 3:
         raise ShapeError(f"expected raw lines (line, sample, band), got {raw.shape}")
-    for name in ("dark", "white", "bad", "flat"):
+    for name in ("dark", "white", "bad"):
         frame = getattr(plain, name)
         if frame is not None and frame.shape != raw.shape[1:]:
             raise ShapeError(

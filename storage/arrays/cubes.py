@@ -129,7 +129,6 @@ def write_references(group: zarr.Group, references: References) -> None:
         "white": (("sample", "band"), references.white, np.float32, "white reference frame"),
         "white_reference": (("band",), references.white_reference, np.float32, "scene value of the white reference"),
         "bad": (("sample", "band"), references.bad, np.bool_, "bad elements of the detector"),
-        "flat": (("sample", "band"), references.flat, np.float32, "relative response left over by the white frame"),
     }
     for name, (dims, values, kind, title) in frames.items():
         if values is not None:
@@ -230,8 +229,8 @@ def read_line_facts(group: zarr.Group, path: object) -> dict[str, Any]:
 def read_references(group: zarr.Group) -> References:
     """Read the frames that `write_references` stored."""
     dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
-    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
-    return References(dark, white, white_reference, bad, flat, bool(group.attrs.get("by_mirror", False)))
+    bad = read_array(group, "bad") if "bad" in group else None
+    return References(dark, white, white_reference, bad, bool(group.attrs.get("by_mirror", False)))
 
 
 def open_raw_cube(path: Path) -> RawCube:

@@ -46,8 +46,10 @@ _DRIVERS = dict.fromkeys(JPEG2000_ENDINGS, "JP2OpenJPEG") | {".png": "PNG", ".bm
 _DRIVERS |= dict.fromkeys((".jpg", ".jpeg"), "JPEG") | dict.fromkeys((".tif", ".tiff"), "GTiff")
 _STRICT = {"GDAL_ERROR_ON_LIBJPEG_WARNING": True, "GDAL_PNG_WHOLE_IMAGE_OPTIM": False}  # cut off files are refused
 _CALLED = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}  # in messages
-ALPHA_NOTE = "its alpha channel says where there are pixels, and is no band"
-NO_MASK_NOTE = "its channel called alpha has the values of a band, not of a mask, and is taken as a band"
+ALPHA_NOTE = (
+    "its alpha channel says where there are pixels, and is no band; if it is one, write so into the file"
+    " (gdal_edit.py -colorinterp_4 undefined)"
+)
 RGB_NM = (640.0, 550.0, 460.0)
 NEAR_INFRARED_NM = 800.0
 GREY_NM = 550.0
@@ -58,8 +60,6 @@ _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
     ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
     ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
 }
-SAMPLED_PX = 256  # side of the part that is read of a mask
-MOST_BETWEEN = 0.1  # partly transparent fraction of a mask
 
 
 def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> CubeSource:
@@ -77,22 +77,18 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
                 f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
                 " one (rio stack), or give the image alone in a file"
             )
-        notes: list[str] = []
         block = max(file.block_shapes)
         item = max(np.dtype(one).itemsize for one in file.dtypes)
         claimed = (file.height, file.width, file.count)
         _check_size(path, driver, claimed, item, math.prod(block) * file.count)
         kinds = [kind.name for kind in file.colorinterp]
-        if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
-            kinds = ["undefined" if kind == "alpha" else kind for kind in kinds]
-            notes = [*notes, NO_MASK_NOTE]
         alpha = kinds.index("alpha") if "alpha" in kinds else None
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
         known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path)
-        notes = [*notes, *([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
+        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
@@ -185,17 +181,6 @@ def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int,
     if driver != "JPEG":  # its blocks may have no byte each
         check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
     check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
-
-
-def _is_mask(file: Any, channel: int) -> bool:
-    """Return whether nearly all values of a channel are 0 or its maximum, in the middle of the image.
-
-    Programs call the fourth band of a file alpha if nothing else is stated.
-    """
-    high, wide = min(file.height, SAMPLED_PX), min(file.width, SAMPLED_PX)
-    top, left = (file.height - high) // 2, (file.width - wide) // 2
-    values = file.read(channel + 1, window=((top, top + high), (left, left + wide)))
-    return bool(np.mean((values > 0) & (values < values.max())) <= MOST_BETWEEN)
 
 
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:

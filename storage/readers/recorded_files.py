@@ -38,7 +38,7 @@ from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wa
 from storage.readers.scene_files import bands_text
 from storage.readers.zarr_files import find_zarr_store
 
-FRAMES = ("dark", "white", "bad", "flat")  # behind the name of a cube in those of its frames
+FRAMES = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
 SAMPLED_LINES = 64  # for bits
 
 
@@ -221,7 +221,7 @@ def find_references(
     notes += [] if source.nodata is None else [f"{name}: the number {source.nodata:g} is no data, as the file says"]
     bad = np.broadcast_to(marked | np.asarray(bad if bad is not None else False, np.bool_), frame).copy()
     white_reference = np.broadcast_to(white_reference, bands).copy()
-    return References(dark, white, white_reference, bad if bad.any() else None, found.get("flat"), by_mirror)
+    return References(dark, white, white_reference, bad if bad.any() else None, by_mirror)
 
 
 Kind = Literal["mirror", "angles", "angle", "px", "m"]

@@ -9,7 +9,7 @@
     NAME.zarr                             any Zarr cube
 
 Files beside a cube ``NAME`` are used if no flag names others: ``NAME.pointing.csv``,
-``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr`` and ``NAME.flat.hdr``. Frames for all cubes of the folder are
+``NAME.dark.hdr``, ``NAME.white.hdr`` and ``NAME.bad.hdr``. Frames for all cubes of the folder are
 ``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may have ``line axis = y``: lines lie along y of the field,
 and the scan goes along x. The header of a white frame may have ``white_reference = {...}``, the value of the white
 reference per band, and ``mirror at rest = 1``, if it was taken so.
@@ -92,7 +92,7 @@ class Recording:
         arrays: list[NDArray[Any]] = []
         for one in self.sweeps:
             known = one.references
-            frames = (known.dark, known.white, known.white_reference, known.bad, known.flat)
+            frames = (known.dark, known.white, known.white_reference, known.bad)
             arrays += [one.position, one.time_s, one.exposure_ms, one.valid_line]
             arrays += [np.zeros(0) if frame is None else frame for frame in frames]
         return {

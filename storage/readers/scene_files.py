@@ -27,6 +27,7 @@ from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings,
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed
+FOUND = f'; they were found by their name: labels = "" in a {SETTINGS_NAME} beside the scene leaves them out'
 FRACTION = 4  # of the free memory for a block: larger ones are no faster
 
 
@@ -51,7 +52,6 @@ class SceneFile:
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     pixel_m: float | None = None  # side of a pixel on the ground, by scene.toml, if there is no geobox
-    labels_found: bool = False  # by the file's name
     regridded: bool = False  # labels were resampled from another grid
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, if they were kept in memory
 
@@ -68,7 +68,6 @@ def open_scene_file(
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
     classes: Mapping[str, ClassValue] | None = None,
-    labels_needed: bool = False,
     keep: bool = False,
 ) -> SceneFile:
     """Open a scene from an image, .npy, .mat, ENVI, Zarr, NetCDF, HDF5 or a Headwall folder.
@@ -77,10 +76,9 @@ def open_scene_file(
     values are read once for gaps; only with ``keep``, and of images and .mat, they stay in memory. Arguments take
     precedence over the ``scene.toml`` beside the file, and that over the file. ``labels`` are class numbers or colours
     on the same pixels, or polygons; others are found by their names. ``bands`` count from 0; ``wavelengths`` [nm] are
-    one for each band used or for each of the file. ``classes`` replace those of a scene.toml that has none. Labels
-    found by their names that cannot be used are left out with a note unless ``labels_needed``. Raises SceneError: a
-    file is missing, damaged, or of a kind or shape that cannot be used, or the labels do not fit; WavelengthError:
-    wavelengths are missing, or their number, unit or range is wrong.
+    one for each band used or for each of the file. ``classes`` replace those of a scene.toml that has none. Raises
+    SceneError: a file is missing, damaged, or of a kind or shape that cannot be used, or the labels do not fit;
+    WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(address)
     source = open_cube(address)
@@ -94,9 +92,7 @@ def open_scene_file(
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
     missing, filled_px, void, gaps = _find_gaps(file, values, kept)
-    found, label_note, by_name = _labels_of(
-        file, source.shape[:2], source.geobox, labels, settings, classes or {}, labels_needed
-    )
+    found, label_note = _labels_of(file, source.shape[:2], source.geobox, labels, settings, classes or {})
     content = _content_hash(file, source.files)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     how, of_mask = values.notes(settings.path)
@@ -124,13 +120,12 @@ def open_scene_file(
         class_names=found.names,
         class_values=found.values,
         class_colours=found.colours,
-        labels_found=by_name,
         regridded=found.regridded,
     )
 
 
 # As `open_scene_file`, with all values in memory.
-load_scene_file = partial(open_scene_file, labels_needed=True, keep=True)
+load_scene_file = partial(open_scene_file, keep=True)
 
 
 def _light_hash(
@@ -188,28 +183,25 @@ def _labels_of(
     stated: str | Path | None,
     settings: SceneSettings,
     classes: Mapping[str, ClassValue],
-    needed: bool,
-) -> tuple[Labels | None, tuple[str, ...], bool]:
-    """Return labels, notes on them, and whether their file was found by its name."""
+) -> tuple[Labels | None, tuple[str, ...]]:
+    """Return labels and notes on them (SceneError: they do not fit)."""
     by_name = stated is None and settings.labels is None
+    address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
+    if address is None:
+        return None, (why_none,) if why_none else ()
     known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
     try:
-        address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
-        if address is None:
-            return None, (why_none,) if why_none else (), by_name
         found = read_labels(address, shape, geobox, known)
     except SceneError as error:
-        if needed or not by_name:
-            raise
-        return None, (f"the labels beside the scene are left out: {error}",), by_name
+        raise SceneError(f"{error}{FOUND}" if by_name else str(error)) from error
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    return found, (f"labels from {address}{', found by its name' if by_name else ''}, {how}", *found.notes), by_name
+    return found, (f"labels from {address}{', found by its name' if by_name else ''}, {how}", *found.notes)
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
     """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
     file, _ = split_variable(address)
-    found, notes, _ = _labels_of(file, shape, None, address, find_scene_settings(file), {}, True)
+    found, notes = _labels_of(file, shape, None, address, find_scene_settings(file), {})
     assert found is not None
     return found, notes
 

@@ -18,7 +18,6 @@ from flows.tasks.scene import open_scene
 from flows.training.data import load_data_set, open_training_data
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
-from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
 from tests.storage.readers.test_label_grids import write
@@ -124,28 +123,19 @@ def test_training_and_evaluation_note_shifted_labels(tmp_path: Path, command_lin
     assert re.findall(r"note: labels of (.*) have another place", judged.err) == ["003"]
 
 
-def test_a_survey_leaves_out_found_labels_of_other_classes(made: Path) -> None:
-    """Labels found by name with other classes than the weights' are left out with a note; equal ones are used."""
-    scene = str(made / "apart" / "images" / "001.png")
-    settings = load_settings(None, {"scene": scene, "weights": "mine.safetensors"})
-    (made / "apart" / "scene.toml").unlink(missing_ok=True)
-    found, notes = open_scene(settings, ("soil", "crop"))
-    assert found.labels is None
-    assert any("left out: the weights know soil, crop, not 'class_0'; give" in note for note in notes)
-    assert open_scene(settings, ("class_0", "class_1"))[0].labels is not None
-
-
 @pytest.mark.parametrize("folder", ["sizes", "soft", "several"])
-def test_unusable_found_labels_do_not_refuse_a_survey(folder: str, made: Path) -> None:
-    """Labels of another size, of mixed colours or in several files are left out of the survey with a note."""
-    (made / folder / "scene.toml").unlink(missing_ok=True)
+def test_unusable_found_labels_are_refused(folder: str, made: Path) -> None:
+    """Labels of another size, of mixed colours or in several files are refused, until scene.toml leaves them out."""
+    settings = made / folder / "scene.toml"
+    settings.unlink(missing_ok=True)
     scene = next(path for path in sorted((made / folder).rglob("00*.png")) if "002" in path.name or folder != "sizes")
     scene = scene.parent.parent / "images" / scene.name if scene.parent.name == "labels" else scene
-    found, notes = open_scene(load_settings(None, {"scene": str(scene), "weights": "w"}), ("class_0", "class_1"))
-    assert found.labels is None
-    assert any("the labels beside the scene are left out" in note for note in notes)
-    with pytest.raises(SceneError):
-        load_scene_file(scene)
+    survey = load_settings(None, {"scene": str(scene), "weights": "w"})
+    with pytest.raises(SceneError, match="labels"):
+        open_scene(survey)
+    settings.write_text('labels = ""\n')
+    assert open_scene(survey)[0].labels is None
+    settings.unlink()
 
 
 def test_an_evaluation_notes_frames_of_a_single_class(made: Path, weights: Path) -> None:

@@ -83,10 +83,9 @@ def test_raw_cube_refuses_to_end_early(tmp_path: Path) -> None:
 def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
     """Return a stored sweep of 130 lines whose references have all optional parts."""
     header = _header(130, 9, 4)
-    flat = np.random.default_rng(4).uniform(0.9, 1.1, (9, 4)).astype(np.float32)
     bad = np.zeros((9, 4), np.bool_)
     bad[3, 1] = True
-    header = replace(header, references=replace(header.references, bad=bad, flat=flat, by_mirror=True))
+    header = replace(header, references=replace(header.references, bad=bad, by_mirror=True))
     lines = _lines(header)
     with RawCubeWriter(tmp_path / "raw.zarr", header) as cube:
         cube.write(lines)
@@ -94,18 +93,17 @@ def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
 
 
 def test_optional_references_are_read_as_written(tmp_path: Path) -> None:
-    """Dead pixels, flat field and mirror flag are stored where there are any; other cubes have no such arrays."""
+    """Dead pixels and mirror flag are stored where there are any; other cubes have no such arrays."""
     path, header, _ = _calibrated(tmp_path)
     found = open_raw_cube(path).references
     np.testing.assert_array_equal(found.bad, header.references.bad)
-    np.testing.assert_array_equal(found.flat, header.references.flat)
     assert found.by_mirror
     plain = _header(2, 9, 4)
     with RawCubeWriter(tmp_path / "plain.zarr", plain) as cube:
         cube.write(_lines(plain))
-    assert not {"bad", "flat"} & {path.name for path in (tmp_path / "plain.zarr").iterdir()}
+    assert not (tmp_path / "plain.zarr" / "bad").exists()
     found = open_raw_cube(tmp_path / "plain.zarr").references
-    assert (found.bad, found.flat, found.by_mirror) == (None, None, False)
+    assert (found.bad, found.by_mirror) == (None, False)
 
 
 def test_a_damaged_block_fails_only_when_it_is_read(tmp_path: Path) -> None:

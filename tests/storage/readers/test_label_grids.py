@@ -99,14 +99,15 @@ def test_labels_on_the_same_grid_are_unchanged(tmp_path: Path) -> None:
 
 
 def test_labels_outside_of_the_image_are_refused(tmp_path: Path) -> None:
-    """The position is an error if labels are needed, and a note if they are not."""
+    """The refusal says how to leave labels out that were found by their name."""
     path = image(tmp_path)
     write(tmp_path / "field_labels.tif", CLASSES, NORTH_UP * Affine.translation(500, 0))
     with pytest.raises(SceneError, match=r"do not lie on the scene: x 600500 to 600560, y .* the scene x 600000"):
         load_scene_file(path)
-    scene = open_scene_file(path)
-    assert scene.labels is None
-    assert any("left out" in note and "do not lie on the scene" in note for note in scene.provenance)
+    with pytest.raises(SceneError, match=r'found by their name: labels = "" in a scene.toml beside the scene leaves'):
+        open_scene_file(path)
+    (tmp_path / "scene.toml").write_text('labels = ""\n')
+    assert open_scene_file(path, wavelengths=[800]).labels is None
 
 
 def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:

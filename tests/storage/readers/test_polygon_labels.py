@@ -111,7 +111,6 @@ def test_labels_are_found_by_their_names(name: str, tmp_path: Path) -> None:
     image = scene(tmp_path)
     written(tmp_path / name)
     found = load_scene_file(image)
-    assert found.labels_found
     np.testing.assert_array_equal(found.labels, TRUTH)
     write(tmp_path / "field_mask.tif", np.ones((1, *SHAPE), np.uint8)).close()
     assert load_scene_file(image).class_names == ("class_1",)
