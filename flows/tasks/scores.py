@@ -31,18 +31,13 @@ def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
     return {str(name): known_number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
 
 
-def format_worst_class(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
-    """Return the class with the lowest IoU in a sentence, ``alone`` without other maps; empty without labels."""
-    this, none, every = (_by_class(one or {}) for one in (accuracy, accuracy.get("none"), accuracy.get("all")))
-    known = {name: iou for name, iou in this.items() if iou is not None}
+def format_worst_class(accuracy: Mapping[str, Any]) -> str:
+    """Return the class with the lowest IoU in a sentence; empty without labels."""
+    known = {name: iou for name, iou in _by_class(accuracy).items() if iou is not None}
     if not known:
         return ""
     worst = min(known, key=lambda name: known[name])
-    words = f"The map's worst class is {spaced(worst)} with {format_points(known[worst])}"
-    if alone:
-        return f"{words}."
-    full = "" if every.get(worst) is None else f", the full network on every patch {format_points(every[worst])}"
-    return f"{words}: the small network alone gives {format_points(none.get(worst))}{full}."
+    return f"The map's worst class is {spaced(worst)} with {format_points(known[worst])}."
 
 
 def format_false_classes(accuracy: Mapping[str, Any]) -> str:

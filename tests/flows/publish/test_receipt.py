@@ -118,7 +118,7 @@ def test_invalid_fields_are_named(path, wrong):
 
 
 def test_maps_without_the_prior_map_are_not_compared() -> None:
-    """A visit with a prior map has no comparison in sentence and page."""
+    """A visit with a prior map has no comparison on the page."""
     receipt = make_receipt()
     for revisit in (False, True):
         if revisit:
@@ -126,7 +126,6 @@ def test_maps_without_the_prior_map_are_not_compared() -> None:
         text = render_report(receipt, b"")
         told = [words in text for words in (">small network", ">full network on every")]
         assert told == 2 * [not revisit]
-        assert ("the small network alone gives" in format_score(receipt)) == (not revisit)
 
 
 def printed(receipt: Receipt, width: int = 100, *, verbose: bool = False) -> str:
@@ -153,7 +152,7 @@ def test_the_details_have_stages_effects_and_lost_lines():
     receipt = {**make_receipt(), "lines": {"scan-0": {"invalid": 41}}}
     assert "sweep scan-0: lines left out: 41 invalid" in printed(receipt)
     text = printed(receipt, verbose=True)
-    for words in ("samples on the field", "capture", "rectify", "asked for", "Effects computed: 1 of 1"):
+    for words in ("samples on the field", "capture", "rectify", "Effects computed: 1 of 1"):
         assert words in text, words
 
 
@@ -177,9 +176,8 @@ def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):
 def test_headline_is_one_paragraph_with_the_figures():
     """It has score, worst class, capture time and fraction captured again; without labels it has no score."""
     assert headline(make_receipt(), 0.23) == (
-        "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct); the full network on every patch gives 87.5."
-        " The map's worst class is bare weed with 60.0: the small network alone gives 20.0, the full network on every"
-        " patch 80.0. Capture time: 104 s (50 % of the reference, 209 s). Captured again: 23 % of the field."
+        "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct). The map's worst class is bare weed with 60.0."
+        " Capture time: 104 s (50 % of the reference, 209 s). Captured again: 23 % of the field."
     )
     assert "labels (" not in headline(make_receipt(labels=False))
 
@@ -292,13 +290,3 @@ def test_an_error_map_stands_beside_the_scores() -> None:
     page = render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], [], address))
     assert address in page.partition("<h3>Errors</h3>")[2]
     assert "<h3>Errors" not in render_report(make_receipt(), PNG, field=FieldMap((2, 2), [], []))
-
-
-@pytest.mark.parametrize(("scored_s", "words"), [(0.7, "between the passes took 1.2 s, beside"), (None, "")])
-def test_the_time_between_passes_is_reported(scored_s: float | None, words: str) -> None:
-    """It is the sum of the stages between them, and left out if one of them was cached."""
-    times = {"capture_coarse": 9.0, "rectify": 0.5, "score": scored_s, "capture_fine": 9.0}
-    stages = [{"name": name, "wall_s": seconds} for name, seconds in times.items()]
-    receipt = {**make_receipt(), "stages": stages}
-    assert words in format_reference(receipt)
-    assert ("The decision" in format_reference(receipt)) == bool(words)

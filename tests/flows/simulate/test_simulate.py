@@ -187,5 +187,5 @@ def test_the_table_fits_the_terminal(width: int) -> None:
     lines = said.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     (row,) = [line for line in lines if line.split()[:2] == ["smile", "cubic"]]
-    assert row.split()[2:] == ["0.3", "nm", "0"]
+    assert row.split()[2:] == ["needed", "0.3", "nm", "0"]
     assert "wind" not in said.getvalue()

@@ -141,7 +141,7 @@ def test_the_best_patches_are_read_within_the_budget(survey_png: Survey, tmp_pat
     assert accuracy["none"]["miou"] != accuracy["all"]["miou"]
     page = (published.folder / "report.html").read_text(encoding="utf-8")
     assert "the full network on the chosen patches" in page
-    assert f"{len(patch_index)} patches read in full; multiply-adds" in page
+    assert "patches read in full" in page
     assert "captured again" not in page
 
 
