@@ -15,6 +15,12 @@ from flows.archive.reprocess_command import reprocess_fields
 from flows.terminal.progress import on_stderr
 from pipeline.errors import ArchiveError
 
+ONE_AT_A_TIME: dict[str, Any] = {  # options of each deployment that is served
+    "concurrency_limit": ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),
+    "version": "1",
+    "entrypoint_type": EntrypointType.MODULE_PATH,
+}
+
 
 @flow(name="reprocess", flow_run_name="reprocess-{archive}", persist_result=False)
 def reprocess(archive: str, field: str | None = None, weights: str | None = None, dry_run: bool = False) -> str:
@@ -31,17 +37,12 @@ def reprocess(archive: str, field: str | None = None, weights: str | None = None
     return f"some fields failed: {'; '.join(refused)}" if refused else "done"
 
 
-def deployment(archive: str, number: int = 1, *, shared: bool = False) -> Any:
-    """Return a deployment of the flow for one archive, run on request, one at a time.
-
-    It is named ``archive``, or by the archive's address on a ``shared`` server.
-    """
-    address = re.sub(r"[^A-Za-z0-9_.-]+", "-", archive).strip("-.")
+def reprocess_deployment(archive: str) -> Any:
+    """Return a deployment of the flow for one archive, named by the archive's address and run on request."""
     return reprocess.to_deployment(
-        address if shared else "archive" if number == 1 else f"archive-{number}",
+        re.sub(r"[^A-Za-z0-9_.-]+", "-", archive).strip("-."),
+        paused=False,
         parameters={"archive": archive},
-        concurrency_limit=ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),
         description=f"Surveys of {archive} again, with newer weights or stages; on request.",
-        version="1",
-        entrypoint_type=EntrypointType.MODULE_PATH,
+        **ONE_AT_A_TIME,
     )

@@ -5,14 +5,10 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-import signal
 import tempfile
-import threading
-import time
-import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,17 +16,16 @@ from typing import Annotated, Any
 import tzlocal
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from httpx import HTTPError
 from prefect.client.orchestration import get_client
 from prefect.client.schemas import filters
-from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy, StateType
+from prefect.client.schemas.objects import StateType
 from prefect.client.schemas.schedules import CronSchedule, IntervalSchedule
-from prefect.exceptions import ObjectNotFound
 from prefect.runner import Runner
 from prefect.states import Cancelled, Crashed
-from prefect.types.entrypoint import EntrypointType
 from pydantic import ValidationError
 
-from flows.archive.reprocess_flow import deployment, reprocess
+from flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess, reprocess_deployment
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey import survey
@@ -46,8 +41,7 @@ from storage.archive.archive import Archive
 from storage.archive.staging import read_toml, take_lock
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-STOPPED_AGAIN_S = 15.0  # interval of requests to a runner to stop
-AGAIN_S = 2.0  # between two tries to reach a server
+UNENDED = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.CANCELLING]
 
 
 def serve(
@@ -80,68 +74,37 @@ def serve(
     """
     schedule = schedule_of(cron, every, timezone)
     served = load_fields(fields, out)
-    archives = {one.settings.out: Archive.open(one.settings.out).root for one in served}
-    try:
-        with terminable(), ExitStack() as held:
-            for name, root in archives.items():
-                release = take_lock(root / ".locks" / "serve.lock", wait=False)
-                if release is None:
-                    raise ArchiveError(
-                        f"another serve uses the archive {name}; give all its fields to that one, or stop it"
-                    )
-                held.callback(release)
-            shared = "PREFECT_API_URL" in os.environ
-            pages = _start_server(next(iter(archives.values())) / ".prefect", port, held)
-            # Prefect's runner keeps the code that it starts in /tmp/runner_storage, which its first user could replace
-            tempfile.tempdir = held.enter_context(
-                tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True)
-            )
-            held.callback(setattr, tempfile, "tempdir", None)
-            when = cron or f"every {every}".removesuffix(", 0:00:00")
-            show_text(f"serving {', '.join(one.name for one in served)}, {when}; Ctrl-C stops it")
-            show_text(f"Prefect's pages: {pages}")
-            _serve(served, schedule, limit or len(served) + 1, shared=shared)
-    except KeyboardInterrupt:
-        show_text("stopped: no run starts from now on; the same command serves again")
+    archives = {settings.out: Archive.open(settings.out).root for settings in served.values()}
+    home = next(iter(archives.values())) / ".prefect"
+    with suppress(KeyboardInterrupt), terminable(), ExitStack() as held:
+        for name, root in archives.items():
+            release = take_lock(root / ".locks" / "serve.lock", wait=False)
+            if release is None:
+                raise ArchiveError(
+                    f"another serve uses the archive {name}; give all its fields to that one, or stop it"
+                )
+            held.callback(release)
+        pages = _start_server(home, port, held)
+        tempfile.tempdir = str(home)  # for Prefect's runner: another user may own its folder in /tmp
+        when = cron or f"every {every}".removesuffix(", 0:00:00")
+        show_text(f"serving {', '.join(str(one.name) for one in served.values())}, {when}; Ctrl-C stops it")
+        show_text(f"Prefect's pages: {pages}")
+        surveys = [survey_deployment(file, settings, schedule) for file, settings in served.items()]
+        _serve([*surveys, *map(reprocess_deployment, archives)], limit or len(served) + 1)
+    show_text("stopped: no run starts from now on; the same command serves again")
     return DONE
 
 
-@dataclass(frozen=True)
-class ServedField:
-    """A field: its name, its settings file and the settings in it."""
-
-    name: str
-    file: Path
-    settings: Settings
-
-    def deployment(self, schedule: Any) -> Any:
-        """Return the field's deployment of the flow `survey`; a run that is due during another is cancelled."""
-        return survey.to_deployment(
-            self.name,
-            schedule=schedule,
-            paused=False,
-            parameters={
-                "settings": {"settings_file": str(self.file), "name": self.name, "out": str(self.settings.out)}
-            },
-            concurrency_limit=ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),
-            tags=[self.settings.source, self.name],
-            description=f"Surveys of {self.name} by {self.file}.",
-            version="1",
-            entrypoint_type=EntrypointType.MODULE_PATH,
-        )
-
-
-def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
-    """Return the fields after planning each one; no device is used.
+def load_fields(files: Sequence[Path], out: str | None = None) -> dict[Path, Settings]:
+    """Return the settings of each file, with the field's name, after planning each one; no device is used.
 
     Raises PipelineError: a field cannot be surveyed; the message names its file.
     """
     if not files:
         raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
-    fields: dict[str, ServedField] = {}
+    fields: dict[str, tuple[Path, Settings]] = {}
     for file in files:
         settings = load_settings(file, {"out": out})
-        settings = replace(settings, out=str(Path(settings.out).absolute()))
         if "scene" not in read_toml(file) and settings.source != "rig":
             raise SettingsError(
                 f"{file} has neither scene nor source = 'rig'; set the field's scene ('field' for sweeps), or its rig"
@@ -149,17 +112,31 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
         name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
         if name in fields:
             raise SettingsError(
-                f'{fields[name].file} and {file} are both called {name}: give one of them another name = "..."'
+                f'{fields[name][0]} and {file} are both called {name}: give one of them another name = "..."'
             )
+        settings = replace(settings, name=name, out=str(Path(settings.out).absolute()))
         try:
-            open_run(replace(settings, name=name), planning=True)
+            open_run(settings, planning=True)
         except NoSceneYet as error:
             describe_weights(weights_path(settings))  # raises where they are invalid
             show_text(f"{name}: {error}; each due run looks for it again")
         except PipelineError as error:
             raise type(error)(f"{file}: {error}") from error
-        fields[name] = ServedField(name, file.absolute(), settings)
-    return list(fields.values())
+        fields[name] = file.absolute(), settings
+    return dict(fields.values())
+
+
+def survey_deployment(file: Path, settings: Settings, schedule: Any) -> Any:
+    """Return a field's deployment of the flow `survey`; a run that is due during another is cancelled."""
+    return survey.to_deployment(
+        str(settings.name),
+        schedule=schedule,
+        paused=False,
+        parameters={"settings": {"settings_file": str(file), "name": settings.name, "out": settings.out}},
+        tags=[settings.source, str(settings.name)],
+        description=f"Surveys of {settings.name} by {file}.",
+        **ONE_AT_A_TIME,
+    )
 
 
 def schedule_of(cron: str | None, every: timedelta | None, timezone: str | None = None) -> Any:
@@ -186,111 +163,58 @@ def _start_server(home: Path, port: int, held: ExitStack) -> str:
     Raises SettingsError: that server does not answer, or the port is in use.
     """
     held.enter_context(quiet_environment(home))
+    named = os.environ.get("PREFECT_API_URL")
     try:
-        if "PREFECT_API_URL" in os.environ:
-            check_answers(os.environ["PREFECT_API_URL"])
-            return os.environ["PREFECT_API_URL"].rstrip("/").removesuffix("/api")
+        if named is not None:
+            check_answers(named)
+            return named.rstrip("/").removesuffix("/api")
         api = held.enter_context(local_server(home, port, schedules=True))
         return f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
     except ServerUnavailable as error:
-        named = "PREFECT_API_URL" in os.environ
         cure = ": start it, or unset PREFECT_API_URL and have one started here" if named else ""
         raise SettingsError(f"{error}{cure}") from error
 
 
-def _serve(fields: Sequence[ServedField], schedule: Any, limit: int, *, shared: bool) -> None:
-    """Serve the fields and the reprocessing of their archives until interrupted, also while the server is away."""
-    # Prefect's runner drops this coroutine where it has given up; the interpreter would say so at its end
-    warnings.filterwarnings("ignore", "coroutine 'Runner._handle_cancellation_observer_failure' was never awaited")
-    surveys = [one.deployment(schedule) for one in fields]
-    outs = dict.fromkeys(str(one.settings.out) for one in fields)
-    again = [deployment(out, number, shared=shared) for number, out in enumerate(outs, 1)]
-    _prepare([*surveys, *again], shared=shared)
-    asked_to_stop = threading.Event()
-    try:
-        while not asked_to_stop.is_set():
-            try:
-                asyncio.run(_run([*surveys, *again], limit, asked_to_stop))
-            except asyncio.CancelledError:
-                break
-            except Exception as error:  # the runner gives up after three tries, also while it stops
-                if not asked_to_stop.is_set():
-                    show_text(
-                        f"Prefect's server does not answer ({type(error).__name__}); serving continues when it answers"
-                    )
-                    with terminable():  # the handler of SIGTERM ended with the event loop
-                        _wait_for_server()
+class InterruptedRunner(Runner):
+    """Prefect's runner, which SIGTERM ends as Ctrl-C does; the runner's own answer leaves a coroutine and a warning."""
+
+    def handle_sigterm(self, *args: Any, **kwargs: Any) -> None:
+        """Interrupt the main thread."""
         raise KeyboardInterrupt
-    finally:
+
+
+def _serve(deployments: Sequence[Any], limit: int) -> None:
+    """Serve the deployments until SIGINT or SIGTERM, then pause them. Raises PipelineError: the server is away."""
+    try:
+        _prepare([one.name for one in deployments])
+        runner = InterruptedRunner(pause_on_shutdown=False, limit=limit)  # it would pause the first one only
+        served: list[Any] = [runner.add_deployment(one) for one in deployments]
         try:
+            asyncio.run(runner.start())
+        finally:
             with get_client(sync_client=True) as client:
-                for one in fields:
-                    client.pause_deployment(client.read_deployment_by_name(f"survey/{one.name}").id)
-        except Exception as error:
-            show_text(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
+                for one in served:
+                    client.pause_deployment(one)
+    except (HTTPError, ExceptionGroup) as error:
+        raise PipelineError(
+            f"Prefect's server does not answer as expected ({error}); the same command serves again"
+        ) from error
 
 
-async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
-    """Run due flow runs by Prefect's runner until it is interrupted."""
-    runner = Runner(pause_on_shutdown=False, limit=limit)
-    for one in deployments:
-        await runner.aadd_deployment(one)
-    running = asyncio.ensure_future(runner.start())
-    await asyncio.sleep(0)  # the runner installs its own handler of SIGTERM here
-    loop = asyncio.get_running_loop()
-
-    def stop() -> None:
-        asked_to_stop.set()
-        running.cancel()
-        loop.call_later(STOPPED_AGAIN_S, stop)  # the runner may lose the first request
-
-    loop.add_signal_handler(signal.SIGTERM, stop)  # SIGINT may be ignored here
-    await running
-
-
-def _prepare(deployments: Sequence[Any], *, shared: bool) -> None:
-    """Limit a rig to one survey at a time in Prefect, and end the runs that an earlier serve left.
-
-    Runs that were due while serve was stopped are cancelled; those that ran at its end have crashed.
-    Raises SettingsError: on a ``shared`` server a deployment of the same name is for another archive.
-    """
-    own: dict[str, Any] = {
-        "deployment_filter": filters.DeploymentFilter(
-            name=filters.DeploymentFilterName(any_=[one.name for one in deployments])
-        ),
-        "flow_filter": filters.FlowFilter(name=filters.FlowFilterName(any_=[survey.name, reprocess.name])),
-    }
+def _prepare(names: list[str]) -> None:
+    """Limit a rig to one survey at a time in Prefect, and end the due runs of deployments that a killed serve left."""
     now: Any = datetime.now(UTC)
-    due = filters.FlowRunFilterExpectedStartTime(before_=now)
-    states: Any = (
-        ([StateType.SCHEDULED], Cancelled(message="no serve was running when it was due"), due),
-        ([StateType.PENDING, StateType.RUNNING], Crashed(message="the process that ran it is gone"), None),
-        ([StateType.CANCELLING], Cancelled(message="cancelled; the process that ran it is gone"), None),
-    )
+    left: dict[str, Any] = {
+        "deployment_filter": filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=names)),
+        "flow_filter": filters.FlowFilter(name=filters.FlowFilterName(any_=[survey.name, reprocess.name])),
+        "flow_run_filter": filters.FlowRunFilter(
+            state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=UNENDED)),
+            expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=now),
+        ),
+    }
     with get_client(sync_client=True) as client:
-        for one in deployments if shared else ():
-            name = f"{one.flow_name}/{one.name}"
-            with suppress(ObjectNotFound):
-                known = client.read_deployment_by_name(name).parameters.get("settings", {}).get("out")
-                if known is not None and known != one.parameters.get("settings", {}).get("out"):
-                    raise SettingsError(
-                        f"the Prefect server has a field {one.name} of the archive {known}: give this field another "
-                        f"name, or delete the deployment {name} there"
-                    )
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        for kinds, ended, when in states:
-            left = filters.FlowRunFilter(
-                state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=kinds)),
-                expected_start_time=when,
-            )
-            while found := client.read_flow_runs(**own, flow_run_filter=left):  # a page at a time
-                for run in found:
-                    client.set_flow_run_state(run.id, ended, force=True)
-
-
-def _wait_for_server() -> None:
-    while True:
-        with suppress(ServerUnavailable):
-            check_answers(os.environ["PREFECT_API_URL"])
-            return
-        time.sleep(AGAIN_S)
+        while found := client.read_flow_runs(**left):  # a page at a time
+            for run in found:
+                ended = Crashed if run.start_time else Cancelled
+                client.set_flow_run_state(run.id, ended(message="left by an earlier serve"), force=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import socket
 import sqlite3
 import subprocess
@@ -15,7 +16,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from contextvars import copy_context
 from http.client import HTTPException
@@ -151,30 +152,26 @@ def create_database(path: Path) -> None:
 
     migrated = cache / "spectralzoom" / f"prefect-{prefect.__version__}.db"
     if not migrated.exists():
-        _put_in_place(migrated, _migrate)
-    with closing(sqlite3.connect(migrated)) as kept:
-        kept.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
-        _put_in_place(path, lambda part: kept.execute("VACUUM INTO ?", (str(part),)))
+        migrated.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=migrated.parent) as folder:
+            _migrate(Path(folder)).replace(migrated)
+    with TemporaryDirectory(dir=path.parent) as folder:
+        shutil.copyfile(migrated, Path(folder) / "copy.db").replace(path)
 
 
-def _put_in_place(path: Path, make: Callable[[Path], object]) -> None:
-    """Make a file beside its place, and rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=f"{path.name}-", dir=path.parent) as folder:
-        make(Path(folder) / path.name)
-        (Path(folder) / path.name).replace(path)
-
-
-def _migrate(path: Path) -> None:
+def _migrate(folder: Path) -> Path:
     """Create an empty database with the tables of the installed Prefect, in a process with settings of its own."""
-    own = {"PREFECT_HOME": str(path.parent), "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{path}"}
+    full, small = folder / "full.db", folder / "small.db"
+    own = {"PREFECT_HOME": str(folder), "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{full}"}
     upgrade = [sys.executable, "-m", "prefect", "server", "database", "upgrade", "-y"]
     try:
         subprocess.run(upgrade, env={**os.environ, **QUIET, **own}, check=True, capture_output=True, text=True)
     except subprocess.CalledProcessError as error:
         raise ServerUnavailable(f"Prefect cannot create its database ({error.stderr.strip()[-300:]})") from error
-    with closing(sqlite3.connect(path)) as made:
-        made.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # all is in the one file
+    with closing(sqlite3.connect(full)) as made:
+        made.execute("PRAGMA page_size = 1024")  # small pages for 229 almost empty tables and indices
+        made.execute("VACUUM INTO ?", (str(small),))
+    return small
 
 
 @contextmanager

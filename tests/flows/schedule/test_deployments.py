@@ -1,10 +1,9 @@
-"""Deployments of the survey on a real Prefect server: parameters, due times, limits, two machines, files, a kill."""
+"""Deployments of the survey on a real Prefect server: parameters, due times, limits, files, a kill."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 import threading
@@ -12,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import Queue
@@ -20,21 +19,17 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
-import httpx
 import pytest
 import yaml
 
-from flows.archive.reprocess_flow import deployment as reprocessing
-from flows.cli.serve_command import _prepare, load_fields, schedule_of
+from flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
 from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
-from flows.tasks.open_survey import LEASE_S, RIG_LIMIT, OpenSurvey
+from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
 from flows.tasks.prefect_tasks import Observer
-from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.pool import THREADS
-from tests.flows.schedule.prefect_server import free_port, server_process
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
@@ -52,13 +47,9 @@ def scheduling(prefect_home: Path) -> Iterator[str]:
 
 @pytest.fixture
 def north(field_file: Callable[..., Path], scheduling: str) -> Any:
-    """Return the field north, due at six in Berlin, on the server that schedules."""
-    return load_fields([field_file("north", source="raster", budget=None)])[0]
-
-
-def deployed(field: Any) -> Any:
-    """Return the id of a field's deployment on the server."""
-    return field.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin")).apply()
+    """Return the deployment of the field north, due at six in Berlin, on the server that schedules."""
+    ((file, settings),) = load_fields([field_file("north", source="raster", budget=None)]).items()
+    return survey_deployment(file, settings, schedule_of("0 6 * * *", None, "Europe/Berlin"))
 
 
 def client() -> Any:
@@ -94,11 +85,11 @@ def settings_of(out: Path) -> list[dict[str, Any]]:
 
 def test_a_run_has_its_due_time_as_visit_and_the_newest_prior_map(north: Any) -> None:
     """The actual start does not matter; the first run finds no earlier one."""
-    deployment = deployed(north)
+    deployment, out = north.apply(), Path(north.parameters["settings"]["out"])
     states = [run_here(planned(deployment, DUE.replace(day=day))) for day in (1, 2)]
     assert [state.name for state in states] == ["Completed", "Completed"]
-    assert [one["visit"] for one in settings_of(north.settings.out)] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
-    memories = [read_run(folder).receipt.get("prior_map") for folder in Archive.open(north.settings.out).runs()]
+    assert [one["visit"] for one in settings_of(out)] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
+    memories = [read_run(folder).receipt.get("prior_map") for folder in Archive.open(out).runs()]
     assert [memory is None for memory in memories] == [True, False]
 
 
@@ -112,37 +103,22 @@ def test_serve_ends_the_runs_of_a_killed_serve(north: Any, monkeypatch: pytest.M
     def another() -> None:
         """Do nothing, as a flow of another project."""
 
-    made = north.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin"))
-    again = reprocessing(str(north.settings.out))
-    deployment, foreign = made.apply(), another.to_deployment("north").apply()
+    deployment, foreign = north.apply(), another.to_deployment("north").apply()
     ran, ended, waited, other, later = (
         planned(deployment, DUE.replace(year=year)).id for year in (2023, 2024, 2025, 2025, 2099)
     )
-    ahead, strange = planned(again.apply(), DUE.replace(year=2099)).id, planned(foreign, DUE.replace(year=2025)).id
+    strange = planned(foreign, DUE.replace(year=2025)).id
     read = SyncPrefectClient.read_flow_runs
     monkeypatch.setattr(SyncPrefectClient, "read_flow_runs", lambda self, **given: read(self, **given, limit=1))
     with client() as asked:
-        begun = ((ran, Pending), (ran, Running), (ended, Cancelling), (ahead, Pending), (strange, Pending))
-        for one, state in begun:
+        for one, state in ((ran, Pending), (ran, Running), (ended, Cancelling), (strange, Pending)):
             asked.set_flow_run_state(one, state(), force=True)
-        _prepare([made, again], shared=False)
-        every = (ran, ended, waited, other, later, ahead, strange)
-        kinds = [asked.read_flow_run(one).state.type.value for one in every]
-        assert kinds == ["CRASHED", *["CANCELLED"] * 3, "SCHEDULED", "CRASHED", "PENDING"]
+        _prepare([north.name])
+        kinds = [asked.read_flow_run(one).state.type.value for one in (ran, ended, waited, other, later, strange)]
+        assert kinds == ["CRASHED", *["CANCELLED"] * 3, "SCHEDULED", "PENDING"]
         after = planned(deployment, DUE).id
         asked.set_flow_run_state(after, Pending())
         assert asked.read_flow_run(after).state.is_pending()
-
-
-def test_a_shared_server_keeps_the_fields_of_others(north: Any) -> None:
-    """A field of another archive with the same name is refused; the reprocessing is named after its archive."""
-    schedule = schedule_of(None, timedelta(hours=1))
-    north.deployment(schedule).apply()
-    _prepare([north.deployment(schedule), reprocessing("/data/a b", shared=True)], shared=True)
-    moved = replace(north, settings=replace(north.settings, out="/data/a b"))
-    with pytest.raises(SettingsError, match=r"the Prefect server has a field north of the archive .*another name"):
-        _prepare([moved.deployment(schedule)], shared=True)
-    assert reprocessing("/data/a b", shared=True).name == "data-a-b"
 
 
 @pytest.mark.usefixtures("scheduling")
@@ -249,7 +225,7 @@ def test_the_automation_reports_a_failed_run(north: Any, tmp_path: Path, schedul
         (tmp_path / "automation.yaml").write_text(text.replace(unset, str(block)))
         prefect_cli(tmp_path, "automation", "create", "--from-file", "automation.yaml")
         settings = {"settings_file": str(tmp_path / "gone.toml")}
-        assert run_here(planned(deployed(north), DUE, {"settings": settings})).is_failed()
+        assert run_here(planned(north.apply(), DUE, {"settings": settings})).is_failed()
         found = told.get(timeout=PATIENCE_S)
     finally:
         listener.shutdown()
@@ -258,63 +234,33 @@ def test_the_automation_reports_a_failed_run(north: Any, tmp_path: Path, schedul
     assert "no settings file" in found["why"]
 
 
-def take_rig(limits: httpx.Client) -> None:
-    """Take the only slot of the rig's limit, as a survey does."""
-    wanted = {"names": [RIG_LIMIT], "slots": 1, "lease_duration": LEASE_S}
-    while (taken := limits.post("/increment-with-lease", json=wanted)).status_code == httpx.codes.SERVICE_UNAVAILABLE:
-        time.sleep(0.5)  # another service of the server locks the database
-    taken.raise_for_status()
-    assert limits.get(f"/{RIG_LIMIT}").json()["active_slots"] == 1
+def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_path: Path, scheduling: str) -> None:
+    """A run that is asked for completes; SIGTERM then ends serve with one sentence and pauses the schedules.
 
-
-def test_serve_resumes_after_the_server_restarts(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """A later run completes; SIGTERM then ends serve with one sentence and pauses the schedule.
-
-    A lease of the rig outlives the server, and the restarted server frees it after its expiry. Serve starts as a
-    shell's background job, which ignores SIGINT.
+    Serve starts as a shell's background job, which ignores SIGINT.
     """
     from prefect.deployments import run_deployment
-    from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
-    file = field_file("north", source="raster", budget=None)
-    home = tmp_path / "home"
-    port = free_port()
-    with server_process(home, port) as server:
-        password = (home / "password").read_text().strip()
-        api = f"http://127.0.0.1:{port}/api"
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
-        environment |= {"PREFECT_API_URL": api, "PREFECT_API_AUTH_STRING": password}
-        environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it retries for minutes
-        words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
-        words += ["serve", str(file), "--every", "365d"]
-        with (
-            temporary_settings({PREFECT_API_URL: api, PREFECT_API_AUTH_STRING: password}),
-            httpx.Client(base_url=f"{api}/v2/concurrency_limits", auth=tuple(password.split(":", 1))) as limits,
-            (tmp_path / "said").open("w") as said,
-            subprocess.Popen(words, cwd=ROOT, env=environment, stderr=said) as process,
-        ):
-            try:
-                wait_for("survey/north")
-                take_rig(limits)
-                server.kill()
-                server.wait()
-                for lease in (home / "concurrency_leases").glob("*.json"):  # a minute later
-                    lease.write_text(re.sub(r'"20\d\d-', '"2020-', lease.read_text()))
-                end = time.monotonic() + PATIENCE_S
-                while "does not answer" not in (tmp_path / "said").read_text() and time.monotonic() < end:
-                    time.sleep(0.2)
-                with server_process(home, port):
-                    run: Any = run_deployment("survey/north", timeout=PATIENCE_S, poll_interval=0.5)
-                    assert run.state.is_completed()
-                    while limits.get(f"/{RIG_LIMIT}").json()["active_slots"]:
-                        assert time.monotonic() < end
-                        time.sleep(0.5)
-                    process.terminate()
-                    assert process.wait(PATIENCE_S) == 0
-                    with client() as asked:
-                        assert asked.read_deployment_by_name("survey/north").paused
-            finally:
-                process.kill()
+    names = ("north", "south")
+    files = [field_file(name, source="raster", budget=None) for name in names]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
+    words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
+    words += ["serve", *map(str, files), "--every", "365d"]
+    with (
+        (tmp_path / "said").open("w") as said,
+        subprocess.Popen(words, cwd=ROOT, env={**environment, "PREFECT_API_URL": scheduling}, stderr=said) as process,
+    ):
+        try:
+            for name in names:
+                wait_for(f"survey/{name}")
+            run: Any = run_deployment("survey/north", timeout=PATIENCE_S, poll_interval=0.5)
+            assert run.state.is_completed()
+            process.terminate()
+            assert process.wait(PATIENCE_S) == 0
+            with client() as asked:
+                assert all(asked.read_deployment_by_name(f"survey/{name}").paused for name in names)
+        finally:
+            process.kill()
     lines = (tmp_path / "said").read_text().splitlines()
-    assert lines[-1].endswith("stopped: no run starts from now on; the same command serves again"), lines
+    assert [line.split()[0] for line in lines] == ["serving", "Prefect's", "stopped:"], lines
     assert len(settings_of(tmp_path / "archive")) == 1

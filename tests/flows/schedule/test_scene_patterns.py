@@ -57,8 +57,8 @@ def test_a_schedule_may_begin_without_a_scene(
 ) -> None:
     """A message says so; unusable weights are refused at once."""
     pattern = {"scene": str(tmp_path / "scenes" / "{date:%Y-%m-%d}.png"), "source": None, "budget": None}
-    (field,) = load_fields([field_file("north", **pattern)])
-    assert field.settings.scene == pattern["scene"]
+    (field,) = load_fields([field_file("north", **pattern)]).values()
+    assert field.scene == pattern["scene"]
     assert "each due run looks for it again" in capsys.readouterr().err
     with pytest.raises(WeightsError):
         load_fields([field_file("south", **pattern, weights=str(tmp_path / "none.safetensors"))])

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flows.cli.serve_command import load_fields, schedule_of
+from flows.cli.serve_command import load_fields, schedule_of, survey_deployment
 from storage.archive.archive import Archive
 from storage.archive.staging import take_lock
 
@@ -83,15 +83,15 @@ def test_serve_without_a_server_is_refused(
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:
     """Its parameters have file, field and archive and pass the flow's checks; a second run at a time is cancelled."""
-    from flows.archive.reprocess_flow import deployment
+    from flows.archive.reprocess_flow import reprocess_deployment
     from flows.survey import survey
 
-    (north,) = load_fields([field_file("north")], out=str(tmp_path / "other"))
-    made = north.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin"))
+    ((file, north),) = load_fields([field_file("north")], out=str(tmp_path / "other")).items()
+    made = survey_deployment(file, north, schedule_of("0 6 * * *", None, "Europe/Berlin"))
     settings = survey.validate_parameters(made.parameters)["settings"].settings()
     assert (settings.name, settings.out, settings.budget) == ("north", str(tmp_path / "other"), 0.8)
     assert (made.concurrency_limit, made.concurrency_options.collision_strategy.value) == (1, "CANCEL_NEW")
     (schedule,) = made.schedules
     assert (schedule.schedule.cron, schedule.schedule.timezone) == ("0 6 * * *", "Europe/Berlin")
-    again = deployment(str(tmp_path / "other"))
-    assert (again.flow_name, again.name, again.schedules) == ("reprocess", "archive", [])
+    again = reprocess_deployment("/data/a b")
+    assert (again.flow_name, again.name, again.schedules) == ("reprocess", "data-a-b", [])
