@@ -15,25 +15,13 @@ MOST_PAIRS = 8191  # a byte offset of 16 bits addresses the cells of the vector 
 
 
 @dataclass(frozen=True)
-class ControlPatience:
-    """Longest time from a command's first byte to the prompt, and how often reads are asked again."""
-
-    deadline_s: float = 5.0
-    retries: int = 2
-    pause_s: float = 0.5  # before connecting again
-
-
-@dataclass(frozen=True)
 class FileServer:
-    """The camera's FTP server and its timeouts. User and password are those of public programs."""
+    """The camera's FTP server. User and password are those of public programs."""
 
     host: str = "10.0.65.50"  # the maker's
     port: int = 21
     user: str = "ftpuser"
     password: str = "ftpuser"
-    stall_s: float = 10.0  # longest silence before a transfer is continued anew
-    tries: int = 3  # in a row that bring no byte
-    pause_s: float = 1.0
 
     @property
     def where(self) -> str:
@@ -57,15 +45,6 @@ def check_times(exposure_ms: float, frame_period_ms: float, most_rate_hz: float)
             f"exposure {exposure_ms:g} ms, expected {LEAST_EXPOSURE_MS:g} ms up to the frame period of "
             f"{frame_period_ms:g} ms; times are in ms"
         )
-
-
-@dataclass(frozen=True)
-class Patience:
-    """Longest time of a transaction, tries of a read within it, and the silence after which no answer comes. [s]"""
-
-    deadline_s: float = 1.0
-    retries: int = 2
-    quiet_s: float = 0.1
 
 
 @dataclass(frozen=True)

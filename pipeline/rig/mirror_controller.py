@@ -22,7 +22,7 @@ from pipeline.errors import RigError, SettingsError, ShapeError
 from pipeline.geometry.mirror import wire_positions
 from pipeline.geometry.scan import device_range
 from pipeline.rig import pro_mode as pro
-from pipeline.rig.device_settings import Patience, SurveyRig
+from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
@@ -199,9 +199,8 @@ def _run_values(run: int) -> dict[int, pro.Value]:
 class MirrorController:
     """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
 
-    Motions (goto, run) are sent once. One that is not acknowledged raises StateUnknown, and so does every later motion
-    of this object; reads and :meth:`halt` still work. Every method that speaks to the device may also raise
-    DeviceRefused, DeadlinePassed or DeviceGone.
+    Motions (goto, run) are sent once; one that is not acknowledged raises StateUnknown. Positions beyond the disk raise
+    PoseError, before a byte is sent.
     """
 
     def __init__(
@@ -209,7 +208,7 @@ class MirrorController:
     ) -> None:
         self.rig = rig
         self.vector_pairs = vector_pairs
-        self.wire = Wire(transport, clock, Patience())
+        self.wire = Wire(transport, clock)
         self._link = ProLink(self.wire, rig.with_crc)
         self._pairs = 0  # positions in the vector memory
         self.identity = Identity("", "", "")
@@ -219,32 +218,31 @@ class MirrorController:
 
         Raises DeadlinePassed or DeviceGone where nothing answers, RigError where another device answers.
         """
-        with self.wire.lock:
-            try:
-                self._greet()
-            except DeadlinePassed:
-                LOG.info("%s does not answer in simple mode; it may be in pro mode", self.wire.port)
-                with suppress(DeadlinePassed):  # it may have changed; the greeting shows
-                    # with a CRC: an earlier session may have had them checked
-                    ProLink(self.wire, with_crc=True).set(pro.GO_SIMPLE, "changing to simple mode")
-                self._greet()
-            found = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
-            self.identity = found
-            if not found.device.upper().startswith(KNOWN_MODEL):
-                raise RigError(
-                    f"expected a controller whose id begins with {KNOWN_MODEL} on {self.wire.port}, got "
-                    f"{found.summary}; is another device at this port?"
-                )
-            try:
-                with suppress(DeadlinePassed):  # it may have changed; the status shows
-                    ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
-                self.status()
-            except (DeadlinePassed, DeviceRefused) as error:
-                own, other = ("with", "without")[:: 1 if self.rig.with_crc else -1]
-                raise RigError(
-                    f"frames {own} a CRC: {error}; if this firmware wants them {other} one, set with_crc = "
-                    f"{str(not self.rig.with_crc).lower()} in [rig]"
-                ) from error
+        try:
+            self._greet()
+        except DeadlinePassed:
+            LOG.info("%s does not answer in simple mode; it may be in pro mode", self.wire.port)
+            with suppress(DeadlinePassed):  # it may have changed; the greeting shows
+                # with a CRC: an earlier session may have had them checked
+                ProLink(self.wire, with_crc=True).set(pro.GO_SIMPLE, "changing to simple mode")
+            self._greet()
+        found = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
+        self.identity = found
+        if not found.device.upper().startswith(KNOWN_MODEL):
+            raise RigError(
+                f"expected a controller whose id begins with {KNOWN_MODEL} on {self.wire.port}, got "
+                f"{found.summary}; is another device at this port?"
+            )
+        try:
+            with suppress(DeadlinePassed):  # it may have changed; the status shows
+                ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
+            self.status()
+        except (DeadlinePassed, DeviceRefused) as error:
+            own, other = ("with", "without")[:: 1 if self.rig.with_crc else -1]
+            raise RigError(
+                f"frames {own} a CRC: {error}; if this firmware wants them {other} one, set with_crc = "
+                f"{str(not self.rig.with_crc).lower()} in [rig]"
+            ) from error
 
     def _greet(self) -> None:
         try:
@@ -257,11 +255,7 @@ class MirrorController:
         return pro.Status(self._link.ask(pro.ASK_STATUS, "the status", pro.cell_int))
 
     def goto(self, x: float, y: float) -> None:
-        """Send the mirror to a position and hold it there; return once that is acknowledged, not at rest.
-
-        Raises PoseError: the position is outside the disk; no byte is sent. Raises RigError: the status forbids motion.
-        Raises StateUnknown: it was not acknowledged, or an earlier motion was not.
-        """
+        """Send the mirror to a position; return once that is acknowledged. RigError: the status forbids motion."""
         to_x, to_y = map(float, wire_positions([(x, y)], self.rig.mounting)[0])
         follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
         # all registers fill one frame: both channels go there, hold it, and end any path
@@ -279,11 +273,9 @@ class MirrorController:
             raise RigError(f"the mirror on {self.wire.port} is not where it was sent; {status.sentence}")
 
     def load_path(self, positions: ArrayLike) -> None:
-        """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Nothing moves.
+        """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Halts a path.
 
-        A path that plays is halted. Raises PoseError or ShapeError where a position is outside the disk, and
-        SettingsError where there are too many; nothing is sent then. Raises RigError: a cell that was read back holds
-        another value.
+        Raises SettingsError: there are too many. Raises RigError: a cell that was read back holds another value.
         """
         cells = wire_positions(positions, self.rig.mounting)
         if len(cells) > self.vector_pairs:
@@ -296,32 +288,29 @@ class MirrorController:
         self._pairs = len(cells)
 
     def run(self, rate_hz: float) -> None:
-        """Play the loaded positions once, at ``rate_hz`` positions a second.
+        """Play the loaded positions once; X from cell 0 on, Y from behind the X of all positions.
 
-        X plays from cell 0 on, Y from behind the X of all positions. Raises SettingsError: no path is loaded. Raises
-        also as :meth:`goto`.
+        Raises SettingsError: no path is loaded. Raises also as :meth:`goto`.
         """
         if not self._pairs:
             raise SettingsError(f"no path is loaded on {self.wire.port}; load one first")
-        with self.wire.lock:
-            self.wire.check_known("running a path")
-            self.halt()
-            for name, begin, channel in (("X", 0, pro.X), ("Y", self._pairs, pro.Y)):
-                start, end = device_range((begin, begin + self._pairs), self.rig.ends)
-                values: dict[int, pro.Value] = {
-                    channel.vector(pro.VectorRegister.UNIT): pro.UNIT_XY,
-                    channel.vector(pro.VectorRegister.START): start,
-                    channel.vector(pro.VectorRegister.END): end,
-                    channel.vector(pro.VectorRegister.FREQUENCY): float(rate_hz),
-                    channel.vector(pro.VectorRegister.CYCLES): 1,
-                    channel.vector(pro.VectorRegister.TRIGGER): pro.TRIGGER_OFF,
-                }
-                self._link.set(pro.set_values(values), f"setting up the path's {name}")
-            follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
-            self._move(follow | _run_values(1), "running the path")  # one frame: both begin together
+        self.halt()
+        for name, begin, channel in (("X", 0, pro.X), ("Y", self._pairs, pro.Y)):
+            start, end = device_range((begin, begin + self._pairs), self.rig.ends)
+            values: dict[int, pro.Value] = {
+                channel.vector(pro.VectorRegister.UNIT): pro.UNIT_XY,
+                channel.vector(pro.VectorRegister.START): start,
+                channel.vector(pro.VectorRegister.END): end,
+                channel.vector(pro.VectorRegister.FREQUENCY): float(rate_hz),
+                channel.vector(pro.VectorRegister.CYCLES): 1,
+                channel.vector(pro.VectorRegister.TRIGGER): pro.TRIGGER_OFF,
+            }
+            self._link.set(pro.set_values(values), f"setting up the path's {name}")
+        follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
+        self._move(follow | _run_values(1), "running the path")  # one frame: both begin together
 
     def halt(self) -> None:
-        """Stop playing; the mirror stays where it is. Works also where motions are refused."""
+        """Stop playing; the mirror stays where it is."""
         self._link.set(pro.set_values(_run_values(0)), "halting the path")
 
     def close(self) -> None:
@@ -329,7 +318,6 @@ class MirrorController:
         self.wire.transport.close()
 
     def _move(self, values: dict[int, pro.Value], name: str) -> None:
-        self.wire.check_known(name)
         if (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
         self._link.move(pro.set_values(values), name)

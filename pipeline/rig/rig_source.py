@@ -115,21 +115,21 @@ class RigSource:
         Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one answers. Raises
         StateUnknown where a motion or capture of an earlier session was not acknowledged.
         """
-        if self._runner is not None:
-            yield self._runner
-            return
         if self._unknown:
             raise StateUnknown(f"the rig gets no further command: {self._unknown[0]}; look at it, then run again")
-        devices = self._open()
+        devices = self._open() if self._runner is None else None
         try:
-            self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self._say)
+            if devices is not None:
+                self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self._say)
+            assert self._runner is not None
             yield self._runner
         except StateUnknown as error:
             self._unknown.append(str(error))
             raise
         finally:
-            self._runner = None
-            devices.close()
+            if devices is not None:
+                self._runner = None
+                devices.close()
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the sweep's lines one by one, from line ``first`` on.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -16,7 +15,6 @@ import serial
 from serial.tools import list_ports
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.rig.device_settings import Patience
 
 
 class Clock(Protocol):
@@ -61,7 +59,7 @@ class DeviceRefused(RigError):  # noqa: N818 - the name states the case
 
 
 class StateUnknown(RigError):  # noqa: N818 - the name states the case
-    """A device may or may not have moved; motions are refused until the next connection."""
+    """A device may or may not have moved; a rig gets no further command."""
 
 
 class NotKept(RigError):  # noqa: N818 - the name states the case
@@ -71,6 +69,9 @@ class NotKept(RigError):  # noqa: N818 - the name states the case
 _SLICE_S = 0.02  # reads wait in slices, so a deadline may be exceeded by one
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
 _MOST_DRAINED = 1 << 20  # bytes
+DEADLINE_S = 1.0  # longest time of a transaction
+RETRIES = 2  # of a read within it
+QUIET_S = 0.1  # silence after which no answer comes
 LOG = logging.getLogger(__name__)
 
 Kind = Literal["read", "write", "motion"]
@@ -238,18 +239,14 @@ class SocketTransport:
 
 
 class Wire:
-    """One device behind a transport. Only one transaction runs at a time, and each begins with an empty line.
+    """One device behind a transport. Each transaction begins with an empty line.
 
-    A read is sent again within its deadline. A write or a motion never is. After a motion without acknowledgement all
-    motions are refused, until a person has looked at the mirror and connects anew.
+    A read is sent again within its deadline. A write or a motion never is.
     """
 
-    def __init__(self, transport: Transport, clock: Clock, patience: Patience) -> None:
+    def __init__(self, transport: Transport, clock: Clock) -> None:
         self.transport = transport
         self.clock = clock
-        self.patience = patience
-        self.lock = threading.RLock()
-        self.unknown = ""  # why the state is unknown; empty where it is known
         self._unanswered = 0  # requests whose answer may still come
 
     @property
@@ -260,37 +257,32 @@ class Wire:
     def exchange(self, data: bytes, name: str, kind: Kind, receiver: Callable[[], Receiver[Answer]]) -> Answer:
         """Send a request, called ``name`` in messages, and return its answer.
 
-        ``receiver`` makes a receiver, one for each time that the request is sent. Raises StateUnknown: this motion or
-        an earlier one was not acknowledged. Raises DeadlinePassed: a read or a write was not answered in time. Raises
+        ``receiver`` makes a receiver, one for each time that the request is sent. Raises StateUnknown: a motion was not
+        acknowledged. Raises DeadlinePassed: a read or a write was not answered in time. Raises
         DeviceRefused or DeviceGone.
         """
-        with self.lock:
-            if kind == "motion":
-                self.check_known(name)
-            self._empty_line(f"before {name}")
-            deadline = self.clock.now() + self.patience.deadline_s
-            left = 1 + (self.patience.retries if kind == "read" else 0)
-            while True:
-                silence_s = (deadline - self.clock.now()) / left
-                try:
-                    return self._once(data, name, receiver(), silence_s, deadline)
-                except BaseException as error:  # an interrupted caller does not know either
-                    if kind == "motion" and not isinstance(error, DeviceRefused):
-                        self.unknown = f"{name} was sent and not acknowledged"
-                        if isinstance(error, RigError):
-                            raise StateUnknown(
-                                f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent "
-                                "again, and all motions are refused. Look at the mirror, then run again, which "
-                                "connects anew"
-                            ) from error
-                    left -= 1
-                    again = isinstance(error, RigError) and not isinstance(error, DeviceGone | DeviceRefused)
-                    if left == 0 or not again:
-                        raise
-                    LOG.info("%s; asking again", error)
-                    self._empty_line("before asking again", deadline)
-                    if self.clock.now() >= deadline:
-                        raise
+        self._empty_line(f"before {name}")
+        deadline = self.clock.now() + DEADLINE_S
+        left = 1 + (RETRIES if kind == "read" else 0)
+        while True:
+            silence_s = (deadline - self.clock.now()) / left
+            try:
+                return self._once(data, name, receiver(), silence_s, deadline)
+            except DeviceRefused:
+                raise
+            except RigError as error:
+                if kind == "motion":
+                    raise StateUnknown(
+                        f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent again. "
+                        "Look at the mirror, then run again, which connects anew"
+                    ) from error
+                left -= 1
+                if left == 0 or isinstance(error, DeviceGone):
+                    raise
+                LOG.info("%s; asking again", error)
+                self._empty_line("before asking again", deadline)
+                if self.clock.now() >= deadline:
+                    raise
 
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
         """Send once, and wait until the device has been silent for ``silence_s``, at most to the deadline."""
@@ -321,19 +313,11 @@ class Wire:
         """Drop what is on the line. If an answer may still come, wait for silence: it would pass for the next one."""
         stale = self.transport.drain()
         now = self.clock.now()
-        latest = min(latest, now + 5 * self.patience.quiet_s)  # some devices never stop
-        until = min(now + self.patience.quiet_s, latest)
+        latest = min(latest, now + 5 * QUIET_S)  # some devices never stop
+        until = min(now + QUIET_S, latest)
         while self._unanswered and (part := self.transport.read(4096, until)):
             stale += part
-            until = min(self.clock.now() + self.patience.quiet_s, latest)
+            until = min(self.clock.now() + QUIET_S, latest)
         self._unanswered = 0
         if stale:
             LOG.info("%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
-
-    def check_known(self, name: str) -> None:
-        """Refuse a motion where an earlier one was not acknowledged (StateUnknown)."""
-        if self.unknown:
-            raise StateUnknown(
-                f"{name} is refused on {self.port}: {self.unknown}, so the mirror's position is not known. Look at it, "
-                "then run again, which connects anew"
-            )

@@ -17,6 +17,9 @@ LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: the user or the password is refused
 OVERLAP = 4096  # last bytes held that are fetched again, to see that it is the same file
 _BLOCK = 1 << 16  # bytes
+STALL_S = 10.0  # longest silence before a transfer is continued anew
+TRIES = 3  # in a row that bring no byte
+PAUSE_S = 1.0  # between them
 Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
 
 
@@ -78,7 +81,7 @@ def open_session(server: FileServer) -> Iterator[ftplib.FTP]:
 
     Raises DeviceRefused where the server refuses, DeviceGone where it does not answer, or not as an FTP server.
     """
-    session = ftplib.FTP(timeout=server.stall_s, encoding="utf-8")
+    session = ftplib.FTP(timeout=STALL_S, encoding="utf-8")
     try:
         session.connect(server.host, server.port)
         session.login(server.user, server.password)
@@ -119,30 +122,25 @@ def fetch_files(
 
     A transfer that breaks off is continued, in a later call too. The last bytes held from before are compared with the
     camera's. Raises RigError where they differ or a file grows; DeviceRefused where the server refuses it; DeviceGone
-    where ``server.tries`` tries in a row brought no byte.
+    where TRIES tries in a row brought no byte.
     """
     for file in files:
-        _fetch(server, file, kept, progress, clock)
-
-
-def _fetch(server: FileServer, file: RemoteFile, kept: Kept, progress: Progress | None, clock: Clock) -> None:
-    """Fetch one file, again where a session breaks off."""
-    failed = 0
-    while True:
-        before = kept.size(file.name)
-        try:
-            with open_session(server) as session:
-                _transfer(session, file, kept, progress)
-            return
-        except DeviceGone as error:
-            held = kept.size(file.name)
-            failed = 1 if held > before else failed + 1
-            if failed >= server.tries:
-                raise DeviceGone(
-                    f"{error}; {held} bytes of {file.name} are kept, and a later fetch continues there"
-                ) from error
-            LOG.info("%s; continuing at byte %d of %s", error, held, file.name)
-            clock.sleep(server.pause_s)
+        failed = 0
+        while True:
+            before = kept.size(file.name)
+            try:
+                with open_session(server) as session:
+                    _transfer(session, file, kept, progress)
+                break
+            except DeviceGone as error:
+                held = kept.size(file.name)
+                failed = 1 if held > before else failed + 1
+                if failed >= TRIES:
+                    raise DeviceGone(
+                        f"{error}; {held} bytes of {file.name} are kept, and a later fetch continues there"
+                    ) from error
+                LOG.info("%s; continuing at byte %d of %s", error, held, file.name)
+                clock.sleep(PAUSE_S)
 
 
 def _transfer(session: ftplib.FTP, file: RemoteFile, kept: Kept, progress: Progress | None) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Self
@@ -17,7 +16,7 @@ from typing import Any, Self
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.device_settings import CONTROL_PORT, ControlPatience, FileServer
+from pipeline.rig.device_settings import CONTROL_PORT, FileServer
 from pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
@@ -30,6 +29,9 @@ from pipeline.rig.transports import (
 )
 
 LOG = logging.getLogger(__name__)
+DEADLINE_S = 5.0  # from a command's first byte to the prompt
+RETRIES = 2  # of a read
+PAUSE_S = 0.5  # before connecting again
 LONGEST_REPLY = 1 << 24  # bytes: a listing of a hundred thousand files
 _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _PROMPT = re.compile(rb"(?:\A|(?<=[\r\n}]))hpi> ")  # a reply may hold the word, but not there
@@ -107,25 +109,15 @@ class HeadwallCamera:
     """A line camera for surveys, a `pipeline.rig.drivers.CameraDriver`. The first command connects.
 
     After a late or damaged reply the connection is closed and opened again, so that a late reply never answers the next
-    command. ``connect`` makes a connection. Commands may also raise DeviceRefused, DeadlinePassed or DeviceGone.
+    command. ``connect`` makes a connection.
     """
 
-    def __init__(
-        self,
-        connect: Callable[[], Transport],
-        server: FileServer,
-        *,
-        clock: Clock = SYSTEM_CLOCK,
-        patience: ControlPatience | None = None,
-    ) -> None:
+    def __init__(self, connect: Callable[[], Transport], server: FileServer, *, clock: Clock = SYSTEM_CLOCK) -> None:
         self.server = server
-        self.patience = ControlPatience() if patience is None else patience
         self.clock = clock
-        self.unknown = ""  # why it is unknown whether a capture runs; empty where it is known
         self._connect = connect
         self._line: Transport | None = None
         self._reader = ReplyReader()
-        self._lock = threading.RLock()
 
     @classmethod
     def at(cls, host: str, server: FileServer, *, clock: Clock = SYSTEM_CLOCK) -> Self:
@@ -133,35 +125,26 @@ class HeadwallCamera:
         return cls(lambda: SocketTransport(host, CONTROL_PORT, clock), server, clock=clock)
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
-        """Set exposure and frame period; StateUnknown where a capture may be running, see ``capture``. [ms]"""
-        with self._lock:
-            self._check_known("configure")
-            self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: None)
+        """Set exposure and frame period. [ms]"""
+        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: None)
 
     def capture(self, frames: int, *, prefix: str = "") -> Capture:
-        """Begin a capture of ``frames`` lines in one file. The command is sent once.
-
-        Raises StateUnknown where no reply comes. Captures and settings are refused from then on, until a person has
-        looked at the camera and connects anew.
-        """
-        with self._lock:
-            self._check_known("capture")
-            self._open()
-            sent_s = self.clock.now()
-            try:
-                folder = self._once("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}, as_folder)
-            except DeviceRefused:
+        """Begin a capture of ``frames`` lines in one file. The command is sent once; StateUnknown without a reply."""
+        self._open()
+        sent_s = self.clock.now()
+        try:
+            folder = self._once("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}, as_folder)
+        except DeviceRefused:
+            raise
+        except BaseException as error:
+            self._hang_up()
+            if not isinstance(error, RigError):  # interrupted while it waited
                 raise
-            except BaseException as error:
-                self.unknown = "a capture was sent and not acknowledged"
-                self._hang_up()
-                if not isinstance(error, RigError):  # interrupted while it waited
-                    raise
-                raise StateUnknown(
-                    f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again. Look "
-                    "at the camera, stop what runs there, then run again, which connects anew"
-                ) from error
-            return Capture(folder, sent_s, self.clock.now())
+            raise StateUnknown(
+                f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again. Look "
+                "at the camera, stop what runs there, then run again, which connects anew"
+            ) from error
+        return Capture(folder, sent_s, self.clock.now())
 
     def is_capturing(self) -> bool:
         """Return whether a capture runs."""
@@ -194,31 +177,29 @@ class HeadwallCamera:
 
     def close(self) -> None:
         """Send exit and close the connection. A capture continues; nothing is raised."""
-        with self._lock:
-            if self._line is not None:
-                try:
-                    self._line.write(to_request("exit"), self.clock.now() + self.patience.deadline_s)
-                except RigError as error:
-                    LOG.info("the camera was gone before exit: %s", error)
-            self._hang_up()
+        if self._line is not None:
+            try:
+                self._line.write(to_request("exit"), self.clock.now() + DEADLINE_S)
+            except RigError as error:
+                LOG.info("the camera was gone before exit: %s", error)
+        self._hang_up()
 
     def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
         """Send a command that may be sent twice: again, on a new connection, after a lost, late or damaged reply."""
-        with self._lock:
-            left = self.patience.retries
-            while True:
-                try:
-                    self._open()
-                    return self._once(name, argument, check)
-                except DeviceRefused:
+        left = RETRIES
+        while True:
+            try:
+                self._open()
+                return self._once(name, argument, check)
+            except DeviceRefused:
+                raise
+            except RigError as error:
+                self._hang_up()
+                if not left:
                     raise
-                except RigError as error:
-                    self._hang_up()
-                    if not left:
-                        raise
-                    left -= 1
-                    LOG.info("%s; asking again", error)
-                    self.clock.sleep(self.patience.pause_s)
+                left -= 1
+                LOG.info("%s; asking again", error)
+                self.clock.sleep(PAUSE_S)
 
     def _open(self) -> None:
         """Open a connection at its prompt, without earlier input."""
@@ -243,19 +224,19 @@ class HeadwallCamera:
         """Send one command and wait for its reply."""
         line = self._line
         assert line is not None
-        line.write(to_request(name, argument), self.clock.now() + self.patience.deadline_s)
+        line.write(to_request(name, argument), self.clock.now() + DEADLINE_S)
         return check(response_of(self._wait(line, name), name, line.port))
 
     def _wait(self, line: Transport, name: str) -> str:
         """Wait for a text with a prompt behind it."""
-        deadline = self.clock.now() + self.patience.deadline_s
+        deadline = self.clock.now() + DEADLINE_S
         while self.clock.now() < deadline:
             if texts := self._reader.feed(line.read(65536, deadline)):
                 return texts[0]
         came = self._reader.held
         found = f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
         raise DeadlinePassed(
-            f"no reply 'hpi> ' to {name} from {line.port} within {self.patience.deadline_s:g} s ({found}); is it the "
+            f"no reply 'hpi> ' to {name} from {line.port} within {DEADLINE_S:g} s ({found}); is it the "
             "camera's control port (8100), is the camera on, and not busy writing?"
         )
 
@@ -263,13 +244,6 @@ class HeadwallCamera:
         if self._line is not None:
             self._line.close()
         self._line = None
-
-    def _check_known(self, name: str) -> None:
-        if self.unknown:
-            raise StateUnknown(
-                f"{name} is refused: {self.unknown}, so whether the camera captures is not known. Look at the "
-                "camera, stop what runs there, then run again, which connects anew"
-            )
 
     def _finished(self, folder: str) -> list[RemoteFile]:
         """Return the files of a folder; RigError where a capture still runs."""

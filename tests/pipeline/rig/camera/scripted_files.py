@@ -7,8 +7,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any
 
+import pytest
+
+from pipeline.rig.camera import camera_files
 from pipeline.rig.device_settings import FileServer
 
 
@@ -72,9 +74,11 @@ class ScriptedFiles:
 
 
 @contextmanager
-def served(files: ScriptedFiles, **settings: Any) -> Iterator[FileServer]:
-    """Serve files for the block, and yield the server's address with short timeouts."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
+def served(files: ScriptedFiles) -> Iterator[FileServer]:
+    """Serve files for the block with short timeouts, and yield the server's address."""
+    with socket.create_server(("127.0.0.1", 0)) as server, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(camera_files, "STALL_S", 2.0)
+        patched.setattr(camera_files, "PAUSE_S", 0.01)
 
         def serve() -> None:
             with suppress(OSError):
@@ -84,6 +88,6 @@ def served(files: ScriptedFiles, **settings: Any) -> Iterator[FileServer]:
 
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
-        yield FileServer("127.0.0.1", server.getsockname()[1], **{"stall_s": 2.0, "pause_s": 0.01, **settings})
+        yield FileServer("127.0.0.1", server.getsockname()[1])
         server.shutdown(socket.SHUT_RDWR)
     thread.join(5)

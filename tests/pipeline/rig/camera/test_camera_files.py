@@ -69,16 +69,17 @@ def test_an_interrupted_transfer_resumes(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(camera_files, "OVERLAP", 16)
     files = ScriptedFiles({NAME: RAW}, cuts=[1000, 16, 2000, 500], refusals=2)
     kept = KeptInMemory()
-    with served(files, tries=3) as server:
+    with served(files) as server:
         fetch_files(server, [FILE], kept)
     assert bytes(kept.files[NAME]) == RAW
     assert [line[5:] for line in files.said if line.startswith("REST")] == ["984", "984", "2968", "3452"]
 
 
-def test_a_broken_transfer_is_continued_by_a_later_call() -> None:
+def test_a_broken_transfer_is_continued_by_a_later_call(monkeypatch: pytest.MonkeyPatch) -> None:
     """The message says how many bytes are kept."""
+    monkeypatch.setattr(camera_files, "TRIES", 1)
     kept = KeptInMemory()
-    with served(ScriptedFiles({NAME: RAW}, cuts=[3000], refusals=0), tries=1) as server:
+    with served(ScriptedFiles({NAME: RAW}, cuts=[3000], refusals=0)) as server:
         with pytest.raises(DeviceGone, match=rf"3000 bytes of {NAME} are kept, and a later fetch continues there"):
             fetch_files(server, [FILE], kept)
         fetch_files(server, [FILE], kept)
@@ -107,7 +108,7 @@ def test_a_different_file_of_the_same_name_is_refused() -> None:
 def test_transfer_of_other_length(size: int, kind: type[RigError], words: str) -> None:
     """A file that is longer or shorter than the server's size is not accepted as complete."""
     files = ScriptedFiles({NAME: RAW}, stated={NAME: size})
-    with served(files, tries=2) as server, pytest.raises(RigError, match=words) as caught:
+    with served(files) as server, pytest.raises(RigError, match=words) as caught:
         fetch_files(server, [RemoteFile(NAME, None, False)], KeptInMemory())
     assert type(caught.value) is kind
 
@@ -121,13 +122,14 @@ def test_refused_files_are_reported() -> None:
         with pytest.raises(DeviceRefused, match="whether the file is there"):
             fetch_files(server, [RemoteFile("/captured/none", 3, False)], KeptInMemory())
     with pytest.raises(DeviceGone, match="is not there, fell silent"):
-        fetch_files(FileServer("127.0.0.1", server.port, tries=2, pause_s=0.0), [FILE], KeptInMemory())
+        fetch_files(FileServer("127.0.0.1", server.port), [FILE], KeptInMemory(), clock=FakeClock())
 
 
-def test_other_servers_are_reported() -> None:
+def test_other_servers_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent server costs the timeout, a port that speaks no FTP is named as such, and so is a missing one."""
+    monkeypatch.setattr(camera_files, "STALL_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        server = FileServer("127.0.0.1", silent.getsockname()[1], stall_s=0.1, tries=1)
+        server = FileServer("127.0.0.1", silent.getsockname()[1])
         with pytest.raises(DeviceGone, match=r"fell silent .*timed out"):
             log_in(server)
     with pytest.raises(DeviceGone, match=r"no connection to 127.0.0.1:1 .*refused.*; is the camera on"):

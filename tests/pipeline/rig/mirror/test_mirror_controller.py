@@ -12,11 +12,10 @@ from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig import mirror_controller
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.mirror_controller import Identity, MirrorController, open_mirror
-from pipeline.rig.pro_mode import Status
 from pipeline.rig.transports import DeadlinePassed, DeviceGone, StateUnknown
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
-from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
+from tests.pipeline.rig.scripted import Pair, ScriptedTransport, scripted
 
 WRONG = pair(
     "7E 00 15 05 26 00 00 00 18 4D 59 7E",
@@ -112,25 +111,6 @@ def test_a_path_that_was_not_stored_is_not_played():
             mirror.load_path(w.PATH)
         with pytest.raises(SettingsError, match="no path is loaded"):
             mirror.run(10.0)
-
-
-def test_an_unacknowledged_motion_blocks_further_motions():
-    """The motion is sent once and later ones send no byte. Status, halting and closing still work."""
-    late = Late(1.02, bytes.fromhex(w.DONE))
-    script = [*w.CONNECT, w.HALT, w.LOAD, w.READ_BACK, w.WELL, (bytes.fromhex(w.GOTO), [late]), w.WELL, w.HALT]
-    with scripted(script) as transport:
-        mirror = connected(transport)
-        mirror.load_path(w.PATH)
-        with pytest.raises(StateUnknown, match=r"going to 0.5; -0.25 was sent to scripted and may have happened"):
-            mirror.goto(0.5, -0.25)
-        with pytest.raises(StateUnknown, match="going to 0; 0 is refused"):
-            mirror.goto(0, 0)
-        with pytest.raises(StateUnknown, match="running a path is refused"):
-            mirror.run(10.0)
-        assert mirror.status() == Status(0)
-        mirror.halt()
-        mirror.close()
-        assert transport.closed
 
 
 def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import wire_positions
-from pipeline.rig.device_settings import Patience
 from pipeline.rig.fakes import FakeClock
 from pipeline.rig.mirror_controller import ProLink, frames_to_check, upload
 from pipeline.rig.pro_mode import Command, Frame, FrameReader, encode
@@ -103,7 +102,7 @@ class Memory:
 
 def link(memory: Memory) -> ProLink:
     """Return pro mode over the memory."""
-    return ProLink(Wire(memory, memory.clock, Patience()))
+    return ProLink(Wire(memory, memory.clock))
 
 
 def path(count: int) -> bytes:
