@@ -158,8 +158,8 @@ class OpenedRun:
     def ground_map(self) -> xarray.Dataset:
         """Images on the ground of a survey with a ``[pose]``; their CRS is in ``spatial_ref``.
 
-        They are ``classes``, ``confidence`` and ``picture``. A later visit also has ``changed`` (fraction of the
-        patch) and ``changed_from`` (previous class, 255 where unchanged).
+        They are ``classes``, ``confidence`` and ``picture``. A later visit also has ``changed_from``
+        (previous class, 255 where unchanged).
         """
         return self.dataset("ground_map")
 

@@ -187,7 +187,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     return [
         image_layer(run, product, "classes", "class_map", "Class map", nodata=UNLABELLED, legend=legend, band="class"),
         image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),
-        patch_layer(run, "attention", "score", "attention", "Expected gain of a fine pass, by patch"),
+        _gain_layer(run),
         _picture(run),
     ]
 
@@ -233,9 +233,9 @@ def image_layer(
     return Layer(name, title, roles, image, stored.rows, unit)
 
 
-def patch_layer(run: ExportedRun, product: str, array: str, name: str, title: str) -> Layer:
-    """Return an image with one pixel a patch, on the grid of the class map."""
-    stored = open_image(run.path(product), array)
+def _gain_layer(run: ExportedRun) -> Layer:
+    """Return the expected gain with one pixel a patch, on the grid of the class map."""
+    stored = open_image(run.path("attention"), "score")
     class_map = run.store("class_map")
     assert class_map is not None
     patch = int(run.archive.manifest(class_map)["params"]["grid"]["patch"])
@@ -245,11 +245,10 @@ def patch_layer(run: ExportedRun, product: str, array: str, name: str, title: st
     shape = (stored.shape[0], stored.shape[1])
     fine = load_geobox(run.path("class_map"))
     geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
-    policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
-    tags = {**layer_tags(run, product, geobox), **policy, "patch_px": str(patch)}
-    return Layer(
-        name, title, ("data",), CogImage(geobox, stored.dtype.name, (array,), np.nan, tags=tags), stored.rows, "1"
-    )
+    policy = str(stored.about.get("policy", ""))
+    tags = {**layer_tags(run, "attention", geobox), "policy": policy, "patch_px": str(patch)}
+    image = CogImage(geobox, stored.dtype.name, ("score",), np.nan, tags=tags)
+    return Layer("attention", "Expected gain of a fine pass, by patch", ("data",), image, stored.rows, "1")
 
 
 def _picture(run: ExportedRun) -> Layer:
@@ -270,16 +269,10 @@ def _picture(run: ExportedRun) -> Layer:
 
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return what a prior map adds: changes, and earlier classes."""
+    """Return what a prior map adds: the previous classes of changed pixels."""
     product = "ground_map" if run.map_product == "ground_map" else PROBABILITIES
     if run.store(product) is None or OLD_CLASS not in (group := open_group(run.path(product))):
         return []
-    make = image_layer if product == "ground_map" else patch_layer
-    changed = make(
-        run, product, "changed", "changed", "Fraction of the patch's pixels with another class than in the prior map"
-    )
     title = "Class of the prior map, where the map is sure of another one"
-    old = image_layer(
-        run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend_of(group), band="class"
-    )
-    return [replace(changed, unit="1"), old]
+    legend = legend_of(group)
+    return [image_layer(run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend, band="class")]

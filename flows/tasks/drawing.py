@@ -26,7 +26,6 @@ from models.reading.prior_map import (
     PriorMap,
     TemporalAgreement,
     as_captured,
-    changed_fractions,
     changed_from,
     compare,
     first_probabilities,
@@ -204,7 +203,8 @@ class FullReading:
         before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
         other = (classes != before) & (classes != UNLABELLED)
         changed = np.zeros(gain.shape, np.float32)
-        changed[patch_index] = changed_fractions(other, region.grid).ravel()[patch_index]
+        fractions = patch_pixels(region.grid, other).mean(axis=(1, 2)) / region.grid.valid_fraction().ravel()
+        changed[patch_index] = fractions[patch_index]
         return FullReading(region.crop_patches(gain), region.crop_patches(read), region.crop_patches(changed))
 
 

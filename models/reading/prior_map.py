@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from models.evaluation.expected_scores import expected_counts
 from models.evaluation.metrics import confusion, overall_accuracy
 from models.network.sizes import CELL_PX
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
+from pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -326,9 +326,3 @@ def changed_from(prior_map: PriorMap, after: ClassProbabilities) -> NDArray[np.u
     new, new_sure = likeliest(after.log_probability)
     sure = np.minimum(old_sure, new_sure) > math.log(CERTAIN)  # NaN is not
     return np.where(sure & (old != new) & (after.age_days == 0), old, UNLABELLED).astype(np.uint8)
-
-
-def changed_fractions(changed: NDArray[np.bool_], grid: SceneGrid) -> Floats:
-    """Return the fraction of each patch's pixels on the scene that changed, (patch_y, patch_x), from (y, x)."""
-    fractions = patch_pixels(grid, changed).mean(axis=(1, 2)).reshape(grid.patch_shape)
-    return np.asarray(fractions / grid.valid_fraction(), np.float32)

@@ -222,14 +222,11 @@ def map_blocks(shape: tuple[int, int], block: tuple[int, int]) -> Iterator[tuple
     return ((rows, columns) for rows in cuts(shape[0], block[0]) for columns in cuts(shape[1], block[1]))
 
 
-def nearest_at(image: NDArray[Pixel], pixels: Floats, nothing: float, *, factor: int = 1) -> NDArray[Pixel]:
-    """Return the pixels of an image (y, x), ``factor`` scene px wide, at scene places (row, column, 2).
-
-    ``nothing`` where the place is NaN.
-    """
+def nearest_at(image: NDArray[Pixel], pixels: Floats, nothing: float) -> NDArray[Pixel]:
+    """Return the pixels of an image (y, x) at scene places (row, column, 2); ``nothing`` where the place is NaN."""
     known: NDArray[np.bool_] = np.all(np.isfinite(pixels), axis=-1)
     last = np.array(image.shape) - 1
-    index = np.clip(np.floor((np.where(known[..., None], pixels, 0) + 0.5) / factor).astype(np.intp), 0, last)
+    index = np.clip(np.floor(np.where(known[..., None], pixels, 0) + 0.5).astype(np.intp), 0, last)
     return np.where(known, image[index[..., 0], index[..., 1]], image.dtype.type(nothing))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import zarr
@@ -30,7 +30,6 @@ from storage.arrays.layout import (
     read_array,
     tile_place,
     write_counts,
-    write_image,
 )
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
@@ -42,7 +41,6 @@ LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in
 # values of the images in unknown pixels
 NOT_BELIEVED = {"log_probability": NOTHING, "age": np.nan, "light": 0}
 OLD_CLASS = "changed_from"
-CHANGED = {"long_name": "fraction of the patch's pixels with another class than remembered", "units": "1"}
 Floats = NDArray[np.float32]
 
 
@@ -201,19 +199,6 @@ def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[n
     array_of(open_group(path, "r+"), OLD_CLASS)[tile_place(origin, old_class.shape)] = old_class
 
 
-def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
-    """Add the fraction of changed pixels of each patch (patch_y, patch_x) of ``patch_px`` to class probabilities."""
-    write_image(open_group(path, "r+"), "changed", ("patch_y", "patch_x"), changed, {**CHANGED, "patch_px": patch_px})
-
-
-class Changes(NamedTuple):
-    """Changes since the prior map."""
-
-    fraction: Floats  # (patch_y, patch_x) fraction of each patch's pixels that changed
-    patch_px: int
-    old_class: NDArray[np.uint8]  # (y, x) previous class where it changed, else 255
-
-
 class ProbabilityStore:
     """Stored class probabilities, read in parts.
 
@@ -248,11 +233,3 @@ class ProbabilityStore:
     def old_class(self) -> NDArray[np.uint8] | None:
         """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""
         return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
-
-    def changes(self) -> Changes | None:
-        """Return what changed since the prior map; None for a first visit."""
-        old_class = self.old_class()
-        if old_class is None or "changed" not in self._group:
-            return None
-        patch_px = int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
-        return Changes(read_array(self._group, "changed"), patch_px, old_class)

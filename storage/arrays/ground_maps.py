@@ -15,7 +15,6 @@ from odc.geo.geobox import GeoBox
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_places import M2_PER_HECTARE
 from storage.arrays.class_maps import (
-    CHANGED,
     CONFIDENCE,
     OLD_CLASS,
     ClassNames,
@@ -93,7 +92,7 @@ class GroundMapWriter:
     def __init__(
         self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any], goes_on: bool = False
     ) -> None:
-        """Create a map; one of a later visit (``goes_on``) also has images of the changes."""
+        """Create a map; one of a later visit (``goes_on``) also has the previous classes."""
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         facts = {**place, **names, **about}
@@ -105,7 +104,7 @@ class GroundMapWriter:
             PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
         }
         if goes_on:
-            images |= {"changed": ("<f4", CHANGED), OLD_CLASS: ("|u1", old_class_flags(legend))}
+            images[OLD_CLASS] = ("|u1", old_class_flags(legend))
         self._images: dict[str, zarr.Array[Any]] = {}
         for name, (kind, attributes) in images.items():
             rest = {"rgb": 3} if name == PICTURE else {}

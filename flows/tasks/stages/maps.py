@@ -15,7 +15,7 @@ from flows.tasks.field_work import region_params
 from flows.tasks.prior_maps import PRIOR_FIGURES, Prior
 from flows.tasks.stage import Product, Report, Wanted, stage
 from flows.tasks.stages.attention import READING, PatchGains
-from models.reading.prior_map import TemporalAgreement, changed_fractions
+from models.reading.prior_map import TemporalAgreement
 from models.weights.files import ReaderPart
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import PosedField, areas_by_number
@@ -30,7 +30,6 @@ from storage.arrays.class_maps import (
     create_class_map,
     create_probabilities,
     load_class_map,
-    write_changes,
 )
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import NO_CLASS, blank_pixels
@@ -98,16 +97,14 @@ def create_maps(path: Path, gains: PatchGains, *, goes_on: bool) -> tuple[str, .
 
 
 def finish_maps(path: Path, gains: PatchGains, *, compared: bool) -> None:
-    """Blank nodata and pixels outside of zones, and write the fraction of each patch that changed."""
-    probabilities = path / PROBABILITIES
+    """Blank nodata and pixels outside of zones."""
     if gains.frame.missing is not None:
         blank_pixels(path / MAP, gains.frame.missing, NO_CLASS)
-        blank_pixels(probabilities, gains.frame.missing, NOT_BELIEVED | ({OLD_CLASS: UNLABELLED} if compared else {}))
+        blank_pixels(
+            path / PROBABILITIES, gains.frame.missing, NOT_BELIEVED | ({OLD_CLASS: UNLABELLED} if compared else {})
+        )
     if gains.zones.left_out is not None:
         blank_pixels(path / MAP, gains.zones.left_out, NO_CLASS)
-    if (old_class := ProbabilityStore(probabilities).old_class()) is not None:
-        grid = gains.frame.grid
-        write_changes(probabilities, changed_fractions(old_class != UNLABELLED, grid), grid.patch)
 
 
 def attention_of(reading: FullReading, policy: str) -> Attention:
@@ -155,8 +152,8 @@ def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, re
 
     def build(path: Path) -> None:
         """Write the map in blocks, then the area of each class."""
-        found = load_class_map(class_map.path / "class_map.zarr")
-        changes = ProbabilityStore(class_map.path / "class_probabilities.zarr").changes()
+        found = load_class_map(class_map.path / MAP)
+        old_class = ProbabilityStore(class_map.path / PROBABILITIES).old_class()
         colours = colours_of(mosaic)
         unsure = np.isnan(found.confidence)
 
@@ -172,9 +169,8 @@ def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, re
                 "confidence": confidence,
                 "picture": np.nan_to_num(np.rint(image_at(colours, pixels))).astype(np.uint8),
             }
-            if changes is not None:
-                images["changed"] = nearest_at(changes.fraction, pixels, np.nan, factor=changes.patch_px)
-                images[OLD_CLASS] = nearest_at(changes.old_class, pixels, UNLABELLED)
+            if old_class is not None:
+                images[OLD_CLASS] = nearest_at(old_class, pixels, UNLABELLED)
             return images
 
         writer = GroundMapWriter(
@@ -182,7 +178,7 @@ def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, re
             ground_grid.geobox,
             ClassNames(found.names, found.colours),
             about={"rig_pose": asdict(ground_grid.frame.view.pose), "scene_pixels": ground_grid.counts()},
-            goes_on=changes is not None,
+            goes_on=old_class is not None,
         )
         for rows, columns in map_blocks(ground_grid.shape, BLOCK):
             writer.write_block(rows, columns, shown(ground_grid.scene_pixels(rows, columns)))

@@ -62,13 +62,6 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
         class_maps.write_probabilities_tile(path, (top, 0), packed, age_days[rows], np.ones(SHAPE, np.float32)[rows])
         if old_class is not None:
             class_maps.write_changes_tile(path, (top, 0), old_class[rows])
-    if old_class is not None:
-        class_maps.write_changes(path, patch_fractions(old_class), 8)
-
-
-def patch_fractions(old_class: np.ndarray) -> np.ndarray:
-    """Return (15, 20) fractions of changed pixels in patches of 8 px."""
-    return (old_class != UNLABELLED).reshape(15, 8, 20, 8).mean(axis=(1, 3), dtype=np.float32)
 
 
 @pytest.fixture
@@ -137,17 +130,15 @@ def field_pixels(run: Run, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarr
 
 
 def test_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, tmp_path: Path) -> None:
-    """Changed fraction and old class are not interpolated; outside of the field they are nodata."""
+    """Old classes are not interpolated; outside of the field they are nodata."""
     rng = np.random.default_rng(3)
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
     write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
     believe(tmp_path / "later", np.zeros(SHAPE, np.float32), old.astype(np.uint8))
     ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
-    changed, old_class = (image(ref, name) for name in ("changed", "changed_from"))
-    seen, (row, column) = field_pixels(run, changed.shape)
+    old_class = image(ref, "changed_from")
+    seen, (row, column) = field_pixels(run, old_class.shape)
     np.testing.assert_array_equal(old_class[seen], old[row, column])
-    np.testing.assert_array_equal(changed[seen], patch_fractions(old)[row // 8, column // 8])
-    assert np.isnan(changed[~seen]).all()
     assert (old_class[~seen] == UNLABELLED).all()
 
 
@@ -155,7 +146,7 @@ def test_a_first_visit_has_no_changes(run: Run, stores: Stores) -> None:
     """The store has no variable for changes."""
     ref = draw(run, stores)
     with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
-        assert not {"changed", "changed_from"} & set(content)
+        assert "changed_from" not in content
 
 
 def test_the_store_has_areas_pose_and_crs(run: Run, stores: Stores) -> None:

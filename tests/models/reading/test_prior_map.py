@@ -16,7 +16,6 @@ import models.reading.prior_map as prior_map
 from models.network.sizes import CELL_PX, TemporalSizes
 from models.network.temporal_reader import TemporalReader
 from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, carried, first_probabilities, fuse
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
 
 CLASSES, COLUMNS = 3, 4
 SHAPE = (24, 20)
@@ -237,8 +236,7 @@ def test_a_harvest_overnight_is_detected() -> None:
     assert not after.classes()[0].any()
     found = prior_map.compare(memory, today, after, np.s_[:, :])
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
-    fractions = prior_map.changed_fractions(prior_map.changed_from(memory, after) != UNLABELLED, SceneGrid(*SHAPE, 5))
-    np.testing.assert_array_equal(fractions, np.float32(0.4))
+    np.testing.assert_array_equal(prior_map.changed_from(memory, after), np.where(rows == 1, 1, 255))
 
 
 def two_maps(seed: int, truth: tuple[NDArray[np.int64], ...], noise: float) -> prior_map.TemporalAgreement:
@@ -281,8 +279,8 @@ def test_change_is_reported_beyond_expected_differences() -> None:
     assert found.beyond.sum() == found.beyond[0, 1]
 
 
-def test_changed_fraction_counts_confident_pixels_only() -> None:
-    """In one patch 8 of 64 pixels changed; in the next as many are unsure and do not count."""
+def test_only_confident_pixels_change() -> None:
+    """8 pixels changed; as many beside them are unsure and do not count."""
     sure, other, unsure = np.log(np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1]], np.float32))
     before = np.tile(sure, (8, 16, 1))
     now = before.copy()
@@ -290,7 +288,6 @@ def test_changed_fraction_counts_confident_pixels_only() -> None:
     memory = PriorMap(ClassProbabilities(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
     old = prior_map.changed_from(memory, ClassProbabilities(now, *np.zeros((2, 8, 16), np.float32)))
     np.testing.assert_array_equal(old, np.where(now.argmax(axis=-1) == 1, np.where(np.arange(16) < 8, 0, 255), 255))
-    np.testing.assert_array_equal(prior_map.changed_fractions(old != UNLABELLED, SceneGrid(8, 16, 8)), [[0.125, 0.0]])
 
 
 def test_only_captured_pixels_change() -> None:
@@ -300,11 +297,6 @@ def test_only_captured_pixels_change() -> None:
     seen = np.random.default_rng(3).random(SHAPE) < 0.5
     aged = replace(after, age_days=np.where(seen, 0, 7).astype(np.float32))
     np.testing.assert_array_equal(prior_map.changed_from(PriorMap(before, None, 7.0), aged) == 0, seen)
-
-
-def test_a_patch_over_the_border_counts_its_pixels_on_the_scene() -> None:
-    """A field of 20 x 20 px that changed everywhere has a changed fraction of 1 in all four patches of 16 px."""
-    assert (prior_map.changed_fractions(np.ones((20, 20), np.bool_), SceneGrid(20, 20, 16)) == 1).all()
 
 
 @READERS

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 from pyproj import Proj
 
@@ -108,20 +106,6 @@ def test_the_nearest_pixel_is_read():
     classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
     places = np.array([[[-0.5, -0.5], [0.49, 0.51], [2.5, 3.5], [np.nan, 1.0]]])
     assert map_grid.nearest_at(classes, places, UNLABELLED).tolist() == [[0, 1, 11, UNLABELLED]]
-
-
-@given(seed=st.integers(0, 2**16), factor=st.integers(1, 9), rows=st.integers(1, 20), columns=st.integers(1, 20))
-def test_a_patch_is_read_at_each_of_its_pixels(seed: int, factor: int, rows: int, columns: int):
-    """The result equals that of patches repeated into pixels, also where the last patches reach beyond the scene."""
-    rng = np.random.default_rng(seed)
-    patch_index = rng.random((-(-rows // factor), -(-columns // factor))).astype(np.float32)
-    places = rng.uniform(-0.5, [rows - 0.5, columns - 0.5], (5, 4, 2))
-    places[0, 0] = np.nan
-    fine = patch_index.repeat(factor, axis=0).repeat(factor, axis=1)[:rows, :columns]
-    found = map_grid.nearest_at(patch_index, places, np.nan, factor=factor)
-    np.testing.assert_array_equal(found, map_grid.nearest_at(fine, places, np.nan))
-    assert found.dtype == np.float32
-    assert np.isnan(found[0, 0])
 
 
 def test_images_are_interpolated_between_pixels():

@@ -43,12 +43,10 @@ def block(shape: tuple[int, int], *, goes_on: bool = False) -> dict[str, np.ndar
     """Return images with some pixels unclassified: classes, confidence, picture; for a later visit changes too."""
     rng = np.random.default_rng(0)
     classes, old = rng.choice(np.array([0, 1, UNLABELLED], np.uint8), (2, *shape))
-    confidence, changed = (
-        np.where(classes == UNLABELLED, np.nan, rng.random(shape)).astype(np.float32) for _ in range(2)
-    )
+    confidence = np.where(classes == UNLABELLED, np.nan, rng.random(shape)).astype(np.float32)
     picture = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
     images = {"classes": classes, "confidence": confidence, "picture": picture}
-    return images | {"changed": changed, "changed_from": old} if goes_on else images
+    return images | {"changed_from": old} if goes_on else images
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
@@ -64,7 +62,7 @@ def test_a_map_written_in_blocks_round_trips(tmp_path: Path, goes_on: bool) -> N
     group = open_group(tmp_path / "a.zarr")
     for name, image in whole.items():
         np.testing.assert_array_equal(read_array(group, name), image)
-    assert ("changed" in group, "changed_from" in group) == (goes_on, goes_on)
+    assert ("changed_from" in group) == goes_on
     np.testing.assert_array_equal(found.classes, whole["classes"])
     np.testing.assert_array_equal(found.picture, whole["picture"])
     assert found.legend.names == LEGEND.names
@@ -95,10 +93,7 @@ def test_xarray_reads_flags_areas_and_grid_of_a_map(tmp_path: Path) -> None:
         assert set(content.attrs["areas"]) == set(LEGEND.names)
         assert (content.classes[64:].values == content.classes.attrs["nodata"]).all()
         assert np.isnan(content.confidence[64:].values).all()
-        np.testing.assert_array_equal(content.changed[:64].values, images["changed"])
-        assert np.isnan(content.changed[64:].values).all()
-        assert content.changed.attrs["units"] == "1"
-        assert content.changed.odc.geobox == content.classes.odc.geobox
+        assert content.changed_from.odc.geobox == content.classes.odc.geobox
         assert content.changed_from.attrs["flag_meanings"] == "sugar_beet bare_soil"
         assert (content.changed_from[64:].values == 255).all()
 

@@ -100,17 +100,6 @@ def test_xarray_unpacks_probabilities(tmp_path: Path) -> None:
     np.testing.assert_allclose(opened.age.values[3:].astype(float), ages[3:], rtol=1e-6)
 
 
-def test_changes_are_none_until_they_are_written(tmp_path: Path) -> None:
-    """A first visit has no changes; a later one has them after `write_changes`."""
-    assert class_maps.ProbabilityStore(stored(tmp_path / "first.zarr")).changes() is None
-    path, old = gone_on(tmp_path / "later.zarr")
-    assert class_maps.ProbabilityStore(path).changes() is None
-    class_maps.write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
-    found = class_maps.ProbabilityStore(path).changes()
-    assert (found.fraction.tolist(), found.patch_px) == ([[0.0, 0.5]], 16)
-    np.testing.assert_array_equal(found.old_class, old)
-
-
 def gone_on(path: Path) -> tuple[Path, np.ndarray]:
     """Store probabilities that continue an earlier visit; return their path and the pixels' old classes."""
     old = np.random.default_rng(1).choice(np.array([0, 2, 255], np.uint8), SHAPE)
