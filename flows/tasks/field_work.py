@@ -213,7 +213,7 @@ class FieldWork:
         found = self._joined(
             self._of_regions(Scoring(self.weights, mosaic, capture, policy), mosaic, NO_PATCHES, report)
         )
-        return _field_gain(found) if policy == GAIN else found
+        return gain_of(found[..., 0, :], found[..., 1, :].sum(axis=(0, 1))) if policy == GAIN else found
 
     def expected_errors(self, mosaic: StageRef, capture: LineSpec, report: Report) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
@@ -271,8 +271,3 @@ class FieldWork:
             )
         fits = (self.memory - RESERVED_BYTES) // each
         return self.pool if fits >= self.pool.count else WorkerPool(self.pool.scheduler, fits)
-
-
-def _field_gain(errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gain of all patches of a field, (patch_y, patch_x), by their `class_errors`."""
-    return gain_of(errors[..., 0, :], errors[..., 1, :].sum(axis=(0, 1)))

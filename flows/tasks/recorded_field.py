@@ -12,13 +12,12 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 
 from flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
-from flows.tasks.scene import FieldSource
+from flows.tasks.scene import FieldSource, unlit_scene
 from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.capture.straight_scans import EDGE_PX, covered_field
 from pipeline.errors import SceneError, SettingsError
-from pipeline.once import Once
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
 from storage.archive.keys import stage_key
 from storage.readers.recordings import RecordedWith, Recording, find_recorded_run, open_recording
@@ -62,18 +61,14 @@ class OpenedRecording:
         notes: tuple[str, ...] = ()
         if self.settings.labels is not None:
             found, notes = load_field_labels(self.settings.labels, (height, width))
-        scene = RasterScene(
+        scene = unlit_scene(
+            (height, width),
+            self.recording.wavelength_nm,
+            white_e=self.settings.camera.full_scale_e,
+            labels=None if found is None else found.index,
             name=self.settings.name or (Path(str(self.settings.sweeps).rstrip("/")).stem or RECORDED),
             key=f"{RECORDED}/{stage_key(RECORDED, 1, self.field.content, [])}/{width}x{height}",
-            raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), None if found is None else found.index),
-            light=Once.of(
-                SceneRadiance(
-                    np.zeros((1, len(self.recording.wavelength_nm)), np.float32),
-                    np.full(len(self.recording.wavelength_nm), self.settings.camera.full_scale_e, np.float32),
-                )
-            ),
             white_reference=self.recording.sweeps[0].references.white_reference,
-            wavelength_nm=self.recording.wavelength_nm,
             fwhm_nm=self.recording.fwhm_nm,
             class_names=() if found is None else found.names,
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,

@@ -130,16 +130,15 @@ def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...
     )
     missing = file.missing if file.missing.any() else None
     labels = file.labels
-    bands = len(file.wavelength_nm)
     if labels is not None and missing is not None:
         labels = np.where(missing, np.uint8(UNLABELLED), labels)
-    scene = RasterScene(
+    scene = unlit_scene(
+        file.shape,
+        file.wavelength_nm,
+        labels=labels,
         name=file.name,
         key=file.light_hash,
-        raster=SceneRaster.of(np.broadcast_to(np.float32(0), (*file.shape, 1)), labels),
-        light=Once.of(SceneRadiance(np.zeros((1, bands), np.float32), np.ones(bands, np.float32))),
-        white_reference=np.ones(bands, np.float32),
-        wavelength_nm=file.wavelength_nm,
+        white_reference=np.ones(len(file.wavelength_nm), np.float32),
         fwhm_nm=file.fwhm_nm,
         class_names=file.class_names,
         class_colours=file.class_colours,
@@ -176,17 +175,29 @@ def _field_before_rig(settings: Settings) -> RasterScene:
     assert settings.size is not None
     assert settings.wavelengths is not None
     width, height = settings.size
-    bands = len(settings.wavelengths)
-    return RasterScene(
+    return unlit_scene(
+        (height, width),
+        np.array(settings.wavelengths, np.float64),
+        white_e=settings.camera.full_scale_e,
         name=settings.name or RIG_FIELD,
         key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
-        raster=SceneRaster.of(np.zeros((height, width, 1), np.float32)),
-        light=Once.of(
-            SceneRadiance(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_scale_e, np.float32))
-        ),
-        white_reference=np.full(bands, settings.rig.white_reference, np.float32),
-        wavelength_nm=np.array(settings.wavelengths, np.float64),
+        white_reference=np.full(len(settings.wavelengths), settings.rig.white_reference, np.float32),
     )
+
+
+def unlit_scene(
+    shape: tuple[int, int],
+    wavelength_nm: NDArray[np.float64],
+    *,
+    white_e: float = 1.0,
+    labels: NDArray[np.uint8] | None = None,
+    **more: Any,
+) -> RasterScene:
+    """Return a scene of (y, x) pixels without light, whose white reference gives ``white_e`` electrons a band."""
+    bands = len(wavelength_nm)
+    light = SceneRadiance(np.zeros((1, bands), np.float32), np.full(bands, white_e, np.float32))
+    raster = SceneRaster.of(np.broadcast_to(np.float32(0), (*shape, 1)), labels)
+    return RasterScene(raster=raster, light=Once.of(light), wavelength_nm=wavelength_nm, **more)
 
 
 def farm_refusal(settings: Settings) -> str | None:

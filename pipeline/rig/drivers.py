@@ -156,9 +156,7 @@ Factory = Callable[[SurveyRig, Clock], Any]
 _PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver": CameraDriver}
 
 
-def open_devices(
-    rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK, seen: SimulatedSource | None = None
-) -> RigDevices:
+def open_devices(rig: SurveyRig, vector_pairs: int, seen: SimulatedSource | None = None) -> RigDevices:
     """Connect to mirror and camera. Nothing moves. ``seen`` is the scene before a fake camera.
 
     Raises
@@ -168,8 +166,7 @@ def open_devices(
     DeadlinePassed : nothing answers.
     RigError : another device answers.
     """
-    if rig.mirror_driver == rig.camera_driver == FAKE:
-        clock = FakeClock()
+    clock = FakeClock() if rig.mirror_driver == rig.camera_driver == FAKE else SYSTEM_CLOCK
     with ExitStack() as opened:
         mirror = open_mirror_driver(rig, vector_pairs, clock)
         opened.callback(mirror.close)

@@ -42,7 +42,6 @@ KNOWN_MODEL = "MR"  # begins the ids of documented controllers
 _POLL_S = 0.01
 
 END = b"\r\n"
-MOST_LINE = 64  # bytes, with the end
 START = "START"
 ID, VERSION, SERIAL = "GETID", "GETVERSION", "GETSN"
 GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"

@@ -16,7 +16,7 @@ from odc.geo.geobox import GeoBox
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from storage.readers.open_cubes import open_labels
+from storage.readers.open_cubes import open_cube
 from storage.readers.scene_toml import ClassValue, Colour
 
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
@@ -134,7 +134,7 @@ def load_codes(
     and the value of an image with equal channels. Raises SceneError: the file cannot be read, holds fractions, or lies
     beside the geobox.
     """
-    source = open_labels(address, by_number=by_number)
+    source = open_cube(address, labels=True, by_number=by_number)
     codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address, by_number=by_number)
     notes: list[str] = []
     if source.nodata is not None and source.nodata.is_integer():

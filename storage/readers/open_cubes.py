@@ -73,12 +73,13 @@ def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image
     return "envi" if of_envi else "none"
 
 
-def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
+def open_cube(address: str | Path, *, labels: bool = False, by_number: bool = False) -> CubeSource:
     """Open a cube; only headers, and coordinates of arrays, are read.
 
     ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
-    averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred. Raises
-    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
+    averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred;
+    ``by_number`` keeps the numbers of a palette. Raises SceneError: there is no such file, it is damaged, or its kind
+    or shape cannot be used.
     """
     path, variable = split_variable(address)
     match reader_of(address):
@@ -89,7 +90,7 @@ def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
         case "envi":
             source = open_envi_source(path, scaled=not labels)
         case "image":
-            source = open_image(path, scaled=not labels)
+            source = open_image(path, scaled=not labels, palette=by_number)
         case "array":
             source = _open_arrays(path, variable, labels=labels)
             if path.suffix.lower() in ARRAY_ENDINGS and source.shape[2] == 1 and not labels and min(source.shape):
@@ -137,17 +138,9 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         return source
 
 
-def open_labels(address: str | Path, *, by_number: bool = False) -> CubeSource:
-    """Open a file of labels or a mask without its scale; ``by_number`` keeps the numbers of a palette (SceneError)."""
-    path, _ = split_variable(address)
-    if reader_of(address) == "image":
-        return open_image(path, scaled=False, palette=by_number)
-    return open_cube(address, labels=True)
-
-
 def load_labels_array(address: str | Path) -> NDArray[Any]:
     """Read a file of labels or a mask without its scale, (y, x, band) (SceneError)."""
-    source = open_labels(address)
+    source = open_cube(address, labels=True)
     return source.read(0, source.shape[0])
 
 
