@@ -84,7 +84,7 @@ def test_mutated_files_give_a_cube_or_one_error() -> None:
     assert [line for tally in found for line in tally.wrong] == []
     assert min(tally.read + tally.refused for tally in found) == 8
     assert sum(tally.refused for tally in found) > 20
-    assert sum(tally.read for tally in found) > 20
+    assert sum(tally.read for tally in found) > 10
 
 
 def test_the_checks_find_damage(subject: Subject) -> None:

@@ -143,8 +143,9 @@ def test_the_container_copies_every_package() -> None:
     (asked,) = re.findall(r"^CMD (\[.*\])$", text, re.MULTILINE)
     (visits,) = re.findall(r"^SURVEY \?= (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     first = tomllib.loads((ROOT / visits.split()[0]).read_text(encoding="utf-8"))
-    words = ["survey", "--scene", first.pop("scene"), "--seconds", f"{first.pop('seconds')}", "--out", "/archive"]
-    assert (json.loads(asked), first) == (words, {})
+    words = ["survey", "--scene", first.pop("scene"), "--seconds", f"{first.pop('seconds')}"]
+    words += ["--controls", "--out", "/archive"]
+    assert (json.loads(asked), first) == (words, {"controls": True})
     build_app(listed=False).parse_args(words, exit_on_error=False, print_error=False)
 
 
