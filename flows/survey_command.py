@@ -49,7 +49,7 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
             run = _survey(settings, console)
     if run.stopped is not None:
         raise run.stopped
-    published = Published(load_receipt(run.folder), run.folder, run.captured_again)
+    published = Published(load_receipt(run.folder), run.folder)
     if summary:
         show_published(published, settings.out, console, verbose=verbose)
     return published

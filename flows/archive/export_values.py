@@ -13,7 +13,6 @@ import numpy as np
 from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
-from flows.publish.receipt import hectares_of_classes
 from models.evaluation.metrics import stratified_fractions
 from pipeline.errors import SettingsError
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
@@ -50,7 +49,7 @@ def write_areas(run: ExportedRun, path: Path) -> None:
         sure_pixels += np.bincount(classes[known], minlength=256)
     confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
     pixels = counts[: len(names)]
-    areas = hectares_of_classes(run.receipt)
+    areas = (run.receipt.get("areas") or {}).get("ha")
     hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
     fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     unknown = np.full(len(names), np.nan)

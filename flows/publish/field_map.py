@@ -47,7 +47,6 @@ class FieldMap:
     size: tuple[int, int]
     layers: Sequence[MapLayer]
     classes: Sequence[dict[str, str]]
-    errors: str | None = None  # data address of the errors against the labels; None without labels
 
     @property
     def data(self) -> dict[str, Any]:
@@ -55,26 +54,16 @@ class FieldMap:
         return {"size": list(self.size), "layers": [asdict(layer) for layer in self.layers]}
 
 
-@dataclass(frozen=True)
-class PriorMapField:
-    """The class map of an earlier run."""
-
-    days: float  # between that capture and this one
-    classes: Bytes  # (y, x) of that run's map, by the class numbers of this run; 255 for other classes
-
-
-def prior_map(prior: Prior | None) -> PriorMapField | None:
-    """Return the image of the prior map; None without one."""
-    if prior is None:
-        return None
+def prior_classes(prior: Prior) -> Bytes:
+    """Return the (y, x) class map of an earlier run by the class numbers of this run; 255 for other classes."""
     earlier = np.array(prior.classes)
     names = np.full(256, UNLABELLED, np.uint8)
     names[earlier[earlier >= 0]] = np.flatnonzero(earlier >= 0)
     before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
-    return PriorMapField(prior.days, names[before])
+    return np.asarray(names[before])
 
 
-def field_map(shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
+def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
     """Return the map of a run from the data of its quicklook and the prior map."""
     thin = thinned(shown.class_map)
     palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
@@ -87,13 +76,12 @@ def field_map(shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
     layers = [MapLayer(shown.caption.capitalize(), data_address(webp(picture, quality=QUALITY)), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
     layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence)))
-    errors = None
     if shown.truth is not None:
         layers.append(MapLayer("Truth", classes(shown.truth)))
         errors = error_address(shown.class_map[thin], shown.truth[thin])
         layers.append(MapLayer("Errors: map and truth differ", errors, opacity=0.8))
-    if before is not None:
-        layers.append(MapLayer(f"Before: {format_days(before.days)}", classes(before.classes)))
+    if prior is not None:
+        layers.append(MapLayer(f"Before: {format_days(prior.days)}", classes(prior_classes(prior))))
     if shown.was is not None:
         differs = (shown.was[thin] != UNLABELLED).astype(np.uint8)
         table = np.array([(0, 0, 0, 0), (*DIFFERS_RGB, 255)], np.uint8)
@@ -108,7 +96,7 @@ def field_map(shown: QuicklookData, before: PriorMapField | None) -> FieldMap:
         for name, fraction, colour in zip((*shown.class_names, NO_CLASS), covered, palette, strict=False)
         if fraction
     ]
-    return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows, errors)
+    return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows)
 
 
 def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -> str:

@@ -34,7 +34,7 @@ def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
     if not (survey.run.plan.plain or plan.sweeps):
         survey.observer.note(f"no second pass: {plan.reason}")
     _show_artifact(survey, published)
-    return RunRef(f"runs/{published.folder.name}", published.folder, published.captured_again)
+    return RunRef(f"runs/{published.folder.name}", published.folder)
 
 
 def clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
@@ -84,7 +84,7 @@ def _show_artifact(survey: OpenSurvey, published: Published) -> None:
         text = render_markdown(
             "survey.md",
             survey=published.receipt["survey"],
-            headline=headline(published.receipt, published.captured_again),
+            headline=headline(published.receipt),
             picture=base64.b64encode(small_jpeg((published.folder / "quicklook.png").read_bytes())).decode("ascii"),
             findings=[f"{name}: {text}" for name, text in finding_rows(published.receipt)],
             where=where,

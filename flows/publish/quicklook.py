@@ -31,7 +31,7 @@ class QuicklookData:
 
     survey: str
     seed: int
-    about: str  # how and when the field was captured
+    about: str  # how the field was captured
     rectified: NDArray[np.floating]  # (y, x, 3) of the pixels `thinned`, NaN where nothing was captured
     caption: str  # of these three bands, by `choose_bands`
     class_map: NDArray[np.integer]  # (y, x), 255 unlabelled

@@ -165,10 +165,3 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
         what = "is missing" if first["type"] == "missing" else f"is not of the design: {first['msg']}"
         raise ShapeError(f"receipt{place} {what}; survey again; gc --damaged removes a damaged run") from None
     return dict(receipt)
-
-
-def hectares_of_classes(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the hectares of each class; None where the size of a pixel is not known."""
-    areas = receipt.get("areas")
-    hectares = areas.get("ha") if isinstance(areas, Mapping) else None
-    return hectares if isinstance(hectares, Mapping) else None

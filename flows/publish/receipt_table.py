@@ -38,7 +38,6 @@ COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
 BYTE_LABELS = {"kept": "bytes kept", "captured": "bytes captured", "written": "bytes written"}
 LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
 MOST_NAMED = 4  # changes of class in a row
-LEAST_LOSS = 0.0005  # of expected mIoU, below which it rounds to 0.0 points
 FOREIGN = 0.2  # fraction of patches unlike the training data above which the weights do not fit the field
 FOREIGN_WORDS = "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET)"
 
@@ -59,22 +58,14 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def format_reference(receipt: Mapping[str, Any]) -> str:
-    """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record.
-
-    With the points that the scan taken is expected to lose.
-    """
+    """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record."""
     capture = receipt["savings"].get("capture_s", {})
     lines = f"line at {receipt['settings']['camera']['exposure_ms']:g} ms, stored as captured" if capture else "pixel"
     words = f"Reference: every {lines}, read by the full network."
     if capture.get("uniform") is None:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
-    words += f" A uniform scan with nearly the best score takes {scan}."
-    taken = receipt.get("scans", {}).get("taken")
-    if taken and not is_foreign(receipt) and format_prediction(taken["expected_miou"], taken.get("expected_spread")):
-        lost = receipt["scans"]["reference"]["expected_miou"] - taken["expected_miou"]
-        words += f" This survey is expected to score {format_points(lost)} points less." if lost >= LEAST_LOSS else ""
-    return words
+    return f"{words} A uniform scan with nearly the best score takes {scan}."
 
 
 def format_score(receipt: Mapping[str, Any]) -> str:
@@ -105,17 +96,12 @@ def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return {name: value for name, value in accuracy.items() if name not in ("none", "all")}
 
 
-def headline(receipt: Receipt, captured_again: float | None = None) -> str:
-    """Return the score, the capture time and the fraction of the field captured again, as plain sentences.
-
-    ``captured_again`` is the fraction of the field that was captured again, 0..1; None leaves it out.
-    """
+def headline(receipt: Receipt) -> str:
+    """Return the score and the capture time as plain sentences."""
     sentences = [format_score(receipt)]
     if (capture := receipt["savings"].get("capture_s")) is not None:
         done, full = (format_seconds(capture[name]) for name in ("done", "full"))
         sentences.append(f"Capture time: {done} ({format_percent(capture['ratio'])} of the reference, {full}).")
-    if captured_again is not None:
-        sentences.append(f"Captured again: {format_percent(captured_again)} of the field.")
     return " ".join(sentences)
 
 

@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from flows.publish.field_map import ERROR_COLOURS, FieldMap
+from flows.publish.field_map import FieldMap
 from flows.publish.panels import data_address
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_table import finding_rows, format_reference, headline, saving_rows, shown_accuracy
@@ -93,13 +93,10 @@ def _plain(value: object) -> object:
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
 
 
-def render_report(
-    receipt: Receipt, quicklook: bytes, *, captured_again: float | None = None, field: FieldMap | None = None
-) -> str:
+def render_report(receipt: Receipt, quicklook: bytes, *, field: FieldMap | None = None) -> str:
     """Return the report as HTML; the same receipt, picture and map give the same bytes.
 
-    ``captured_again`` is the fraction of the field captured at full resolution, 0..1, or None. ``field`` is the map
-    with layers; without it the quicklook is shown first and the page has no script.
+    ``field`` is the map with layers; without it the page has no script.
     """
     scene = split_variable(receipt["settings"]["scene"])[0].name
     accuracy = shown_accuracy(receipt)
@@ -109,7 +106,7 @@ def render_report(
         policy=policy(scripts),
         scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in scripts),
         title=receipt["survey"],
-        lead=headline(receipt, captured_again),
+        lead=headline(receipt),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
         links={  # without raw lines, which may be cleared, and the report itself
@@ -120,9 +117,9 @@ def render_report(
         export=shlex.join(["spectralzoom", "export", receipt["settings"]["out"], *_run_folder(receipt).split("/")[1:]]),
         field=field,
         leaflet=LEAFLET,
-        error_colours=ERROR_COLOURS,
         quicklook=data_address(quicklook),
-        **_savings(receipt),
+        savings=saving_rows(receipt),
+        reference=format_reference(receipt),
         findings=finding_rows(receipt),
         accuracy=accuracy,
         error_matrix=None if accuracy is None else error_matrix(accuracy),
@@ -134,13 +131,3 @@ def render_report(
 def _run_folder(receipt: Receipt) -> str:
     products: Mapping[str, str] = receipt["products"]
     return next(posixpath.dirname(one) for one in products.values() if one.startswith("runs/"))
-
-
-def _savings(receipt: Receipt) -> dict[str, Any]:
-    split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
-    parts = [name for name in ("overview", "score", "detail") if split["done"] and split[name] is not None]
-    return {
-        "savings": saving_rows(receipt),
-        "reference": format_reference(receipt),
-        "fractions": {name: split[name] / split["done"] for name in parts},
-    }

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.field_map import field_map, prior_map
+from flows.publish.field_map import field_map
 from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import thinned
 from flows.publish.quicklook import QuicklookData, draw_quicklook
@@ -38,7 +38,6 @@ from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import SceneGrid, patch_pixels
 from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.uniform_scans import format_scan
 from storage.archive.keys import StageRef
 from storage.archive.manifests import CURE, read_table
 from storage.archive.records import RECEIPT, read_run
@@ -57,7 +56,6 @@ class Published:
 
     receipt: Receipt
     folder: Path
-    captured_again: float | None  # fraction of patches captured at full resolution; None for a uniform scan
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -72,20 +70,19 @@ def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
     """Publish the products of a survey as a run folder with receipt.json, quicklook.png and report.html."""
     run, products = survey.run, survey.products
     rests_on = run.archive.manifest_hashes(products.values())
-    again = None if run.plan.plain else len(plan.patch_index) / len(run.grid.every_patch())
     shown = quicklook_data(run, products, plan)
     quicklook = draw_quicklook(shown)
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}", count_bytes(survey, plan, rests_on))
-        field = field_map(shown, prior_map(run.prior))
-        page = render_report(receipt, quicklook, captured_again=again, field=field)
+        field = field_map(shown, run.prior)
+        page = render_report(receipt, quicklook, field=field)
         draft.write_file("quicklook.png", quicklook)
         if "plots" in receipt:
             draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
         draft.write_file(RECEIPT, to_json(receipt))
         draft.write_file(REPORT, page)
         draft.publish(rests_on=rests_on, survey=receipt["survey"], settings=receipt["settings"])
-    return Published(receipt, draft.published, again)
+    return Published(receipt, draft.published)
 
 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str, data_bytes: Facts) -> Receipt:
@@ -153,8 +150,6 @@ def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> QuicklookData:
     """Return the data of the quicklook, with three bands."""
-    moment = run.settings.moment
-    when = "" if moment is None else f"; day {moment[0]}, {moment[1]:g} h"
     bands, caption = choose_bands(run.scene.wavelength_nm)
     found = load_class_map(products["segment"].path / "class_map.zarr")
     thin = thinned(found.classes)
@@ -169,7 +164,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
-        about=f"{_format_asked(run, plan)}{when}",
+        about=plan.reason,
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
         class_map=found.classes,
@@ -188,16 +183,6 @@ def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.intp]) -> NDArray
     patches = np.zeros(grid.patch_shape, bool)
     patches.ravel()[patch_index] = True
     return patches.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)[: grid.height, : grid.width]
-
-
-def _format_asked(run: SurveyRun, plan: FinePlan) -> str:
-    """Return a short description of the capture."""
-    if run.raster is not None:
-        return "raster"
-    if run.plan.plain:
-        return format_scan(run.step, run.settings.scan_exposure_ms or run.camera.exposure_ms)
-    first = format_scan(run.plan.coarse[0].step, run.settings.coarse_exposure_ms or run.camera.exposure_ms)
-    return f"first {first}; {plan.reason}"
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:

@@ -48,7 +48,6 @@ class RunRef:
 
     uri: str  # relative to the archive
     folder: Path
-    captured_again: float | None = None  # fraction of the patches; None after a uniform scan
     stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
 
     @property

@@ -8,7 +8,6 @@ from typing import Any
 from flows.terminal.figures import format_count, format_points, known_number, spaced
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
-MAPS = {"this survey": None, "small network": "none", "full network": "all"}  # name: key in a receipt's accuracy
 
 
 def format_prediction(miou: float | None, error: float | None) -> str:
@@ -42,13 +41,10 @@ def format_worst_class(accuracy: Mapping[str, Any]) -> str:
 
 def format_false_classes(accuracy: Mapping[str, Any]) -> str:
     """Return the classes of a map that the labels lack, with their pixels; empty where there are none."""
-    parts = []
-    for name, key in MAPS.items():
-        one = accuracy if key is None else accuracy.get(key)
-        if isinstance(one, Mapping) and _by_class(one) and (false := one.get("false_classes")):
-            pixels = ", ".join(f"{kind.replace('_', ' ')} {format_count(count)} px" for kind, count in false.items())
-            parts.append(f"{name} {pixels}")
-    return f"Shown although the truth has none: {'; '.join(parts)}." if parts else ""
+    pixels = ", ".join(
+        f"{spaced(kind)} {format_count(px)} px" for kind, px in (accuracy["false_classes"] or {}).items()
+    )
+    return f"Shown although the truth has none: {pixels}." if pixels else ""
 
 
 def error_matrix(accuracy: Mapping[str, Any]) -> dict[str, list[Any]] | None:

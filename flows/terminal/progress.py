@@ -113,20 +113,14 @@ def heard_by(listener: Listener | None) -> Iterator[None]:
 
 
 LINE_EVERY_S = 30.0
-TITLE = 34  # columns of a title
-NARROW = 110  # a console of fewer columns is narrow
-BARS = (8, 24)  # columns of a bar: narrow, wide
-TIME = 7
+TITLE, BAR, TIME = 30, 10, 12  # columns
 
 
-class _TextOrLeft(TimeRemainingColumn):
-    """The time that is left, after the text of the task; a narrow line cuts it off."""
+class _TimeLeft(TimeRemainingColumn):
+    """The time that is left, by its name."""
 
     def render(self, task: Task) -> Text:
-        text = task.fields["text"]
-        if text and (task.fields["ended"] or task.time_remaining is None):
-            return Text(text)
-        return Text(f"{text}  left " if text else "left ") + super().render(task)
+        return Text("left ") + super().render(task)
 
 
 class StageProgress:
@@ -139,15 +133,17 @@ class StageProgress:
         self._printed: dict[str, float] = {}
         self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is
         self._listener = _listener.get()
-        bar = BARS[console.width >= NARROW]
-        room = max(console.width - TITLE - bar - TIME - 3, TIME)
+        cut: Any = {"no_wrap": True, "overflow": "ellipsis"}
         self._bars = Progress(
+            TextColumn("{task.description}", markup=False, table_column=Column(width=TITLE, **cut)),
+            BarColumn(BAR),
+            TimeElapsedColumn(table_column=Column(width=7)),
+            _TimeLeft(table_column=Column(width=TIME)),
             TextColumn(
-                "{task.description}", markup=False, table_column=Column(width=TITLE, no_wrap=True, overflow="ellipsis")
+                "{task.fields[text]}",
+                markup=False,
+                table_column=Column(max_width=max(console.width - TITLE - BAR - TIME - 11, 8), **cut),
             ),
-            BarColumn(bar, table_column=Column(width=bar)),
-            TimeElapsedColumn(table_column=Column(width=TIME)),
-            _TextOrLeft(table_column=Column(max_width=room, no_wrap=True, overflow="ellipsis")),
             console=console,
             disable=not console.is_terminal,
         )
@@ -166,9 +162,9 @@ class StageProgress:
             self._listener(stage, done, 1.0)
         title = self.titles.get(stage, stage)
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(title, total=1.0, text="", ended=False)
+            self._tasks[stage] = self._bars.add_task(title, total=1.0, text="")
             self._printed[stage] = time.monotonic()
-        self._bars.update(self._tasks[stage], completed=done, text=text, ended=ended)
+        self._bars.update(self._tasks[stage], completed=done, text=text)
         if not self.console.is_terminal and (ended or time.monotonic() - self._printed[stage] > LINE_EVERY_S):
             self._printed[stage] = time.monotonic()
             left = None if ended else self._bars.tasks[self._tasks[stage]].time_remaining

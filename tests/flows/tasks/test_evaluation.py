@@ -80,17 +80,17 @@ def test_light_gains_and_path_corrections_are_per_sweep(monkeypatch: pytest.Monk
 
 
 def test_receipts_give_score_worst_class_and_false_classes():
-    """The worst class is one of the labels; each map with a false class is listed with its pixels."""
+    """The worst class is one of the labels; each false class of the map is listed with its pixels."""
     assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
     assert format_worst_class(accuracy) == "The map's worst class is bare weed with 60.0."
     accuracy["per_class_iou"] = {"wheat": None}
     assert format_worst_class(accuracy) == ""
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
-    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
-    words = "Shown although the truth has none: this survey wheat 2 px; small network wheat 30 px, bare track 1 px."
+    accuracy["false_classes"] = {"wheat": 30, "bare_track": 1}
+    words = "Shown although the truth has none: wheat 30 px, bare track 1 px."
     assert format_false_classes(accuracy) == words
-    accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
+    accuracy["false_classes"] = {}
     assert format_false_classes(accuracy) == ""
 
 

@@ -98,7 +98,7 @@ def test_receipt_has_every_field(farm: Done) -> None:
     )
     assert {row["name"] for row in receipt["effects"]} == set(BY_NAME)
     assert receipt["effects_total"]["bound"] <= receipt["effects_total"]["tolerance"] == 0.1
-    assert 0 < farm.published.captured_again < 1
+    assert farm.receipt["plan"]["lines"] > 0
 
 
 def test_all_maps_of_a_receipt_have_iou_for_the_classes_of_the_labels(farm: Done) -> None:
@@ -175,7 +175,7 @@ def test_without_later_lines_the_first_pass_is_read_in_full(survey_png: Any, wei
     said = Console(file=io.StringIO(), width=400)
     done = Done(survey_png(tmp_path, said, budget="0.45"), tmp_path)
     assert "note: no second pass: no " in said.file.getvalue()
-    assert done.published.captured_again == 0
+    assert done.receipt["plan"]["lines"] == 0
     mosaic = open_mosaic(tmp_path / done.receipt["products"]["mosaic"])
     drawn = done.open("class_map")["classes"].values
     grid = SceneGrid(*drawn.shape, 8)
@@ -196,7 +196,7 @@ def test_uncomputed_scores_are_left_out(surveyed_png: Any, survey_png: Any, scen
     found = survey_png(tmp_path, scene=str(scene_files / "cube.npy"), labels=None, wavelengths=nm, budget="1").receipt
     assert "accuracy" not in check_receipt(found)
     assert "evaluate" not in [stage["name"] for stage in found["stages"]]
-    stored = Done(Published(found, tmp_path, 0.0), tmp_path).open("mosaic")["wavelength"].values
+    stored = Done(Published(found, tmp_path), tmp_path).open("mosaic")["wavelength"].values
     assert stored.tolist() == [float(word) for word in nm.split(",")]
 
 
