@@ -101,14 +101,6 @@ _NUMBER = r"(-?\d+(?:p\d+)?(?:e-?\d+)?)"
 _FORM = re.compile(rf"(.+)_([cf])([xy]){_NUMBER}_{_NUMBER}_(\d+)x(\d+)x(\d+)(?:x(\d+))?_(\d+)", re.DOTALL)
 
 
-@dataclass(frozen=True)
-class Announced:
-    """A sweep, and the line of it that a capture's first frame takes."""
-
-    sweep: Sweep
-    first: int
-
-
 def capture_prefix(sweep: Sweep, first: int = 0) -> str:
     """Return the prefix of a capture of a sweep's lines from ``first`` on.
 
@@ -122,8 +114,8 @@ def capture_prefix(sweep: Sweep, first: int = 0) -> str:
     return prefix
 
 
-def announced(prefix: str) -> Announced | None:
-    """Return the sweep of a capture's prefix; None where it names none."""
+def announced(prefix: str) -> tuple[Sweep, int] | None:
+    """Return the sweep of a capture's prefix, and its line in the first frame; None where it names none."""
     found = _FORM.fullmatch(prefix)
     if found is None:
         return None
@@ -140,7 +132,7 @@ def announced(prefix: str) -> Announced | None:
         *sizes,
         held=None if held is None else int(held),
     )
-    return Announced(sweep, int(first))
+    return sweep, int(first)
 
 
 def _written(value: float) -> str:

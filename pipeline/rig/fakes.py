@@ -117,8 +117,8 @@ class FakeCamera:
         found = announced(prefix)
         if found is None:
             raise RigError(f"{folder} announces no lines; the fake camera sees those of a survey's sweeps only")
-        sweep = replace(found.sweep, binning=1, exposure_ms=exposure_ms)
-        lines = range(found.first, min(found.first + frames, sweep.lines))
+        sweep = replace(found[0], binning=1, exposure_ms=exposure_ms)
+        lines = range(found[1], min(found[1] + frames, sweep.lines))
         number = np.arange(len(lines))
         stamps = STARTED_US + np.rint(number * period_ms * 1e3).astype(np.int64)
         return CapturedLines(source.render(sweep, lines), 0, LineTimes(number, stamps))

@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 
 from numpy.typing import ArrayLike
@@ -117,14 +118,9 @@ class ProLink:
         """Send a request once that moves the mirror."""
         self.ask(frame, name, bytes, "motion")
 
-    def _answer(
-        self, found: pro.Frame | pro.Damaged, sent: pro.Frame, name: str, parse: Callable[[bytes], Answer]
-    ) -> Answer | None:
+    def _answer(self, found: pro.Frame, sent: pro.Frame, name: str, parse: Callable[[bytes], Answer]) -> Answer | None:
         """Return the answer in a frame; None, and a line in the log, where it does not answer the request."""
         port = self.wire.port
-        if isinstance(found, pro.Damaged):
-            LOG.info("%s, while waiting for %s: bytes that form no frame: %s", port, name, found.data.hex(" "))
-            return None
         if self.with_crc and not found.crc_good:
             LOG.warning("%s: the CRC of an answer to %s does not fit; it is refused", port, name)
             return None
@@ -141,20 +137,6 @@ class ProLink:
         return None
 
 
-@dataclass(frozen=True)
-class Identity:
-    """Identity of a controller; a field is empty where it does not know the request."""
-
-    device: str
-    version: str
-    serial: str
-
-    @property
-    def summary(self) -> str:
-        """All fields in one line."""
-        return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
-
-
 def upload(link: ProLink, cells: bytes) -> None:
     """Write cells, X of all positions and then Y of all, to the vector memory.
 
@@ -167,10 +149,12 @@ def upload(link: ProLink, cells: bytes) -> None:
         link.set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {stop}")
     for number in frames_to_check(len(frames)):
         start, sent = frames[number]
-        if read_cells(link, pro.VECTOR_MEMORY, start, len(sent) // pro.CELL) != sent:
+        place = f"cells {start} to {start + len(sent) // pro.CELL}"
+        asked = pro.get_vector(pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
+        if link.ask(asked, f"reading {place}", partial(pro.checked, size=len(sent))) != sent:
             raise RigError(
-                f"cells {start} to {start + len(sent) // pro.CELL} of the vector memory on {link.wire.port} hold other "
-                "values than were sent; nothing was moved: run again"
+                f"{place} of the vector memory on {link.wire.port} hold other values than were sent; nothing was "
+                "moved: run again"
             )
 
 
@@ -181,18 +165,7 @@ def frames_to_check(frames: int) -> list[int]:
     return sorted({number for number in chain(range(0, frames, SAMPLED_EVERY), ends) if 0 <= number < frames})
 
 
-def read_cells(link: ProLink, register: int, start: int, count: int) -> bytes:
-    """Read cells of a vector, at most as many as one frame takes."""
-    return link.ask(
-        pro.get_vector(register, start, count),
-        f"reading cells {start} to {start + count}",
-        lambda payload: pro.checked(payload, count * pro.CELL),
-    )
-
-
-def _run_values(run: int) -> dict[int, pro.Value]:
-    """Return the registers that start (1) or halt (0) the vector units of both channels, in one frame."""
-    return {channel.vector(pro.VectorRegister.RUN): run for channel in (pro.X, pro.Y)}
+_STOPPED: dict[int, pro.Value] = {pro.X.run: 0, pro.Y.run: 0}  # halts the vector units of both channels
 
 
 class MirrorController:
@@ -210,7 +183,7 @@ class MirrorController:
         self.wire = Wire(transport, clock)
         self._link = ProLink(self.wire, rig.with_crc)
         self._pairs = 0  # positions in the vector memory
-        self.identity = Identity("", "", "")
+        self.identity = ""
 
     def connect(self) -> None:
         """Find the controller in either mode, and change it to pro mode. Nothing moves.
@@ -225,12 +198,13 @@ class MirrorController:
                 # with a CRC: an earlier session may have had them checked
                 ProLink(self.wire, with_crc=True).set(pro.GO_SIMPLE, "changing to simple mode")
             self._greet()
-        found = Identity(*(ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL)))
-        self.identity = found
-        if not found.device.upper().startswith(KNOWN_MODEL):
+        # empty where it does not know the request
+        device, version, number = (ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL))
+        self.identity = f"{device or 'no id'}, version {version or 'unknown'}, serial {number or 'unknown'}"
+        if not device.upper().startswith(KNOWN_MODEL):
             raise RigError(
                 f"expected a controller whose id begins with {KNOWN_MODEL} on {self.wire.port}, got "
-                f"{found.summary}; is another device at this port?"
+                f"{self.identity}; is another device at this port?"
             )
         try:
             with suppress(DeadlinePassed):  # it may have changed; the status shows
@@ -256,9 +230,8 @@ class MirrorController:
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position; return once that is acknowledged. RigError: the status forbids motion."""
         to_x, to_y = map(float, wire_positions([(x, y)], self.rig.mounting)[0])
-        follow = {**pro.X.followed(pro.X.static_system), **pro.Y.followed(pro.Y.static_system)}
         # all registers fill one frame: both channels go there, hold it, and end any path
-        values = {pro.X.static_xy: to_x, pro.Y.static_xy: to_y, **follow, **_run_values(0)}
+        values = {pro.X.static_xy: to_x, pro.Y.static_xy: to_y, **pro.X.hold, **pro.Y.hold, **_STOPPED}
         self._move(values, f"going to {to_x:.6g}; {to_y:.6g}")
 
     def settle(self, within_s: float) -> None:
@@ -297,20 +270,20 @@ class MirrorController:
         for name, begin, channel in (("X", 0, pro.X), ("Y", self._pairs, pro.Y)):
             start, end = device_range((begin, begin + self._pairs), self.rig.ends)
             values: dict[int, pro.Value] = {
-                channel.vector(pro.VectorRegister.UNIT): pro.UNIT_XY,
-                channel.vector(pro.VectorRegister.START): start,
-                channel.vector(pro.VectorRegister.END): end,
-                channel.vector(pro.VectorRegister.FREQUENCY): float(rate_hz),
-                channel.vector(pro.VectorRegister.CYCLES): 1,
-                channel.vector(pro.VectorRegister.TRIGGER): pro.TRIGGER_OFF,
+                channel.unit: pro.UNIT_XY,
+                channel.start: start,
+                channel.end: end,
+                channel.frequency: float(rate_hz),
+                channel.cycles: 1,
+                channel.trigger: pro.TRIGGER_OFF,
             }
             self._link.set(pro.set_values(values), f"setting up the path's {name}")
-        follow = {**pro.X.followed(pro.X.vector_system), **pro.Y.followed(pro.Y.vector_system)}
-        self._move(follow | _run_values(1), "running the path")  # one frame: both begin together
+        # one frame: both begin together
+        self._move({**pro.X.play, **pro.Y.play, pro.X.run: 1, pro.Y.run: 1}, "running the path")
 
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is."""
-        self._link.set(pro.set_values(_run_values(0)), "halting the path")
+        self._link.set(pro.set_values(_STOPPED), "halting the path")
 
     def close(self) -> None:
         """Close the port; the mirror stays where it is."""

@@ -13,6 +13,7 @@ does not document the payload of an acknowledgement; it is assumed to be empty.
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from functools import cache
 
 from pipeline.errors import ShapeError
 
+LOG = logging.getLogger(__name__)
 TURNED = 0x20  # the bit that an escape inverts
 MOST_PAYLOAD = 50
 _HEAD, _CRC = 3, 2  # bytes: address, command, size; and the check behind the payload
@@ -77,13 +79,6 @@ class Frame:
     crc_good: bool = field(default=True, compare=False)
 
 
-@dataclass(frozen=True)
-class Damaged:
-    """Bytes between two boundaries that form no frame."""
-
-    data: bytes
-
-
 @cache
 def _crc_step(value: int) -> int:
     for _ in range(8):
@@ -121,21 +116,23 @@ class FrameReader:
     def __init__(self) -> None:
         self._held = b""  # behind the last boundary
 
-    def feed(self, data: bytes) -> list[Frame | Damaged]:
-        """Take bytes; return the frames and the damaged frames that they complete."""
+    def feed(self, data: bytes) -> list[Frame]:
+        """Take bytes; return the frames that they complete. A line in the log names bytes that form none."""
         *ended, held = (self._held + data).split(b"\x7e")
         self._held = held[:_TOO_LONG]
-        return [_read_frame(part[:_TOO_LONG]) for part in ended if part]
+        found = (_read_frame(part[:_TOO_LONG]) for part in ended if part)
+        return [frame for frame in found if frame is not None]
 
 
-def _read_frame(data: bytes) -> Frame | Damaged:
-    """Read the bytes between two boundaries."""
+def _read_frame(data: bytes) -> Frame | None:
+    """Read the bytes between two boundaries; None where they form no frame."""
     first, *rest = data.split(b"\x7d")
     plain = first + b"".join(bytes((part[0] ^ TURNED,)) + part[1:] for part in rest if part)
     size = len(plain) - _HEAD - _CRC
     escaped = all(part[:1] in (b"\x5d", b"\x5e") for part in rest)
     if not escaped or not 0 <= size <= MOST_PAYLOAD or plain[2] != size:
-        return Damaged(data)
+        LOG.info("bytes that form no frame: %s", data.hex(" "))
+        return None
     body, check = plain[:-_CRC], int.from_bytes(plain[-_CRC:], "little")
     return Frame(body[1], body[_HEAD:], body[0], crc_good=crc_arc(body) == check)
 
@@ -225,36 +222,17 @@ class Status(IntFlag):
 _STOPS = Status.DISCONNECTED | Status.ELECTRONICS_WARM | Status.MIRROR_WARM | Status.EEPROM_INVALID
 
 
-class VectorRegister(IntEnum):
-    """Registers of the vector unit."""
-
-    UNIT = 0x0
-    RUN = 0x1
-    START = 0x2
-    END = 0x3
-    FREQUENCY = 0x4  # cells per second, float
-    CYCLES = 0x7  # -1 is without end
-    TRIGGER = 0x8
-
-
 class ChannelRegisters:
-    """Registers of one channel: the inputs it can follow, and which of them it follows."""
+    """Registers of one channel, and the values that make it follow an input, controlled by position."""
 
     def __init__(self, channel: int) -> None:
-        self.static_system = 0x50 + channel  # of held positions
-        self.vector_system = 0x68 + channel  # plays the vector memory
-        self.xy_system = 0xC0 + channel  # controls position
-        self.static_xy = self.static_system << 8 | UNIT_XY  # held position, float
-        self.input = 0x4000 + 5 * channel  # which system the channel follows
-        self.control = 0x4002 + 5 * channel  # which system controls the channel
-
-    def vector(self, register: VectorRegister) -> int:
-        """Return the id of a register of the vector unit."""
-        return self.vector_system << 8 | register
-
-    def followed(self, system: int) -> dict[int, Value]:
-        """Return the values that make the channel follow an input, controlled by position."""
-        return {self.control: self.xy_system, self.input: system}
+        held, vector = 0x50 + channel, 0x68 + channel  # systems: a held position, and the player of the vector memory
+        control = {0x4002 + 5 * channel: 0xC0 + channel}
+        self.hold: dict[int, Value] = {**control, 0x4000 + 5 * channel: held}
+        self.play: dict[int, Value] = {**control, 0x4000 + 5 * channel: vector}
+        self.static_xy = held << 8 | UNIT_XY  # held position, float
+        self.unit, self.run, self.start, self.end, self.frequency = (vector << 8 | number for number in range(5))
+        self.cycles, self.trigger = vector << 8 | 7, vector << 8 | 8
 
 
 X, Y = ChannelRegisters(0), ChannelRegisters(1)

@@ -29,8 +29,8 @@ def test_a_sweep_is_recovered_from_its_prefix() -> None:
         swath, start = (float(rng.choice([one, -0.5, -0.0, 7.0, 1e300])) for one in odd)
         turned = Sweep(f"fine-{number:03d}", "fine", "y", swath, start, int(rng.integers(1, 3000)), 4, 4)
         sweep = turned if number % 2 else replace(turned, kind="coarse", along="x")
-        told = capture_paths.Announced(sweep, int(rng.integers(sweep.lines)))
-        prefix = capture_paths.capture_prefix(*vars(told).values())
+        told = (sweep, int(rng.integers(sweep.lines)))
+        prefix = capture_paths.capture_prefix(*told)
         assert capture_paths.announced(prefix) == told
         assert str(capture_paths.announced(prefix)) == str(told)  # the sign of zero
 

@@ -11,7 +11,7 @@ import pytest
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig import mirror_controller
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.mirror_controller import Identity, MirrorController, open_mirror
+from pipeline.rig.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.transports import DeadlinePassed, DeviceGone, StateUnknown
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
@@ -33,7 +33,7 @@ def play(mirror: MirrorController) -> None:
 
 # exchanges after connecting, the call, settings, and the call's result
 DONE_AS_ASKED: dict[str, tuple[list[Pair], Call, dict[str, Any], object]] = {
-    "who is there": ([], lambda mirror: mirror.identity, {}, Identity("MR-E-2", "1.2.4065", "ABCD0123")),
+    "who is there": ([], lambda mirror: mirror.identity, {}, "MR-E-2, version 1.2.4065, serial ABCD0123"),
     "going, in one frame": ([w.WELL, THERE], lambda mirror: mirror.goto(0.5, -0.25), {}, None),
     "a path, X before Y, half open, begun in one frame": (
         [w.HALT, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, pair(w.RUN, w.DONE)],
@@ -132,7 +132,7 @@ def test_opening_connects_or_releases_the_port(monkeypatch: pytest.MonkeyPatch):
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
         with closing(open_mirror(SETTINGS, 1500, transport.clock)) as mirror:
-            assert mirror.identity.device == "MR-E-2"
+            assert mirror.identity.startswith("MR-E-2,")
         assert transport.closed
     with scripted([*[silent] * 3, (w.LEAVE[0], b""), *[silent] * 3]) as transport:
         give(monkeypatch, transport)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flows.cli.rig_commands import SQUARE, CheckRow, check_camera, check_mirror, failed, works
 from pipeline.errors import RigError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import FileServer
 from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
 from pipeline.rig.transports import DeviceGone
 from tests.pipeline.rig.camera.scripted_files import ScriptedFiles, served
 from tests.pipeline.rig.mirror import mirror_bytes as w
@@ -108,20 +108,17 @@ def said(command: bytes, response: bytes) -> Pair:
 
 
 IDLE, EXIT = said(b"isCapturing\r", b"false"), (b"exit\r", b"")
-LISTING = said(b'listFiles("/")\r', b'[{"name": "/captured", "isDirectory": true}]')
 
 
 def test_a_working_camera_passes_the_check() -> None:
-    """Rows report its state, its files and their server. A running capture is a warning and is left alone."""
+    """Rows report its state and its file server. A running capture is a warning and is left alone."""
     with served(ScriptedFiles({})) as server:
-        rows = check_camera(camera_of([IDLE, LISTING, EXIT], server))
-        assert [row.asked.partition(",")[0] for row in rows] == [
-            *("whether it captures", "list its files", "log in to its files")
-        ]
+        rows = check_camera(camera_of([IDLE, EXIT], server))
+        assert [row.asked.partition(",")[0] for row in rows] == [*("whether it captures", "log in to its files")]
         assert {row.verdict for row in rows} == {"ok"}
-        rows = check_camera(camera_of([said(b"isCapturing\r", b"true"), LISTING, EXIT], server))
+        rows = check_camera(camera_of([said(b"isCapturing\r", b"true"), EXIT], server))
         assert told(rows, "warn") == ["whether it captures"]
-        rows = check_camera(camera_of([IDLE, LISTING, EXIT], replace(server, password="x")))
+        rows = check_camera(camera_of([IDLE, EXIT], replace(server, password="x")))
         assert told(rows, "fail") == [f"log in to its files, port {server.port}"]
     assert [row.came for row in check_camera(lambda: FakeCamera(FakeClock()))] == ["no capture runs"]
 
