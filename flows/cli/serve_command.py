@@ -18,18 +18,17 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 from httpx import HTTPError
 from prefect.client.orchestration import get_client
-from prefect.client.schemas import filters
-from prefect.client.schemas.objects import StateType
+from prefect.client.schemas.filters import FlowRunFilter
 from prefect.client.schemas.schedules import CronSchedule, IntervalSchedule
 from prefect.runner import Runner
 from prefect.states import Cancelled, Crashed
 from pydantic import ValidationError
 
-from flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess, reprocess_deployment
+from flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey import survey
-from flows.tasks.local_server import ServerUnavailable, check_answers, local_server, quiet_environment
+from flows.tasks.local_server import check_answers, local_server, quiet_environment
 from flows.tasks.open_survey import RIG_LIMIT
 from flows.tasks.run import open_run
 from flows.tasks.survey_model import weights_path
@@ -41,7 +40,6 @@ from storage.archive.archive import Archive
 from storage.archive.staging import read_toml, take_lock
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-UNENDED = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.CANCELLING]
 
 
 def serve(
@@ -163,16 +161,11 @@ def _start_server(home: Path, port: int, held: ExitStack) -> str:
     Raises SettingsError: that server does not answer, or the port is in use.
     """
     held.enter_context(quiet_environment(home))
-    named = os.environ.get("PREFECT_API_URL")
-    try:
-        if named is not None:
-            check_answers(named)
-            return named.rstrip("/").removesuffix("/api")
-        api = held.enter_context(local_server(home, port, schedules=True))
-        return f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
-    except ServerUnavailable as error:
-        cure = ": start it, or unset PREFECT_API_URL and have one started here" if named else ""
-        raise SettingsError(f"{error}{cure}") from error
+    if (named := os.environ.get("PREFECT_API_URL")) is not None:
+        check_answers(named)
+        return named.rstrip("/").removesuffix("/api")
+    api = held.enter_context(local_server(home, port, schedules=True))
+    return f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
 
 
 class InterruptedRunner(Runner):
@@ -185,10 +178,11 @@ class InterruptedRunner(Runner):
 
 def _serve(deployments: Sequence[Any], limit: int) -> None:
     """Serve the deployments until SIGINT or SIGTERM, then pause them. Raises PipelineError: the server is away."""
+    began = datetime.now(UTC)
     try:
-        _prepare([one.name for one in deployments])
         runner = InterruptedRunner(pause_on_shutdown=False, limit=limit)  # it would pause the first one only
         served: list[Any] = [runner.add_deployment(one) for one in deployments]
+        _prepare(served, began)
         try:
             asyncio.run(runner.start())
         finally:
@@ -201,20 +195,16 @@ def _serve(deployments: Sequence[Any], limit: int) -> None:
         ) from error
 
 
-def _prepare(names: list[str]) -> None:
-    """Limit a rig to one survey at a time in Prefect, and end the due runs of deployments that a killed serve left."""
-    now: Any = datetime.now(UTC)
-    left: dict[str, Any] = {
-        "deployment_filter": filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=names)),
-        "flow_filter": filters.FlowFilter(name=filters.FlowFilterName(any_=[survey.name, reprocess.name])),
-        "flow_run_filter": filters.FlowRunFilter(
-            state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=UNENDED)),
-            expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=now),
-        ),
+def _prepare(deployments: Sequence[Any], now: datetime) -> None:
+    """Limit a rig to one survey at a time, and end the due runs of deployments (ids) that a killed serve left."""
+    left = {
+        "deployment_id": {"any_": deployments},
+        "state": {"type": {"any_": ["SCHEDULED", "PENDING", "RUNNING", "CANCELLING"]}},
+        "expected_start_time": {"before_": now},
     }
     with get_client(sync_client=True) as client:
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        while found := client.read_flow_runs(**left):  # a page at a time
+        while found := client.read_flow_runs(flow_run_filter=FlowRunFilter.model_validate(left)):  # a page at a time
             for run in found:
                 ended = Crashed if run.start_time else Cancelled
                 client.set_flow_run_state(run.id, ended(message="left by an earlier serve"), force=True)

@@ -16,8 +16,8 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from contextvars import copy_context
 from http.client import HTTPException
 from pathlib import Path
@@ -50,20 +50,27 @@ QUIET = {  # no requests to other machines, no output on the terminal; run logs 
 }
 
 
-class ServerUnavailable(RuntimeError):  # noqa: N818 - a survey runs without it
+class ServerUnavailable(SettingsError):  # noqa: N818 - a survey runs without it
     """No Prefect server can be started or reached."""
 
 
+def quiet_environment(home: Path) -> AbstractContextManager[None]:
+    """Set Prefect's folder and quiet settings in the environment for a block; variables of the user are kept."""
+    wanted = {**QUIET, "PREFECT_HOME": str(home)}
+    return _environment({name: value for name, value in wanted.items() if name not in os.environ})
+
+
 @contextmanager
-def quiet_environment(home: Path) -> Iterator[None]:
-    """Set Prefect's folder and quiet settings in the environment; variables of the user are kept."""
-    added = {name: value for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items() if name not in os.environ}
-    os.environ.update(added)
+def _environment(wanted: Mapping[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
     try:
         yield
     finally:
-        for name in added:
+        for name, value in before.items():
             os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
 
 
 @contextmanager
@@ -74,7 +81,15 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
     schedules the runs of deployments and serves its pages. Raises ServerUnavailable: it does not start;
     SettingsError: the port is in use.
     """
-    with _listening(port) as listening, _using(home, listening.getsockname()[1], schedules=schedules) as api:
+    with socket.socket() as listening, ExitStack() as held:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise SettingsError(
+                f"--port {port} cannot be used ({error}): give another, or name its server in PREFECT_API_URL"
+            ) from error
+        api = held.enter_context(_using(home, listening.getsockname()[1], schedules=schedules))
         import uvicorn
         from prefect.logging.handlers import APILogWorker
         from prefect.server.api.server import create_app
@@ -121,21 +136,14 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
         "PREFECT_API_AUTH_STRING": password,
         "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": f"http://{HOST}:{port},http://localhost:{port}",
     }
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
     try:
         from prefect import settings
-
-        known = {getattr(settings, name): value for name, value in wanted.items()}
-        with settings.temporary_settings(updates={**known, settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
-            yield api
     except ImportError as error:
         raise ServerUnavailable(f"Prefect cannot be imported ({error})") from error
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+    known = {getattr(settings, name): value for name, value in wanted.items()}
+    heartbeat = {settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
+    with _environment(wanted), settings.temporary_settings(updates={**known, **heartbeat}):
+        yield api
 
 
 def create_database(path: Path) -> None:
@@ -174,26 +182,15 @@ def _migrate(folder: Path) -> Path:
     return small
 
 
-@contextmanager
-def _listening(port: int) -> Iterator[socket.socket]:
-    with socket.socket() as found:
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            found.bind((HOST, port))
-        except (OSError, OverflowError) as error:
-            raise SettingsError(
-                f"--port {port} cannot be used ({error}): give another, or name its server in PREFECT_API_URL"
-            ) from error
-        yield found
-
-
 def check_answers(url: str) -> None:
     """Check that a server answers. Raises ServerUnavailable."""
     try:
         with suppress(urllib.error.HTTPError):  # it requires a password
             urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S).close()
     except (OSError, ValueError, HTTPException) as error:
-        raise ServerUnavailable(f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error})") from error
+        raise ServerUnavailable(
+            f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error}): start it, or unset that"
+        ) from error
 
 
 def wait_until_recorded(flow_run: Any) -> None:

@@ -113,7 +113,7 @@ def test_serve_ends_the_runs_of_a_killed_serve(north: Any, monkeypatch: pytest.M
     with client() as asked:
         for one, state in ((ran, Pending), (ran, Running), (ended, Cancelling), (strange, Pending)):
             asked.set_flow_run_state(one, state(), force=True)
-        _prepare([north.name])
+        _prepare([deployment], datetime.now(UTC))
         kinds = [asked.read_flow_run(one).state.type.value for one in (ran, ended, waited, other, later, strange)]
         assert kinds == ["CRASHED", *["CANCELLED"] * 3, "SCHEDULED", "PENDING"]
         after = planned(deployment, DUE).id
