@@ -16,7 +16,7 @@ from flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, pars
 from flows.terminal.progress import print_json, stderr
 from flows.training.train import asked_command, check_counts, run_train
 from flows.training.train_scenes import TrainRequest
-from flows.training.train_temporal import JUDGED_LANDS, LANDS, TemporalRequest, run_remember
+from flows.training.train_temporal import LANDS, TemporalRequest, run_remember
 from models.network.machine import PROCESSOR, Device
 from models.training.temporal import TemporalTraining
 from models.training.train import TrainingSettings
@@ -85,7 +85,7 @@ class TrainFlags(SceneFlags):
         Highest learning rate. Default: 0.0015, or a third of it with --start.
     train_temporal
         Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
-        reader that they have. It takes --scenes, --steps, --minutes, --seed and --validation; it does not resume. It
+        reader that they have. It takes --scenes, --steps, --minutes and --seed; it does not resume. It
         needs 4 GB of memory, and half an hour for reading the scenes besides --minutes.
     dim
         Token width of the transformer.
@@ -197,7 +197,7 @@ class EvaluateFlags(SceneFlags):
 
 
 NO_TRAIN_FLAGS, NO_EVALUATE_FLAGS = TrainFlags(), EvaluateFlags()
-OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed", "validation")  # flags of --train-temporal
+OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed")  # flags of --train-temporal
 
 
 def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_json: AsJson = False) -> int:
@@ -229,8 +229,7 @@ def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, conso
     check_default(flags, OF_TEMPORAL, "not for --train-temporal")
     how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
     lands = LANDS if flags.scenes is None else flags.scenes
-    judged = JUDGED_LANDS if flags.validation is None else flags.validation
-    reader = TemporalRequest(dataset, flags.train_temporal, out, lands, judged, settings=how, command=command)
+    reader = TemporalRequest(dataset, flags.train_temporal, out, lands, settings=how, command=command)
     return run_remember(reader, console)
 
 

@@ -159,8 +159,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         what = "Read by the full network" if run.plan.plain else "Captured again"
         chosen = pixels_of_patches(run.grid, patches)[thin]
         choice = f"{what}: {len(patches)} patches by {run.settings.policy}"
-    prior = prior_map_figures(products["segment"].path)
-    drawn = products["segment"].path / "class_probabilities.zarr"
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
@@ -174,7 +172,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         chosen=chosen,
         choice=choice,
         truth=run.labels,
-        was=None if prior is None else ProbabilityStore(drawn).old_class(),
+        was=ProbabilityStore(products["segment"].path / "class_probabilities.zarr").old_class(),
     )
 
 

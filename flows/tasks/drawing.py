@@ -19,7 +19,7 @@ from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse
 from flows.tasks.prior_maps import Prior
 from models.network.spectral import LineSpec, unlike_training
 from models.policies.policies import class_errors, gain_of
-from models.reading.inference import CoarsePass, CoarsePrediction, load_overview, read_coarse_prediction, segment
+from models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
 from models.reading.prior_map import (
     ClassProbabilities,
     CurrentVisit,
@@ -35,15 +35,9 @@ from models.reading.prior_map import (
 )
 from models.reading.regions import Region
 from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED, pad_by_reflection, patch_pixels
+from pipeline.geometry.grid import pad_by_reflection, patch_pixels
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import (
-    ProbabilityStore,
-    packed_probabilities,
-    write_changes_tile,
-    write_class_tile,
-    write_probabilities_tile,
-)
+from storage.arrays.class_maps import ProbabilityStore, packed_probabilities, write_class_tile, write_probabilities_tile
 from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from storage.parallel.pool import run_blocks
 
@@ -79,7 +73,7 @@ class Drawing:
         if self.choice is not None:
             folder = self.choice.overviews
             overview = None if folder is None else load_overview(overview_file(folder, region), weights)
-            seen = predicted = read_coarse_prediction(weights, seen, overview)
+            seen = read_coarse_prediction(weights, seen, overview)
             gain = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels)
             here = region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
@@ -105,7 +99,10 @@ class Drawing:
             comparison = compare(local, observation, after, region.kept_here)
             old = changed_from(local, after)
             after = as_captured(local, after)
-        reading = None if self.choice is None else FullReading.of(region, predicted, drawn.classes, gain, patch_index)
+        reading = None
+        if self.choice is not None:
+            read = np.isin(region.grid.every_patch(), patch_index).reshape(gain.shape)
+            reading = FullReading(region.crop_patches(gain), region.crop_patches(read))
         unread = 0 if seen.out_of_range is None else int(np.count_nonzero(region.crop(seen.out_of_range)))
         return DrawnRegion(
             region.crop(classes),
@@ -187,25 +184,6 @@ class FullReading:
 
     gain: NDArray[np.float64]  # expected gain by the policy
     read: NDArray[np.bool_]  # patches that it read
-    changed: NDArray[np.float32]  # fraction of their pixels whose class it changed
-
-    @staticmethod
-    def of(
-        region: Region,
-        predicted: CoarsePrediction,
-        classes: NDArray[np.integer],
-        gain: NDArray[np.float64],
-        patch_index: NDArray[np.integer],
-    ) -> FullReading:
-        """Compare the ``classes`` (y, x) of a region, where ``patch_index`` was read, with those of the overview."""
-        read = np.zeros(gain.shape, np.bool_)
-        read[patch_index] = True
-        before = predicted.probability.argmax(axis=-1)[: region.grid.height, : region.grid.width]
-        other = (classes != before) & (classes != UNLABELLED)
-        changed = np.zeros(gain.shape, np.float32)
-        fractions = patch_pixels(region.grid, other).mean(axis=(1, 2)) / region.grid.valid_fraction().ravel()
-        changed[patch_index] = fractions[patch_index]
-        return FullReading(region.crop_patches(gain), region.crop_patches(read), region.crop_patches(changed))
 
 
 @dataclass(frozen=True)
@@ -244,10 +222,9 @@ def draw_field(
 
     def take(region: Region, images: DrawnRegion) -> Drawn:
         origin = region.kept.top, region.kept.left
-        if images.old_class is not None:
-            write_changes_tile(path / PROBABILITIES, origin, images.old_class)
         write_class_tile(path / MAP, origin, images.classes, images.confidence)
-        write_probabilities_tile(path / PROBABILITIES, origin, images.packed, images.age_days, images.light)
+        beside = images.age_days, images.light, images.old_class
+        write_probabilities_tile(path / PROBABILITIES, origin, images.packed, *beside)
         return images.drawn
 
     begun = 0.0
@@ -267,7 +244,7 @@ def draw_field(
     reading = None
     if least_gain is not None:
         shape = field.regions[0].field.patch_shape
-        reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
+        reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_))
         for region, part in zip(field.regions, parts, strict=True):
             for name, whole in vars(reading).items():
                 whole[region.kept_patches.rows, region.kept_patches.columns] = getattr(part.reading, name)

@@ -48,6 +48,13 @@ PASSES = 2  # of each visit
 JUDGED_DAY = 172
 JUDGED_AFTER = (1, 3, 7)  # days
 JUDGED_LANDS = 3
+MAPS = {
+    "kept": "first map",
+    "extent": "visit alone",
+    "anew": "new full scan",
+    "surer": "more confident",
+    "prior_map": "fused",
+}
 BEFORE, NOW = (1, 25.0), (2, 5.0)  # line spacing [px] and exposure [ms] of the judged scans
 
 
@@ -59,8 +66,6 @@ class TemporalRequest:
     weights: Path
     out: Path
     lands: int = LANDS
-    judged: int = JUDGED_LANDS
-    shape: tuple[int, int] = SHAPE
     settings: TemporalTraining = field(default_factory=TemporalTraining)
     command: str = ""
 
@@ -83,13 +88,12 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         raise SettingsError(
             f"--train-temporal {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
         )
-    augmentation = CaptureAugmentation(weights.normalisation)
     lands = []
     for number in range(request.lands):
         seed = FIRST_SEED + number
         report("visiting lands", number / request.lands, f"land {seed}")
         rng = np.random.default_rng([request.settings.seed, seed])
-        lands.append([_visit(weights, augmentation, request.shape, seed, *moment, rng) for moment in _moments(rng)])
+        lands.append([_visit(weights, seed, *moment, rng) for moment in _moments(rng)])
     known = describe_weights(request.weights).reader
     reader, steps = train_reader(
         lands,
@@ -103,7 +107,7 @@ def train_temporal(request: TemporalRequest, report: Report = lambda what, done,
         "settings": asdict(request.settings),
         "steps": steps,
         "started_from": None if known is None else known.key,
-        "validation": judge_temporal(weights, augmentation, reader, request, report),
+        "validation": judge_temporal(weights, reader, request.settings.seed, report),
     }
     add_reader(request.weights, request.out, reader, record)
     return record
@@ -117,22 +121,14 @@ def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
     return sorted((day, float(rng.choice(HOURS))) for day in days)
 
 
-def _visit(
-    weights: Weights,
-    augmentation: CaptureAugmentation,
-    shape: tuple[int, int],
-    seed: int,
-    day: int,
-    hour: float,
-    rng: np.random.Generator,
-) -> Visit:
+def _visit(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> Visit:
     """Return a land on a day, as scans drawn at random show it."""
-    seen = _Land.observed(weights, shape, seed, day, hour, rng)
+    seen = _Land.observed(weights, seed, day, hour, rng)
     drawn = []
     for _ in range(PASSES):
         step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
         exposure_ms = float(np.exp(rng.uniform(np.log(MIN_EXPOSURE_MS), np.log(MAX_EXPOSURE_MS))))
-        observation = seen.observe(weights, augmentation, step, exposure_ms, rng)
+        observation = seen.observe(weights, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
         drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))
     return Visit(day + hour / 24, seen.labels, drawn)
@@ -148,76 +144,49 @@ class _Land:
     grid: SceneGrid
 
     @staticmethod
-    def observed(
-        weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float, rng: np.random.Generator
-    ) -> _Land:
+    def observed(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> _Land:
         """Image the farm of a seed on a day, with noise of its own."""
         camera = LineCamera()
-        scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
-        grid = SceneGrid(*shape, weights.config.patch)
+        scene = farm_scene(seed, SHAPE, camera=camera, day=day, hour=hour)
+        grid = SceneGrid(*SHAPE, weights.config.patch)
         seen, noise = observe_finely(scene, camera, grid, weights.basis, int(rng.integers(2**31)))
         padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
         columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))
         return _Land(columns, noise, np.asarray(scene.labels, np.uint8), grid)
 
-    def observe(
-        self,
-        weights: Weights,
-        augmentation: CaptureAugmentation,
-        step: int,
-        exposure_ms: float,
-        rng: np.random.Generator,
-    ) -> CurrentVisit:
+    def observe(self, weights: Weights, step: int, exposure_ms: float, rng: np.random.Generator) -> CurrentVisit:
         """Return a visit by a uniform scan, segmented by the weights."""
         light = exposure_ms / REFERENCE_MS
+        augmentation = CaptureAugmentation(weights.normalisation)
         scan = augmentation.scanned(self.columns, self.noise, light=light, step=step, rng=rng)
         _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
         return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
 
 
-def judge_temporal(
-    weights: Weights,
-    augmentation: CaptureAugmentation,
-    reader: TemporalReader,
-    request: TemporalRequest,
-    report: Report,
-) -> list[dict[str, float]] | None:
+def judge_temporal(weights: Weights, reader: TemporalReader, seed: int, report: Report) -> list[dict[str, float]]:
     """Return the mean mIoU of maps some days after a first visit, on lands that training did not see.
 
     ``kept`` is the first map and ``extent`` the later visit alone. ``prior_map`` is their fusion by the reader,
-    ``surer`` without it. ``anew`` is a second scan like the first. Returns None without a land to judge.
+    ``surer`` without it. ``anew`` is a second scan like the first.
     """
-    rows: dict[int, list[dict[str, float]]] = {days: [] for days in JUDGED_AFTER}
-    for number in range(request.judged):
-        seed = JUDGED_SEED + number
-        rng = np.random.default_rng([request.settings.seed, seed])
-        land = _Land.observed(weights, request.shape, seed, JUDGED_DAY, 11.0, rng)
-        before = land.observe(weights, augmentation, *BEFORE, rng)
-        for days in JUDGED_AFTER:
-            report(
-                "judging", (number * len(rows) + JUDGED_AFTER.index(days)) / (len(rows) * request.judged), f"{days} d"
-            )
-            later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0, rng)
-            now, anew = (later.observe(weights, augmentation, *how, rng) for how in (NOW, BEFORE))
+    scores = np.empty((len(JUDGED_AFTER), JUDGED_LANDS, len(MAPS)))
+    for number in range(JUDGED_LANDS):
+        own = JUDGED_SEED + number
+        rng = np.random.default_rng([seed, own])
+        land = _Land.observed(weights, own, JUDGED_DAY, 11.0, rng)
+        before = land.observe(weights, *BEFORE, rng)
+        for row, days in enumerate(JUDGED_AFTER):
+            report("judging", (number + row / len(JUDGED_AFTER)) / JUDGED_LANDS, f"{days} d")
+            later = _Land.observed(weights, own, JUDGED_DAY + days, 11.0, rng)
+            now, anew = (later.observe(weights, *how, rng) for how in (NOW, BEFORE))
             prior_map = PriorMap(first_probabilities(before), before.coarse, float(days), JUDGED_DAY + days)
-            probabilities = {
-                "kept": first_probabilities(before),
-                "extent": first_probabilities(now),
-                "surer": fuse(prior_map, now, None),
-                "prior_map": fuse(prior_map, now, reader),
-                "anew": first_probabilities(anew),
-            }
-            rows[days].append(
-                {
-                    name: mean_iou(confusion(later.labels, one.classes()[0], len(CLASSES)))
-                    for name, one in probabilities.items()
-                }
-            )
-    if not request.judged:
-        return None
+            fused = fuse(prior_map, now, None), fuse(prior_map, now, reader)
+            maps = [*map(first_probabilities, (before, now, anew)), *fused]
+            scores[row, number] = [mean_iou(confusion(later.labels, one.classes()[0], len(CLASSES))) for one in maps]
+    means = scores.mean(axis=1).tolist()
     return [
-        {"days": float(days), **{name: float(np.mean([row[name] for row in found])) for name in found[0]}}
-        for days, found in rows.items()
+        {"days": float(days), **dict(zip(MAPS, row, strict=True))}
+        for days, row in zip(JUDGED_AFTER, means, strict=True)
     ]
 
 
@@ -228,11 +197,9 @@ def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
     console.print(
         f"weights with a temporal reader: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
     )
-    if record["validation"]:
-        title = f"mIoU on {request.judged} lands that training did not see"
-        table = Table("days later", "first map", "visit alone", "more confident", "fused", "new full scan", title=title)
-        for row in record["validation"]:
-            figures = (f"{row[name]:.1%}" for name in ("kept", "extent", "surer", "prior_map", "anew"))
-            table.add_row(f"{row['days']:g}", *figures)
-        console.print(table)
+    title = f"mIoU on {JUDGED_LANDS} lands that training did not see"
+    table = Table("days later", *MAPS.values(), title=title)
+    for row in record["validation"]:
+        table.add_row(f"{row['days']:g}", *(f"{row[name]:.1%}" for name in MAPS))
+    console.print(table)
     return record

@@ -62,13 +62,17 @@ class ClassNames:
     names: tuple[str, ...]
     colours: NDArray[np.uint8]  # (class, 3)
 
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Return the attributes of a store, as `legend_of` reads them."""
+        return {"class_names": list(self.names), "class_colours": np.asarray(self.colours).tolist()}
+
 
 def create_class_map(
     path: Path, shape: tuple[int, ...], legend: ClassNames, *, grid: AngularGrid | None = None
 ) -> None:
     """Create a class map of (y, x) ``shape`` without classified pixels."""
-    names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-    group, place = create_placed_group(path, "class map", grid, shape, names)
+    group, place = create_placed_group(path, "class map", grid, shape, legend.attributes)
     _create_flat(group, "classes", ("y", "x"), shape, "|u1", {**class_flags(legend.names, legend.colours), **place})
     _create_flat(group, "confidence", ("y", "x"), shape, "<f4", {**CONFIDENCE, **place})
 
@@ -140,8 +144,7 @@ def create_probabilities(
 
     A store of a later visit (``goes_on``) also has the previous classes of changed pixels: `OLD_CLASS`.
     """
-    names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-    group, place = create_placed_group(path, "class_probabilities", grid, shape, names)
+    group, place = create_placed_group(path, "class_probabilities", grid, shape, legend.attributes)
     write_counts(group, **{"class": len(legend.names)})
     about: dict[str, Any] = {
         "long_name": "natural logarithm of the probability of each class",
@@ -180,23 +183,28 @@ def packed_probabilities(log_probability: Floats) -> NDArray[np.uint8]:
 
 
 def write_probabilities_tile(
-    path: Path, origin: tuple[int, int], packed: NDArray[np.uint8], age_days: Floats, light: Floats
+    path: Path,
+    origin: tuple[int, int],
+    packed: NDArray[np.uint8],
+    age_days: Floats,
+    light: Floats,
+    old_class: NDArray[np.uint8] | None = None,
 ) -> None:
     """Store `packed_probabilities` (y, x, class), (y, x) ages and light of whole shards, the first pixel at ``origin``.
 
-    Raises IncompleteStoreError: there is no store.
+    A later visit has previous classes (y, x) too, 255 where unchanged.
+    Raises IncompleteStoreError: the store is missing, or has no place for previous classes.
     """
     group = open_group(path, "r+")
-    for name, values in (("log_probability", packed), ("age", age_days), ("light", light)):
-        array_of(group, name)[tile_place(origin, age_days.shape)] = values
-
-
-def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
-    """Store the previous (y, x) classes, 255 where unchanged, of whole shards, the first pixel at ``origin``.
-
-    Raises IncompleteStoreError: the store is missing, or is of a first visit.
-    """
-    array_of(open_group(path, "r+"), OLD_CLASS)[tile_place(origin, old_class.shape)] = old_class
+    images: dict[str, NDArray[Any] | None] = {
+        "log_probability": packed,
+        "age": age_days,
+        "light": light,
+        OLD_CLASS: old_class,
+    }
+    for name, values in images.items():
+        if values is not None:
+            array_of(group, name)[tile_place(origin, age_days.shape)] = values
 
 
 class ProbabilityStore:

@@ -94,8 +94,7 @@ class GroundMapWriter:
     ) -> None:
         """Create a map; one of a later visit (``goes_on``) also has the previous classes."""
         place = map_attributes(geobox)
-        names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-        facts = {**place, **names, **about}
+        facts = {**place, **legend.attributes, **about}
         self._group = create_group(path, "class map on the ground", facts, map_coordinates(geobox))
         self._legend = legend
         images: dict[str, tuple[str, Mapping[str, Any]]] = {

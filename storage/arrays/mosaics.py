@@ -220,12 +220,11 @@ def open_mosaic(path: Path) -> Mosaic:
 
 @dataclass(frozen=True)
 class Attention:
-    """Scores of all patches, the order in which they were chosen, and the changes by the full network."""
+    """Scores of all patches, and the order in which they were chosen."""
 
     score: NDArray[np.float64]  # (patch_y, patch_x), NaN where there is none
     rank: NDArray[np.int32]  # (patch_y, patch_x), 0 = chosen first, -1 = not chosen
     policy: str
-    changed: NDArray[np.float32] | None = None  # (patch_y, patch_x) fraction of pixels of another class than before
 
 
 def write_attention(path: Path, attention: Attention) -> None:
@@ -235,19 +234,16 @@ def write_attention(path: Path, attention: Attention) -> None:
     images: dict[str, tuple[Any, type[np.generic], str]] = {
         "score": (attention.score, np.float64, f"worth of a fine look, policy {attention.policy}"),
         "rank": (attention.rank, np.int32, "order in which the patch was chosen, from 0; -1 where it was not"),
-        "changed": (attention.changed, np.float32, "fraction of pixels whose class the full network changed"),
     }
     for name, (values, kind, title) in images.items():
-        if values is not None:
-            about = {"long_name": title, "units": "1"}
-            write_image(group, name, ("patch_y", "patch_x"), np.asarray(values, kind), about)
+        about = {"long_name": title, "units": "1"}
+        write_image(group, name, ("patch_y", "patch_x"), np.asarray(values, kind), about)
 
 
 def load_attention(path: Path) -> Attention:
     """Read scores and ranks. Raises IncompleteStoreError where they are missing or damaged."""
     group = open_group(path)
-    changed = read_array(group, "changed") if "changed" in group else None
-    return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")), changed)
+    return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")))
 
 
 def chosen_patches(path: Path) -> NDArray[np.int64]:

@@ -108,12 +108,12 @@ def finish_maps(path: Path, gains: PatchGains, *, compared: bool) -> None:
 
 
 def attention_of(reading: FullReading, policy: str) -> Attention:
-    """Return expected gain, rank and change of the patches that the full network read during segmentation."""
+    """Return expected gain and rank of the patches that the full network read during segmentation."""
     count = int(np.count_nonzero(reading.read))
     best = np.argsort(np.where(reading.read, -reading.gain, np.inf).ravel(), kind="stable")
     rank = np.full(reading.gain.size, -1, np.int32)
     rank[best[:count]] = np.arange(count)
-    return Attention(reading.gain, rank.reshape(reading.gain.shape), policy, reading.changed)
+    return Attention(reading.gain, rank.reshape(reading.gain.shape), policy)
 
 
 def _prior_map_figures(

@@ -59,9 +59,8 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
     for top in range(0, SHAPE[0], 64):
         rows = slice(top, top + 64)
         packed = class_maps.packed_probabilities(values[rows])
-        class_maps.write_probabilities_tile(path, (top, 0), packed, age_days[rows], np.ones(SHAPE, np.float32)[rows])
-        if old_class is not None:
-            class_maps.write_changes_tile(path, (top, 0), old_class[rows])
+        beside = age_days[rows], np.ones(SHAPE, np.float32)[rows], None if old_class is None else old_class[rows]
+        class_maps.write_probabilities_tile(path, (top, 0), packed, *beside)
 
 
 @pytest.fixture

@@ -79,10 +79,11 @@ def test_the_command_trains_and_writes_its_record(tmp_path: Path, monkeypatch: p
     """The reader belongs to the given weights; its record has seeds, settings and validation on another land."""
     monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
     monkeypatch.setattr(remember, "VISITS", 2)
-    monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
+    for name, value in {"JUDGED_AFTER": (3,), "JUDGED_LANDS": 1, "SHAPE": (64, 96)}.items():
+        monkeypatch.setattr(remember, name, value)
     out = tmp_path / "farm.safetensors"
     weights = shipped_weights()
-    request = TemporalRequest("farm", weights, out, 1, 1, (64, 96), QUICK, "spectralzoom train")
+    request = TemporalRequest("farm", weights, out, 1, QUICK, "spectralzoom train")
     record = run_remember(request, QUIET)
     assert describe_weights(out).key == describe_weights(weights).key
     assert dict(describe_weights(out).reader.record) == record

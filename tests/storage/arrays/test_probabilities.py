@@ -105,7 +105,9 @@ def gone_on(path: Path) -> tuple[Path, np.ndarray]:
     old = np.random.default_rng(1).choice(np.array([0, 2, 255], np.uint8), SHAPE)
     class_maps.create_probabilities(path, SHAPE, LEGEND, goes_on=True)
     for top, bottom in ((0, 64), (64, 70)):
-        class_maps.write_changes_tile(path, (top, 0), old[top:bottom])
+        packed = np.zeros((bottom - top, SHAPE[1], len(LEGEND.names)), np.uint8)
+        nothing = np.zeros((2, *packed.shape[:2]), np.float32)
+        class_maps.write_probabilities_tile(path, (top, 0), packed, *nothing, old[top:bottom])
     return path, old
 
 
@@ -125,8 +127,10 @@ def test_a_first_visit_has_no_old_classes(tmp_path: Path) -> None:
     """It refuses tiles of old classes."""
     path = stored(tmp_path / "first.zarr")
     assert class_maps.ProbabilityStore(path).old_class() is None
+    packed = np.zeros((64, 64, len(LEGEND.names)), np.uint8)
+    nothing = np.zeros((2, 64, 64), np.float32)
     with pytest.raises(IncompleteStoreError, match="changed_from"):
-        class_maps.write_changes_tile(path, (0, 0), np.zeros((64, 64), np.uint8))
+        class_maps.write_probabilities_tile(path, (0, 0), packed, *nothing, packed[..., 0])
 
 
 def test_missing_probabilities_are_refused(tmp_path: Path) -> None:
