@@ -152,7 +152,7 @@ def split_labels(
     """Return the labels with the mask's class, or under a mask of one number, and all others, (y, x), 255 elsewhere."""
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
-    mask = load_codes(train_mask, scene.geobox, by_number=True).values
+    mask = load_codes(train_mask, scene.geobox).values
     if mask.shape != scene.labels.shape:
         sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
         raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x); give one of its size")

@@ -55,18 +55,17 @@ NEAR_INFRARED_NM = 800.0
 GREY_NM = 550.0
 _COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
     ("gray",): (GREY_NM,),
-    ("palette",): (GREY_NM,),
     ("red", "green", "blue"): RGB_NM,
     ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
     ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
 }
 
 
-def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> CubeSource:
+def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open an image, (y, x, band), without its alpha channel.
 
-    Scale and offset of the file are applied if ``scaled``; ``palette`` keeps the numbers of a palette. Raises
-    SceneError: there is no such file, it is damaged, or claims more than its bytes can hold.
+    Scale and offset of the file are applied if ``scaled``; else the numbers of a palette are kept. Raises SceneError:
+    there is no such file, it is damaged, claims more than its bytes can hold, or is a scene with a palette.
     """
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
@@ -82,6 +81,8 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
         claimed = (file.height, file.width, file.count)
         _check_size(path, driver, claimed, item, math.prod(block) * file.count)
         kinds = [kind.name for kind in file.colorinterp]
+        if scaled and kinds == ["palette"]:
+            raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
@@ -112,8 +113,6 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             void=_void(file, alpha),
             notes=tuple(notes),
         )
-        if driver not in _CALLED and kinds == ["palette"] and not palette:
-            source = _coloured(source, file)
     read = source.read
     void = source.void
     if scaled and void is not None and not void.all():
@@ -125,23 +124,6 @@ def open_image(path: Path, *, scaled: bool = True, palette: bool = False) -> Cub
             ),
         )
     return source if not scaled or ((scale == 1).all() and (offset == 0).all()) else rescaled(source, scale, offset)
-
-
-def _coloured(source: CubeSource, file: Any) -> CubeSource:
-    """Return the colours (y, x, 3) of a palette's numbers; clear ones are void."""
-    listed = np.zeros((256, 4), np.uint8)
-    for number, colour in file.colormap(1).items():
-        listed[number] = colour
-    clear = listed[file.read(1), 3] == 0
-    return replace(
-        source,
-        shape=(*source.shape[:2], 3),
-        read=lambda first, last: listed[source.read(first, last)[..., 0], :3],
-        bands=_of_colours(RGB_NM),
-        nodata=None,
-        void=clear if clear.any() else None,
-        notes=("colours looked up in the image's palette",),
-    )
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:

@@ -1,4 +1,4 @@
-"""Read labels of pixels from pictures: numbers, exact colours or a palette."""
+"""Read labels of pixels from pictures: numbers (also those of a palette) or exact colours."""
 
 from __future__ import annotations
 
@@ -85,17 +85,20 @@ def load_labels(
     without ``classes``.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
-    read = load_codes(address, geobox, by_number=bool(classes) and not by_colour, classes=classes.values())
+    read = load_codes(address, geobox, classes=classes.values())
     codes = read.values
     if codes.shape != shape:
         raise SceneError(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
             f"(y x x); give labels on the scene's own pixels"
         )
-    if by_colour and not read.of_colours and codes.max(initial=0) < 256:
-        codes = np.where(codes < 0, codes, codes * 0x010101)  # a grey value g is the colour (g, g, g)
+    if by_colour and not read.of_colours:
+        raise SceneError(
+            f"labels {address} have numbers, and [classes] or unlabelled has colours; write the number of each class"
+            " there, or give labels of colours"
+        )
     none = None if unlabelled is None else _code(unlabelled)
-    stated = dict(classes) or found_codes(codes, none, read.of_colours or by_colour, str(address))
+    stated = dict(classes) or found_codes(codes, none, read.of_colours, str(address))
     negative = (codes < 0) & (codes != NO_VALUE) & ~np.isin(codes, [none or 0, *map(_code, stated.values())])
     note = (f"{negative.sum()} px of labels {address} have negative values: unlabelled",) if negative.any() else ()
     return Labels(
@@ -110,32 +113,34 @@ def load_labels(
 
 def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None = None) -> dict[str, ClassValue]:
     """Return every value of several label files as one class each (SceneError as `load_labels`)."""
-    codes: set[int] = set()
-    is_colour = isinstance(unlabelled, tuple)
-    parts: list[tuple[NDArray[np.int64], bool]] = []
-    for address in addresses:
-        read = load_codes(address, by_number=False)
-        is_colour = is_colour or read.of_colours
-        parts.append((np.unique(read.values), read.of_colours))
-        found_codes(parts[-1][0], None, read.of_colours, str(address))  # raises for mixed values
-    for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
-        codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
+    codes: dict[bool, set[int]] = {}  # by whether they are colours
+    files = list(addresses)
+    for address in files:
+        read = load_codes(address)
+        found = np.unique(read.values)
+        found_codes(found, None, read.of_colours, str(address))  # raises for mixed values
+        codes.setdefault(read.of_colours, set()).update(found.tolist())
+    if len(codes) > 1:
+        raise SceneError(f"some of {len(files)} label files have colours, some have numbers; save all in one form")
     none = None if unlabelled is None else _code(unlabelled)
-    return found_codes(np.array(sorted(codes), np.int64), none, is_colour, f"of {len(parts)} files")
+    return {
+        name: value
+        for is_colour, values in codes.items()
+        for name, value in found_codes(np.array(list(values)), none, is_colour, f"of {len(files)} files").items()
+    }
 
 
 def load_codes(
-    address: str | Path, geobox: GeoBox | None = None, *, by_number: bool, classes: Collection[ClassValue] = ()
+    address: str | Path, geobox: GeoBox | None = None, *, classes: Collection[ClassValue] = ()
 ) -> LabelCodes:
     """Read a file as one whole number a pixel.
 
     NaN is no value. So are no-data value, transparent and masked pixels, if their number is none of ``classes``.
-    A file with a place is resampled to ``geobox`` by nearest neighbour. ``by_number`` takes the indices of a palette,
-    and the value of an image with equal channels. Raises SceneError: the file cannot be read, holds fractions, or lies
-    beside the geobox.
+    A file with a place is resampled to ``geobox`` by nearest neighbour. Raises SceneError: the file cannot be read,
+    holds fractions, or lies beside the geobox.
     """
-    source = open_cube(address, labels=True, by_number=by_number)
-    codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address, by_number=by_number)
+    source = open_cube(address, labels=True)
+    codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address)
     notes: list[str] = []
     if source.nodata is not None and source.nodata.is_integer():
         void = codes == int(source.nodata) * (0x010101 if of_colours else 1)
@@ -157,7 +162,7 @@ def load_codes(
     return LabelCodes(codes, of_colours, tuple(notes), regridded)
 
 
-def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
+def _whole_numbers(values: NDArray[Any], address: str | Path) -> tuple[NDArray[np.int64], bool]:
     """Return one number a pixel for (y, x, band) values, `NO_VALUE` for NaN, and whether they are colours."""
     if values.shape[2] == 1:
         values = values[..., 0]
@@ -168,8 +173,6 @@ def _whole_numbers(values: NDArray[Any], address: str | Path, *, by_number: bool
             raise SceneError(f"labels {address} hold fractions, expected whole numbers; is it a scene?")
         return rounded.astype(np.int64), False
     if values.shape[2:] == (3,) and values.dtype == np.uint8:
-        if by_number and (values == values[..., :1]).all():
-            return values[..., 0].astype(np.int64), False
         planes = values.astype(np.int64)
         return planes[..., 0] << 16 | planes[..., 1] << 8 | planes[..., 2], True
     raise SceneError(

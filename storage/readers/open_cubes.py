@@ -73,13 +73,12 @@ def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image
     return "envi" if of_envi else "none"
 
 
-def open_cube(address: str | Path, *, labels: bool = False, by_number: bool = False) -> CubeSource:
+def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
     """Open a cube; only headers, and coordinates of arrays, are read.
 
     ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
-    averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred;
-    ``by_number`` keeps the numbers of a palette. Raises SceneError: there is no such file, it is damaged, or its kind
-    or shape cannot be used.
+    averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred. Raises
+    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
     """
     path, variable = split_variable(address)
     match reader_of(address):
@@ -90,7 +89,7 @@ def open_cube(address: str | Path, *, labels: bool = False, by_number: bool = Fa
         case "envi":
             source = open_envi_source(path, scaled=not labels)
         case "image":
-            source = open_image(path, scaled=not labels, palette=by_number)
+            source = open_image(path, scaled=not labels)
         case "array":
             source = _open_arrays(path, variable, labels=labels)
             if path.suffix.lower() in ARRAY_ENDINGS and source.shape[2] == 1 and not labels and min(source.shape):

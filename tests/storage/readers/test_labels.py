@@ -52,14 +52,16 @@ def test_numbers_become_indices(tmp_path: Path, ending: str) -> None:
     assert found.index.tolist() == [[255, 0, 1], [1, 1, 0]]
 
 
-def test_a_palette_gives_indices_or_colours(tmp_path: Path) -> None:
-    """An indexed PNG gives its indices for numbered classes and its colours for coloured ones."""
+def test_a_palette_gives_indices(tmp_path: Path) -> None:
+    """An indexed PNG gives its indices; classes that are colours refuse it."""
     image = Image.new("P", (2, 2))
     image.putpalette([0, 0, 0, 0, 255, 0, 255, 0, 0])
     image.putdata([0, 1, 2, 1])
     image.save(tmp_path / "a.png")
-    for classes in (COLOURS, {"soil": 0, "crop": 1, "weed": 2}):
-        assert load_labels(tmp_path / "a.png", (2, 2), classes=classes).index.tolist() == [[0, 1], [2, 1]]
+    classes = {"soil": 0, "crop": 1, "weed": 2}
+    assert load_labels(tmp_path / "a.png", (2, 2), classes=classes).index.tolist() == [[0, 1], [2, 1]]
+    with pytest.raises(SceneError, match=r"have numbers, and .classes. or unlabelled has colours"):
+        load_labels(tmp_path / "a.png", (2, 2), classes=COLOURS)
 
 
 @pytest.mark.parametrize(("classes", "unlabelled_px"), [({}, 2), (COLOURS, 1)])
