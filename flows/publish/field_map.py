@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -104,6 +102,8 @@ def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -
 
     Pixels without class or label are transparent.
     """
+    from matplotlib.colors import to_rgba
+
     judged = (class_map != UNLABELLED) & (labels != UNLABELLED)
     colours = [(0, 0, 0, 0), *(np.rint(255 * np.array(to_rgba(one))) for one in ERROR_COLOURS.values())]
     return layer_address(np.where(judged, 1 + (class_map != labels), 0).astype(np.uint8), np.array(colours, np.uint8))
@@ -119,6 +119,8 @@ def layer_address(numbers: Bytes, colours: Bytes) -> str:
 
 def _ramp_address(values: NDArray[np.floating]) -> str:
     """Draw (y, x) values from 0 to 1 from dark to bright; unknown ones are transparent."""
+    from matplotlib import colormaps
+
     table = np.zeros((LEVELS + 2, 4), np.uint8)
     table[: LEVELS + 1] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, LEVELS + 1)))
     known = np.isfinite(values)

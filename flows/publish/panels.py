@@ -5,15 +5,16 @@ from __future__ import annotations
 import base64
 import io
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from pipeline.geometry.grid import UNLABELLED
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 COLOURS = 256  # of a PNG
 MOST_PX = 2048  # of a picture's longer side; larger fields are subsampled
@@ -39,6 +40,8 @@ def thinned(image: NDArray[np.generic]) -> tuple[slice, slice]:
 
 def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
     """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     canvas = FigureCanvasAgg(figure)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph", UserWarning)  # a letter that the font lacks is a box

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from textwrap import fill
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from flows.publish.panels import STYLE, UNLABELLED_COLOUR, class_rgb, png
@@ -18,6 +15,9 @@ from flows.terminal.figures import format_percent, spaced
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import class_counts
 from storage.arrays.mosaics import develop
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TITLE_LETTERS, CAPTION_LETTERS = 7.5, 9.0  # to an inch of a line
 LETTER_IN, MARK_IN = 0.15, 0.7  # of the legend
@@ -46,6 +46,8 @@ class QuicklookData:
 
 def draw_quicklook(data: QuicklookData) -> bytes:
     """Draw the four panels as a PNG of about 1800 x 1400 px."""
+    import matplotlib as mpl  # after its cache folder is placed
+
     with mpl.rc_context(STYLE):
         grey = np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8)
         return png(_compose(data), np.vstack([data.class_colours, grey]))
@@ -56,6 +58,8 @@ _FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked
 
 
 def _compose(data: QuicklookData) -> Figure:
+    from matplotlib.figure import Figure
+
     height, width = data.class_map.shape
     tallness = height / width
     rows, columns = (4, 1) if tallness < _FLAT else (1, 4) if tallness > _TALL else (2, 2)
@@ -97,6 +101,8 @@ def _panels(data: QuicklookData) -> Iterator[tuple[str, NDArray[np.floating]]]:
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, page: float) -> None:
+    from matplotlib.patches import Patch
+
     counts = class_counts(data.class_map, len(data.class_names))
     words = zip(data.class_names, map(format_percent, counts / max(int(counts.sum()), 1)), strict=True)
     names = [f"{spaced(name)[:MOST_LETTERS]}  {fraction}" for name, fraction in words]
