@@ -26,7 +26,7 @@ from flows.settings.load import anchor_paths
 from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
 from flows.tasks.capture_plan import as_figures
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
-from flows.tasks.prior_maps import prior_map_figures
+from flows.tasks.prior_maps import PRIOR_FIGURES
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.scene import seen_in_training
 from flows.tasks.stages.accuracy import load_accuracy
@@ -188,7 +188,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     plan = load_plan(products["score"])
     figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
-    prior = prior_map_figures(products["segment"].path)
+    prior = None if run.prior is None else dict(read_table(products["segment"].path / PRIOR_FIGURES))
     if run.recorded is not None:
         found["recording"] = {
             "sweeps": str(run.settings.sweeps),

@@ -242,12 +242,8 @@ def draw_field(
         )
     compared = [part.comparison for part in parts if part.comparison is not None]
     reading = None
-    if least_gain is not None:
-        shape = field.regions[0].field.patch_shape
-        reading = FullReading(np.zeros(shape), np.zeros(shape, np.bool_))
-        for region, part in zip(field.regions, parts, strict=True):
-            for name, whole in vars(reading).items():
-                whole[region.kept_patches.rows, region.kept_patches.columns] = getattr(part.reading, name)
+    if read := [part.reading for part in parts if part.reading is not None]:
+        reading = FullReading(field.joined([one.gain for one in read]), field.joined([one.read for one in read]))
     unread, unlike, captured = (
         sum(getattr(part, name) for part in parts) for name in ("unread_px", "unlike", "captured")
     )

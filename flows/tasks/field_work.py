@@ -210,7 +210,7 @@ class FieldWork:
 
         Raises SettingsError: one region does not fit the memory.
         """
-        found = self._joined(
+        found = self.joined(
             self._of_regions(Scoring(self.weights, mosaic, capture, policy), mosaic, NO_PATCHES, report)
         )
         return gain_of(found[..., 0, :], found[..., 1, :].sum(axis=(0, 1))) if policy == GAIN else found
@@ -223,7 +223,7 @@ class FieldWork:
         work = ExpectedErrors(self.weights, mosaic, capture)
         parts: list[PatchExpectedErrors] = self._of_regions(work, mosaic, NO_PATCHES, report)
         shapes = [(*region.kept_patches.shape, *parts[0].wrong.shape) for region in self.regions]
-        pixels = self._joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+        pixels = self.joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
         pixels = pixels.reshape(-1, *parts[0].wrong.shape)
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
@@ -243,7 +243,7 @@ class FieldWork:
         pool = self.pool_for(patch_index, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
         return run_blocks(worker, self.regions, pool, report=report)
 
-    def _joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def joined(self, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Join arrays of all regions' own patches to that of the padded grid, (patch_y, patch_x, ...)."""
         whole = np.zeros((*self.regions[0].field.patch_shape, *parts[0].shape[2:]), parts[0].dtype)
         for region, part in zip(self.regions, parts, strict=True):

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from odc.geo.geobox import GeoBox
 
@@ -21,7 +20,6 @@ from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.archive import Archive, run_stem
 from storage.archive.keys import StageRef, published_runs
-from storage.archive.manifests import read_table
 from storage.archive.records import Run, moment_of, read_run
 from storage.arrays.class_maps import ProbabilityStore
 from storage.arrays.georeference import load_geobox
@@ -180,9 +178,3 @@ def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -
         return moment[0] - day + (moment[1] - hour) / 24
     created = moment_of(run.created)
     return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
-
-
-def prior_map_figures(store: Path) -> dict[str, Any] | None:
-    """Return the figures of the prior map of a stored map; None for a first visit."""
-    record = store / PRIOR_FIGURES
-    return dict(read_table(record)) if record.is_file() else None

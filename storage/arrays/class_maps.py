@@ -232,11 +232,8 @@ class ProbabilityStore:
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
-        return values, self.age(rows, columns), np.nan_to_num(read_array(self._group, "light", np.s_[rows, columns]))
-
-    def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
-        """Return (y, x) days since each pixel was captured; NaN where unknown."""
-        return read_array(self._group, "age", np.s_[rows, columns])
+        age, light = (read_array(self._group, name, np.s_[rows, columns]) for name in ("age", "light"))
+        return values, age, np.nan_to_num(light)
 
     def old_class(self) -> NDArray[np.uint8] | None:
         """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""

@@ -14,15 +14,7 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_places import M2_PER_HECTARE
-from storage.arrays.class_maps import (
-    CONFIDENCE,
-    OLD_CLASS,
-    ClassNames,
-    check_named,
-    class_flags,
-    legend_of,
-    old_class_flags,
-)
+from storage.arrays.class_maps import CONFIDENCE, OLD_CLASS, ClassNames, check_named, class_flags, old_class_flags
 from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, map_coordinates
 from storage.arrays.layout import (
     SHARD_COLUMNS,
@@ -77,11 +69,8 @@ def open_image(path: Path, name: str) -> StoredImage:
 
 @dataclass(frozen=True)
 class GroundMap:
-    """A stored map in memory, without its confidence and changes."""
+    """Grid of a stored map, and the areas in it."""
 
-    classes: NDArray[np.uint8]  # (y, x) index into the legend's names, 255 = none or not seen
-    picture: NDArray[np.uint8]  # (y, x, 3) red green blue, 0 where not seen
-    legend: ClassNames
     geobox: GeoBox
     areas: dict[str, dict[str, float]]  # of each class: m2, ha, fraction of the classified area
 
@@ -132,10 +121,9 @@ class GroundMapWriter:
 
 
 def load_ground_map(path: Path) -> GroundMap:
-    """Read a map. Raises IncompleteStoreError where it is missing or damaged."""
-    group = open_group(path)
-    areas: Any = dict(group.attrs).get("areas", {})
+    """Read grid and areas of a map. Raises IncompleteStoreError where it is missing or damaged."""
+    areas: Any = dict(open_group(path).attrs).get("areas", {})
     geobox = load_geobox(path)
     if geobox is None:
         raise IncompleteStoreError(f"{path} has no grid mapping; it is no map of the ground")
-    return GroundMap(read_array(group, "classes"), read_array(group, PICTURE), legend_of(group), geobox, areas)
+    return GroundMap(geobox, areas)

@@ -240,18 +240,12 @@ def write_attention(path: Path, attention: Attention) -> None:
         write_image(group, name, ("patch_y", "patch_x"), np.asarray(values, kind), about)
 
 
-def load_attention(path: Path) -> Attention:
-    """Read scores and ranks. Raises IncompleteStoreError where they are missing or damaged."""
-    group = open_group(path)
-    return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")))
-
-
 def chosen_patches(path: Path) -> NDArray[np.int64]:
     """Return the numbers of the patches that an attention store chose, ascending.
 
     Raises IncompleteStoreError: missing or damaged.
     """
-    return np.flatnonzero(load_attention(path).rank.ravel() >= 0)
+    return np.flatnonzero(read_array(open_group(path), "rank").ravel() >= 0)
 
 
 def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, int], str]:

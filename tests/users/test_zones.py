@@ -22,7 +22,8 @@ from pipeline.errors import SettingsError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
-from storage.arrays.mosaics import chosen_patches, load_attention
+from storage.arrays.layout import open_group, read_array
+from storage.arrays.mosaics import chosen_patches
 from tests.conftest import Survey
 from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch
@@ -120,15 +121,15 @@ def test_patches_outside_or_in_a_hole_are_never_chosen(kept_to: tuple[Path, Publ
     """Their score is 0 and they have no rank."""
     out, published = kept_to
     products = published.receipt["products"]
-    attention = load_attention(out / products["attention"])
-    rows, columns = attention.score.shape
+    score, rank = (read_array(open_group(out / products["attention"]), name) for name in ("score", "rank"))
+    rows, columns = rank.shape
     patch_index = [shapely.box(8 * x, 8 * y, 8 * x + 8, 8 * y + 8) for y in range(rows) for x in range(columns)]
     barred = np.array([not patch_number.intersects(AREA) for patch_number in patch_index])
     cut = chosen_patches(out / products["attention"])
     assert len(cut) > 10
     assert not barred[cut].any()
-    assert (attention.rank.ravel()[barred] == -1).all()
-    assert (attention.score.ravel()[barred] == 0).all()
+    assert (rank.ravel()[barred] == -1).all()
+    assert (score.ravel()[barred] == 0).all()
 
 
 def test_lines_outside_are_left_out(kept_to: tuple[Path, Published], opened: Opened, zones: dict[str, str]) -> None:

@@ -22,8 +22,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
-from storage.arrays.layout import consolidate_stores
-from storage.arrays.mosaics import load_attention
+from storage.arrays.layout import consolidate_stores, open_group, read_array
 from storage.parallel.pool import WorkerPool
 from tests.conftest import Flags, Survey
 
@@ -115,7 +114,7 @@ def test_scores_of_regions_equal_those_of_the_field(
     parts = _work(run, WorkerPool(workers=2), halo_px).score(policy, mosaic, run.capture, lambda done: None)
     np.testing.assert_allclose(parts, whole, rtol=within)  # gains are sums over the field
     if policy == run.settings.policy:
-        assert (load_attention(_store(stages, "score").path / "attention.zarr").score == whole).all()
+        assert (read_array(open_group(_store(stages, "score").path / "attention.zarr"), "score") == whole).all()
 
 
 def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:
