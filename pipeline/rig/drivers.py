@@ -20,10 +20,10 @@ from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FAKE, SurveyRig
+from pipeline.rig.device_settings import CONTROL_PORT, FAKE, SurveyRig
 from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
 from pipeline.rig.mirror_controller import open_mirror
-from pipeline.rig.transports import SYSTEM_CLOCK, Clock
+from pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport
 from pipeline.simulator.simulated import SimulatedSource
 
 __all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
@@ -40,35 +40,26 @@ class MirrorDriver(Protocol):
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; return once it is acknowledged, not at rest.
 
-        Raises
-        ------
-        PoseError : the position lies outside the disk; nothing was sent.
-        StateUnknown : the motion was sent and not acknowledged.
+        Raises PoseError: the position lies outside the disk; nothing was sent. Raises StateUnknown: the motion was sent
+        and not acknowledged.
         """
 
     def settle(self, within_s: float) -> None:
         """Wait at most ``within_s`` seconds until the mirror is at rest.
 
-        Raises
-        ------
-        RigError : it is not at rest by then, or not where it was sent.
+        Raises RigError: it is not at rest by then, or not where it was sent.
         """
 
     def load_path(self, positions: ArrayLike) -> None:
         """Store positions (position, 2) for `run`. Nothing moves; a path that plays is halted.
 
-        Raises
-        ------
-        PoseError : a position lies outside the disk.
-        SettingsError : the device holds fewer positions.
+        Raises PoseError: a position lies outside the disk. Raises SettingsError: the device holds fewer positions.
         """
 
     def run(self, rate_hz: float) -> None:
         """Play the loaded positions once, ``rate_hz`` a second by the device's own clock.
 
-        Raises
-        ------
-        StateUnknown : the motion was sent and not acknowledged.
+        Raises StateUnknown: the motion was sent and not acknowledged.
         """
 
     def halt(self) -> None:
@@ -84,23 +75,16 @@ class CameraDriver(Protocol):
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period of later captures. [ms]
 
-        Raises
-        ------
-        SettingsError : the camera does not take such times.
+        Raises SettingsError: the camera does not take such times.
         """
 
     def capture(self, frames: int, *, prefix: str = "") -> Capture:
         """Begin a capture of ``frames`` frames; return once the camera acknowledged it.
 
-        Parameters
-        ----------
-        prefix
-            Up to 128 letters, digits, - and _ that the capture's name begins with. ``references`` asks for dark and
-            white frames beside it, see `references`.
+        Its name begins with ``prefix``, up to 128 letters, digits, - and _. ``references`` asks for dark and white
+        frames beside it, see `references`.
 
-        Raises
-        ------
-        StateUnknown : it was asked for and not acknowledged; it may run.
+        Raises StateUnknown: it was asked for and not acknowledged; it may run.
         """
 
     def is_capturing(self) -> bool:
@@ -112,19 +96,11 @@ class CameraDriver(Protocol):
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Return a finished capture's lines (line, sample, band) uint16, with their frames' numbers and stamps [us].
 
-        Parameters
-        ----------
-        folder
-            As `capture` returned it; it may have been captured by an earlier process.
-        kept
-            Where a driver may keep what it fetches, so that a later call continues.
-        progress
-            Called with a file's name, bytes held and bytes in all.
+        ``folder`` is as `capture` returned it, maybe in an earlier process. A driver may keep in ``kept`` what it
+        fetches, so that a later call continues. ``progress`` gets a file's name, bytes held and bytes in all.
 
-        Raises
-        ------
-        RigError : the capture still runs, or is damaged.
-        DeviceRefused : the camera does not have it any more.
+        Raises RigError: the capture still runs, or is damaged. Raises DeviceRefused: the camera does not have it any
+        more.
         """
 
     def references(self, folder: str, kept: Kept) -> dict[str, MeanFrame]:
@@ -159,12 +135,9 @@ _PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver
 def open_devices(rig: SurveyRig, vector_pairs: int, seen: SimulatedSource | None = None) -> RigDevices:
     """Connect to mirror and camera. Nothing moves. ``seen`` is the scene before a fake camera.
 
-    Raises
-    ------
-    SettingsError : a driver of another make cannot be imported, or is none.
-    DeviceGone : there is no such port, it is in use, or the camera is not there.
-    DeadlinePassed : nothing answers.
-    RigError : another device answers.
+    Raises SettingsError: a driver of another make cannot be imported, or is none. Raises DeviceGone: there is no such
+    port, it is in use, or the camera is not there. Raises DeadlinePassed: nothing answers. Raises RigError: another
+    device answers.
     """
     clock = FakeClock() if rig.mirror_driver == rig.camera_driver == FAKE else SYSTEM_CLOCK
     with ExitStack() as opened:
@@ -195,16 +168,14 @@ def open_camera_driver(
         return FakeCamera(clock, seen)
     factory = import_factory(rig, "camera_driver")
     if factory is None:
-        return HeadwallCamera.at(rig.host, rig.files, clock=clock)
+        return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
     return cast("CameraDriver", _opened(factory, rig, "camera_driver", clock))
 
 
 def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
     """Import the function that opens a driver of another make; None where the settings name a shipped one.
 
-    Raises
-    ------
-    SettingsError : it cannot be imported.
+    Raises SettingsError: it cannot be imported.
     """
     name: str = getattr(rig, setting)
     try:

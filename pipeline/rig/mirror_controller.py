@@ -114,10 +114,6 @@ class ProLink:
         """Send a request once that writes and moves nothing."""
         self.ask(frame, name, bytes, "write")
 
-    def move(self, frame: pro.Frame, name: str) -> None:
-        """Send a request once that moves the mirror."""
-        self.ask(frame, name, bytes, "motion")
-
     def _answer(self, found: pro.Frame, sent: pro.Frame, name: str, parse: Callable[[bytes], Answer]) -> Answer | None:
         """Return the answer in a frame; None, and a line in the log, where it does not answer the request."""
         port = self.wire.port
@@ -292,7 +288,7 @@ class MirrorController:
     def _move(self, values: dict[int, pro.Value], name: str) -> None:
         if (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
-        self._link.move(pro.set_values(values), name)
+        self._link.ask(pro.set_values(values), name, bytes, "motion")
 
 
 def open_mirror(rig: SurveyRig, vector_pairs: int = 1500, clock: Clock = SYSTEM_CLOCK) -> MirrorController:

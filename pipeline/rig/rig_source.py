@@ -40,16 +40,9 @@ BARREN = 2  # captures in a row without a line, after which a sweep fails
 class RigSource:
     """A :class:`pipeline.source.Source` over a rig. Devices are opened when they are first needed.
 
-    Parameters
-    ----------
-    camera, wavelength_nm, field_shape
-        The camera of the settings, (band,) centres [nm] and (y, x) size of the field [px].
-    open_devices
-        Connects both; they are closed when a session, or a call outside of one, ends.
-    kept
-        Store of the camera's files and the journal. The store of an earlier process continues its captures.
-    vector_pairs
-        Positions that the mirror's memory holds.
+    ``camera``, ``wavelength_nm`` (band,) [nm] and ``field_shape`` (y, x) [px] are those of the settings.
+    ``open_devices`` connects both; they are closed when a session, or a call outside of one, ends. ``kept`` stores the
+    camera's files and the journal; that of an earlier process continues its captures.
     """
 
     name = "rig"
@@ -89,23 +82,19 @@ class RigSource:
 
     def keeping(self, kept: Kept) -> RigSource:
         """Return the same source with its files elsewhere."""
-        other = self.saying(self._say)
-        other._kept = kept
-        other._journal = CaptureJournal(kept)
-        other._whole = {}
-        return other
+        return self._copied(_kept=kept, _journal=CaptureJournal(kept), _whole={})
 
     def saying(self, say: Say) -> RigSource:
         """Return the same source that calls ``say`` while no line comes, with its step: upload, capture or transfer."""
-        other = copy(self)
-        other._say = say
-        other._runner = None
-        return other
+        return self._copied(_say=say)
 
     def opening(self, open_devices: Callable[[], RigDevices]) -> RigSource:
         """Return the same source over other devices."""
-        other = self.saying(self._say)
-        other._open = open_devices
+        return self._copied(_open=open_devices)
+
+    def _copied(self, **changed: Any) -> RigSource:
+        other = copy(self)
+        vars(other).update(changed, _runner=None)
         return other
 
     @contextmanager

@@ -68,6 +68,7 @@ class NotKept(RigError):  # noqa: N818 - the name states the case
 
 _SLICE_S = 0.02  # reads wait in slices, so a deadline may be exceeded by one
 _WRITE_S = 0.25  # a frame takes 10 ms at 115200
+_CONNECT_S = 3.0
 _MOST_DRAINED = 1 << 20  # bytes
 DEADLINE_S = 1.0  # longest time of a transaction
 RETRIES = 2  # of a read within it
@@ -181,14 +182,14 @@ class SerialTransport:
 class SocketTransport:
     """A :class:`Transport` to ``host:port``; DeviceGone where no device answers."""
 
-    def __init__(self, host: str, port: int, clock: Clock = SYSTEM_CLOCK, *, connect_s: float = 3.0) -> None:
+    def __init__(self, host: str, port: int, clock: Clock = SYSTEM_CLOCK) -> None:
         self.port = f"{host}:{port}"
         self._clock = clock
         try:
-            self._socket = socket.create_connection((host, port), timeout=connect_s)
+            self._socket = socket.create_connection((host, port), timeout=_CONNECT_S)
         except (OSError, UnicodeError) as error:
             raise DeviceGone(
-                f"no connection to {self.port} within {connect_s:g} s ({error}); is the camera on, its network cable "
+                f"no connection to {self.port} within {_CONNECT_S:g} s ({error}); is the camera on, its network cable "
                 "in, and this machine's address in its network?"
             ) from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

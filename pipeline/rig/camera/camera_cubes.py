@@ -37,13 +37,12 @@ class CubeLines:
 
 @dataclass(frozen=True)
 class CapturedLines:
-    """The whole lines of a capture, in order. ``lost`` further lines are in its header, but not whole in its file."""
+    """The whole lines of a capture, in order."""
 
     values: NDArray[np.uint16]  # (line, sample, band)
     first_frame: int  # number of the first line's frame by the file's name
     times: LineTimes
     notes: tuple[str, ...] = ()
-    lost: int = 0
 
 
 def parse_cube_header(text: str, where: str) -> EnviHeader:
@@ -87,7 +86,7 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
     if cube.lost:
         notes.append(f"raw_{first} is cut off: {held} of {held + cube.lost} lines are whole")
     times = _times(by_name, first, cube, read, notes) or LineTimes.unknown(held)
-    return CapturedLines(cube.values.astype(np.uint16, copy=False), first, times, tuple(notes), cube.lost)
+    return CapturedLines(cube.values.astype(np.uint16, copy=False), first, times, tuple(notes))
 
 
 def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:

@@ -11,22 +11,13 @@ import logging
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Self
+from typing import Any
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
 from pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.device_settings import CONTROL_PORT, FileServer
-from pipeline.rig.transports import (
-    SYSTEM_CLOCK,
-    Answer,
-    Clock,
-    DeadlinePassed,
-    DeviceRefused,
-    SocketTransport,
-    StateUnknown,
-    Transport,
-)
+from pipeline.rig.device_settings import FileServer
+from pipeline.rig.transports import SYSTEM_CLOCK, Answer, Clock, DeadlinePassed, DeviceRefused, StateUnknown, Transport
 
 LOG = logging.getLogger(__name__)
 DEADLINE_S = 5.0  # from a command's first byte to the prompt
@@ -119,11 +110,6 @@ class HeadwallCamera:
         self._line: Transport | None = None
         self._reader = ReplyReader()
 
-    @classmethod
-    def at(cls, host: str, server: FileServer, *, clock: Clock = SYSTEM_CLOCK) -> Self:
-        """Return a camera on the network."""
-        return cls(lambda: SocketTransport(host, CONTROL_PORT, clock), server, clock=clock)
-
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]"""
         self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: None)
@@ -160,10 +146,7 @@ class HeadwallCamera:
         return self._ask("listFiles", folder, as_listing)
 
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
-        """Fetch a finished capture's files, small ones first, and return its lines; a later call continues.
-
-        Raises RigError where the capture still runs, or its files do not belong together.
-        """
+        """Fetch a finished capture's files, small ones first, and return its lines; a later call continues."""
         files = sorted(self._finished(folder), key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
         fetch_files(self.server, files, kept, progress, clock=self.clock)
         return read_capture([file.name for file in files], _reader(kept))

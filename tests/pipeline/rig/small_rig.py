@@ -86,7 +86,7 @@ class FaultyCamera(FakeCamera):
         if cut is None:
             return found
         times = replace(found.times, frame=found.times.frame[:cut], stamp_us=found.times.stamp_us[:cut])
-        return replace(found, values=found.values[:cut], times=times, lost=len(found.values) - cut)
+        return replace(found, values=found.values[:cut], times=times)
 
     def _act(self, name: str) -> None:
         if self.acts[name]:

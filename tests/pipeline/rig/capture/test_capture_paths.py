@@ -55,11 +55,11 @@ PATH = capture_paths.next_path(FINE, 3, CAMERA, vector_pairs=6)  # lines 3 to 9
 TAKEN = capture_paths.CaptureRecord(FINE, 3, 9, "/captured/x", (0.1, 0.2), (0.1, 0.2))
 
 
-def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
-    """Return a capture with these frame numbers of the index and with ``lost`` lines missing at its end."""
+def frames(numbers: list[int], first: int = 0) -> CapturedLines:
+    """Return a capture with these frame numbers of the index."""
     told = np.array(numbers, np.int64)
     times = LineTimes(told, np.where(told >= 0, 10**15 + told * 100_000, -1))
-    return CapturedLines(np.zeros((len(told), 48, 3), np.uint16), first, times, lost=lost)
+    return CapturedLines(np.zeros((len(told), 48, 3), np.uint16), first, times)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def frames(numbers: list[int], lost: int = 0, first: int = 0) -> CapturedLines:
     [
         (frames([0, 1, 3, 4, 5]), [0, 1, -1, 2, 3, 4]),
         (frames([70, 71, 72, 73, 74, 75], first=70), [0, 1, 2, 3, 4, 5]),
-        (frames([0, 1, 2, 3], lost=2), [0, 1, 2, 3]),
+        (frames([0, 1, 2, 3]), [0, 1, 2, 3]),
     ],
     ids=["frame 2 dropped", "counted from 70", "two lost at the end"],
 )

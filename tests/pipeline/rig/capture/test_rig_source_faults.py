@@ -145,6 +145,18 @@ def test_a_rig_of_unknown_state_gets_no_command():
     assert rig.opened == opened
 
 
+def test_a_rig_of_unknown_state_gets_no_command_in_an_open_session():
+    """A mirror whose motion was not acknowledged is not sent anywhere again, though the devices are connected."""
+    rig = SmallRig()
+    rig.mirror.goto = Mock(side_effect=StateUnknown("going is not sent again"))  # type: ignore[method-assign]
+    source = rig.source()
+    with source.session():
+        for words in ("not sent again", "no further command"):
+            with pytest.raises(StateUnknown, match=words):
+                list(source.lines(FINE))
+    assert rig.mirror.goto.call_count == 1
+
+
 def killed_amid(rig: SmallRig, kept: KeptInMemory) -> None:
     """Start to capture the sweep and get killed while waiting."""
     with pytest.raises(KilledError):

@@ -49,7 +49,7 @@ def test_pro_mode_sends_every_kind_of_request():
         link = pro(transport)
         assert link.ask(get_value(0x680A), "it", cell_int) == 300
         link.set(set_value(0x5002, 0.5), "it")
-        link.move(set_value(0x5002, 0.5), "it")
+        link.ask(set_value(0x5002, 0.5), "it", bytes, "motion")
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_a_refused_motion_blocks_nothing():
     with scripted([(SET, bytes.fromhex("7E 00 90 04 00 00 01 03 AD 01 7E"))]) as transport:
         link = pro(transport)
         with pytest.raises(DeviceRefused, match="out of range"):
-            link.move(set_value(0x5002, 0.5), "it")
+            link.ask(set_value(0x5002, 0.5), "it", bytes, "motion")
 
 
 def test_a_wrong_crc_is_refused(caplog: pytest.LogCaptureFixture):
