@@ -74,6 +74,9 @@ def format_score(receipt: Mapping[str, Any]) -> str:
         scene = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
         right = format_points(accuracy.get("overall_accuracy"))
         score = f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)"
+        if accuracy.get("none") and accuracy.get("all"):  # with controls
+            none, every = (format_points(accuracy[which]["miou"]) for which in ("none", "all"))
+            score += f"; the small network alone gives {none}, the full network on every patch {every}"
         return f"{score}. {format_worst_class(accuracy)}".rstrip()
     if is_foreign(receipt):
         unlike = format_percent(receipt["unlike"]["fraction"])
