@@ -177,7 +177,8 @@ def test_headline_is_one_paragraph_with_the_figures():
     """It has score, worst class and capture time; without labels it has no score."""
     assert headline(make_receipt()) == (
         "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct); the small network alone gives 50.0, the full"
-        " network on every patch 87.5. The map's worst class is bare weed with 60.0. Capture time: 104 s (50 % of the reference, 209 s)."
+        " network on every patch 87.5. The map's worst class is bare weed with 60.0."
+        " Capture time: 104 s (50 % of the reference, 209 s)."
     )
     assert "labels (" not in headline(make_receipt(labels=False))
 
