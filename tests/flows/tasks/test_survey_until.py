@@ -33,8 +33,7 @@ def stages(archive: Path) -> set[str]:
     return {folder.name for folder in (archive / "stages").iterdir()}
 
 
-@pytest.mark.parametrize("engine", ["plain", "prefect"])
-@pytest.mark.parametrize("scan", [UNIFORM, TWICE], ids=["uniform", "twice"])
+@pytest.mark.parametrize(("scan", "engine"), [(UNIFORM, "plain"), (TWICE, "prefect")], ids=["uniform", "twice"])
 def test_a_stopped_survey_goes_on(tmp_path: Path, scan: dict[str, str], engine: str) -> None:
     """Lines are captured once, and the map equals that of a survey in one go."""
     asked = small(tmp_path / "a", **scan, engine=engine)
