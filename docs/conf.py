@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from importlib import metadata
 
-from flows.settings.documents import settings_table
-from flows.tasks.open_survey import STAGES
+from spectralzoom.flows.settings.documents import settings_table
+from spectralzoom.flows.tasks.open_survey import STAGES
 
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")

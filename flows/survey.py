@@ -1,7 +1,7 @@
 """Define the survey as a Prefect flow: from raw sweeps to a class map and its receipt.
 
-    from flows.settings.parameters import SurveySettings
-    from flows.survey import survey
+    from spectralzoom.flows.settings.parameters import SurveySettings
+    from spectralzoom.flows.survey import survey
 
     if __name__ == "__main__":  # Prefect imports the program of a served flow again for every run
         survey(SurveySettings(scene="farm", seconds=25))                          # once, now
@@ -15,18 +15,18 @@ No ``from __future__ import annotations`` here: Prefect reads the signatures.
 
 from prefect import flow
 
-from flows.publish.publishing import clear_raw, publish
-from flows.settings.parameters import SurveySettings
-from flows.tasks.captures import captured_signal, first_mosaic, plan_capture
-from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import score
-from flows.tasks.stages.condense import condense_raster
-from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import ground, segment
-from flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
-from pipeline.errors import SurveyStopped
-from storage.archive.keys import StageRef
+from spectralzoom.flows.publish.publishing import clear_raw, publish
+from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.tasks.captures import captured_signal, first_mosaic, plan_capture
+from spectralzoom.flows.tasks.open_survey import OpenSurvey, RunRef
+from spectralzoom.flows.tasks.stages.accuracy import evaluate
+from spectralzoom.flows.tasks.stages.attention import score
+from spectralzoom.flows.tasks.stages.condense import condense_raster
+from spectralzoom.flows.tasks.stages.effects import choose_effects
+from spectralzoom.flows.tasks.stages.maps import ground, segment
+from spectralzoom.flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
+from spectralzoom.pipeline.errors import SurveyStopped
+from spectralzoom.storage.archive.keys import StageRef
 
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)

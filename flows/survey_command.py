@@ -11,24 +11,24 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt_table import print_summary
-from flows.publish.run_folder import Published, load_receipt
-from flows.settings.parameters import SurveySettings
-from flows.settings.survey_settings import Settings
-from flows.tasks.captures import opened_first
-from flows.tasks.local_server import (
+from spectralzoom.flows.publish.receipt_table import print_summary
+from spectralzoom.flows.publish.run_folder import Published, load_receipt
+from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.tasks.captures import opened_first
+from spectralzoom.flows.tasks.local_server import (
     ServerUnavailable,
     check_answers,
     local_server,
     quiet_environment,
     wait_until_recorded,
 )
-from flows.tasks.open_survey import TITLES, RunRef
-from flows.tasks.prefect_tasks import Observer, inside_flow, observed_by
-from flows.terminal.progress import StageProgress
-from models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
-from storage.archive.archive import Archive
-from storage.archive.staging import remove_tree, take_lock
+from spectralzoom.flows.tasks.open_survey import TITLES, RunRef
+from spectralzoom.flows.tasks.prefect_tasks import Observer, inside_flow, observed_by
+from spectralzoom.flows.terminal.progress import StageProgress
+from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.staging import remove_tree, take_lock
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -60,7 +60,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
     Inside another flow its tasks become tasks of that flow.
     """
-    from flows.survey import survey  # Prefect takes a second
+    from spectralzoom.flows.survey import survey  # Prefect takes a second
 
     asked = SurveySettings.of(settings)
     if settings.engine != "plain" and not inside_flow():

@@ -24,48 +24,60 @@ from rich.console import Console
 from rich.markup import escape
 from scipy.ndimage import gaussian_filter
 
-from flows.settings.flags import AsJson, OutFile
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import RASTER, Settings, SignalChoice
-from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.scene import check_labels
-from flows.terminal.figures import format_bytes
-from flows.terminal.processes import writing
-from flows.terminal.progress import on_stdout, print_json, show_text, stderr, table
-from models.evaluation.metrics import confusion, mean_iou
-from models.network.machine import keep_freed_memory, one_thread
-from models.network.sizes import TOKEN_PX
-from models.network.spectral import LineSpec
-from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, DrawnMap, read_coarse_pass, read_coarse_prediction, segment
-from models.weights.files import Weights
-from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts
-from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import BYTES_PER_SAMPLE, cheapest_full, frame_patches, raw_bytes, uniform_sweeps
-from pipeline.planning.uniform_scans import format_scan
-from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.region import mosaic_rows
-from pipeline.rectify.resample import resample
-from pipeline.signal.calibrate import calibrate
-from pipeline.signal.condense import score_lines, whole_steps
-from pipeline.signal.lines import BLOCK_LINES
-from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.probe import noise_electrons
-from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.survey_probe import probe_scene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
-from pipeline.source import SweepLines
-from storage.archive.archive import Archive
-from storage.archive.whole_files import to_json
-from storage.arrays.layout import packed_size
+from spectralzoom.flows.settings.flags import AsJson, OutFile
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import RASTER, Settings, SignalChoice
+from spectralzoom.flows.tasks.run import SurveyRun, open_run
+from spectralzoom.flows.tasks.scene import check_labels
+from spectralzoom.flows.terminal.figures import format_bytes
+from spectralzoom.flows.terminal.processes import writing
+from spectralzoom.flows.terminal.progress import on_stdout, print_json, show_text, stderr, table
+from spectralzoom.models.evaluation.metrics import confusion, mean_iou
+from spectralzoom.models.network.machine import keep_freed_memory, one_thread
+from spectralzoom.models.network.sizes import TOKEN_PX
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.policies.policies import score_patches
+from spectralzoom.models.reading.inference import (
+    CoarsePrediction,
+    DrawnMap,
+    read_coarse_pass,
+    read_coarse_prediction,
+    segment,
+)
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts
+from spectralzoom.pipeline.geometry.scan import CostModel
+from spectralzoom.pipeline.planning.coverage import (
+    BYTES_PER_SAMPLE,
+    cheapest_full,
+    frame_patches,
+    raw_bytes,
+    uniform_sweeps,
+)
+from spectralzoom.pipeline.planning.uniform_scans import format_scan
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rectify.region import mosaic_rows
+from spectralzoom.pipeline.rectify.resample import resample
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.signal.condense import score_lines, whole_steps
+from spectralzoom.pipeline.signal.lines import BLOCK_LINES
+from spectralzoom.pipeline.signal.subspace import SignalStatistics, find_components
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.probe import noise_electrons
+from spectralzoom.pipeline.simulator.readout import dark_frame, read_out
+from spectralzoom.pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
+from spectralzoom.pipeline.source import SweepLines
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.arrays.layout import packed_size
 
 Setting = str | float
 Values = NDArray[np.float32]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
+from spectralzoom.pipeline.errors import SceneError
 
 NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
 MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}

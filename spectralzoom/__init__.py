@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import PipelineError as Error
+from spectralzoom.pipeline.errors import PipelineError as Error
 
 if TYPE_CHECKING:
     from spectralzoom.opened import OpenedArchive, OpenedRun, open

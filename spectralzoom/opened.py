@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.errors import IncompleteStoreError, NoRunError
-from storage.archive.archive import Archive
-from storage.archive.keys import LATEST
-from storage.archive.manifests import CURE
-from storage.archive.records import LINE_PRODUCTS, Run, read_run
-from storage.arrays.layout import damage_named, open_group
+from spectralzoom.pipeline.errors import IncompleteStoreError, NoRunError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import LATEST
+from spectralzoom.storage.archive.manifests import CURE
+from spectralzoom.storage.archive.records import LINE_PRODUCTS, Run, read_run
+from spectralzoom.storage.arrays.layout import damage_named, open_group
 
 if TYPE_CHECKING:
     import xarray

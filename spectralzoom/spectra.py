@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from storage.arrays.georeference import GRID_MAPPING
-from storage.arrays.layout import array_of, open_group
-from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
+from spectralzoom.storage.arrays.georeference import GRID_MAPPING
+from spectralzoom.storage.arrays.layout import array_of, open_group
+from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
+from spectralzoom.storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
 
 OpenStore = Callable[[Path], Mosaic | SignalCube]
 OF_WAVELENGTHS = ("band", "wavelength")

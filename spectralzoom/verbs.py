@@ -12,17 +12,17 @@ import threadpoolctl
 from pydantic import TypeAdapter, ValidationError
 
 import spectralzoom.opened as opened
-from flows.archive.plan_command import plan_content
-from flows.settings.load import load_settings
-from flows.terminal.processes import place_caches
-from flows.terminal.progress import Listener, heard_by, on_stderr
-from pipeline.errors import SettingsError
+from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.terminal.processes import place_caches
+from spectralzoom.flows.terminal.progress import Listener, heard_by, on_stderr
 from spectralzoom.opened import OpenedRun
+from spectralzoom.pipeline.errors import SettingsError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flows.settings.survey_settings import Settings
+    from spectralzoom.flows.settings.survey_settings import Settings
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
@@ -52,7 +52,7 @@ def survey(settings: Asked = None, *, progress: Listener | None = None, quiet: b
     SurveyStopped
         The keyword ``until`` stops the survey before its class map; ``uri`` names the store.
     """
-    from flows.survey_command import run_survey
+    from spectralzoom.flows.survey_command import run_survey
 
     asked = _settings(settings, flags)
     with _working(progress, quiet=quiet) as console:
@@ -107,8 +107,8 @@ def evaluate(dataset: str | Path, *, progress: Listener | None = None, **flags: 
     Error
         A value or a file is not valid.
     """
-    from flows.cli.model_verbs import EvaluateFlags
-    from flows.evaluate.command import evaluate_weights
+    from spectralzoom.flows.cli.model_verbs import EvaluateFlags
+    from spectralzoom.flows.evaluate.command import evaluate_weights
 
     if "weights" not in flags:
         raise SettingsError("evaluate needs weights=FILE, the weights to judge on the data set")
@@ -145,7 +145,7 @@ def train(
     Error
         A value or a file is not valid.
     """
-    from flows.cli.model_verbs import TrainFlags, run_training
+    from spectralzoom.flows.cli.model_verbs import TrainFlags, run_training
 
     arguments = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
     asked = _flags(TrainFlags, "train", flags)

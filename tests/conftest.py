@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 
-from flows import survey_command
-from flows.publish.run_folder import Published
-from flows.settings.load import load_settings
-from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
-from models.network.spectral import Normalisation, SpectralBasis
-from models.weights.files import Weights, save_weights, with_record
-from storage.readers.labels import DEFAULT_COLOURS
+from spectralzoom.flows import survey_command
+from spectralzoom.flows.publish.run_folder import Published
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.models.network.segmenter import Segmenter
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
+from spectralzoom.models.weights.files import Weights, save_weights, with_record
+from spectralzoom.storage.readers.labels import DEFAULT_COLOURS
 from tests.object_server import bucket, s3_server  # noqa: F401 - fixtures
 from tests.prior_work import remember, with_effects, without_effects
 from tests.zarr_at_once import close_loops, work_at_once

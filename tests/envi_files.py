@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from storage.arrays.cubes import RawCube
+from spectralzoom.storage.arrays.cubes import RawCube
 
 CODES = {"u1": 1, "f4": 4, "u2": 12}
 

@@ -11,7 +11,7 @@ import numpy as np
 import rasterio
 import xarray as xr
 
-from pipeline.ground.view import RigPose
+from spectralzoom.pipeline.ground.view import RigPose
 
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 

@@ -36,8 +36,8 @@ import torch  # noqa: E402
 import xarray as xr  # noqa: E402
 
 import spectralzoom  # noqa: E402
-from flows.settings.survey_settings import Settings  # noqa: E402
 from spectralzoom import OpenedRun  # noqa: E402
+from spectralzoom.flows.settings.survey_settings import Settings  # noqa: E402
 
 GOLDEN = ROOT / "tests" / "golden.json"
 WRITE = "python tests/golden.py"

@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.publish import run_folder
-from flows.publish.quicklook import QuicklookData
-from flows.tasks.stages import effects as effect_choice
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import uniform_sweeps
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import raster_from_values
+from spectralzoom.flows.publish import run_folder
+from spectralzoom.flows.publish.quicklook import QuicklookData
+from spectralzoom.flows.tasks.stages import effects as effect_choice
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.coverage import uniform_sweeps
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
 
 PURE = {effect_choice: ("probe_survey", "decide"), run_folder: ("draw_quicklook",)}
 WORKED_OUT: dict[str, tuple[ModuleType, Any]] = {

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from models.network.sizes import multiply_adds
-from models.network.spectral import LineSpec, patches_of
-from models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
-from models.reading.inference import CoarsePrediction, segment
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import select_patches
-from pipeline.simulator.scenes.scene import raster_from_values
+from spectralzoom.models.network.sizes import multiply_adds
+from spectralzoom.models.network.spectral import LineSpec, patches_of
+from spectralzoom.models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
+from spectralzoom.models.reading.inference import CoarsePrediction, segment
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.coverage import select_patches
+from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
 from tests.conftest import CLASSES, patchy_scene, random_weights
 
 BENCHMARKS = Path(__file__).parent / "benchmarks"

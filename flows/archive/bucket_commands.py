@@ -9,13 +9,13 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 from rich.console import Console
 
-from flows.settings.flags import ArchiveName, AsJson
-from flows.terminal.figures import counted, format_bytes
-from flows.terminal.processes import DONE, PARTLY
-from flows.terminal.progress import StageProgress, put_out, stderr
-from storage.archive.archive import Archive
-from storage.remote import bucket
-from storage.remote.objects import Objects, parse_place
+from spectralzoom.flows.settings.flags import ArchiveName, AsJson
+from spectralzoom.flows.terminal.figures import counted, format_bytes
+from spectralzoom.flows.terminal.processes import DONE, PARTLY
+from spectralzoom.flows.terminal.progress import StageProgress, put_out, stderr
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.remote import bucket
+from spectralzoom.storage.remote.objects import Objects, parse_place
 
 BucketName = Annotated[str, Parameter(name="bucket", help="Address in a bucket: s3://bucket/prefix.")]
 

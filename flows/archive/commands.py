@@ -13,19 +13,19 @@ from rich.console import Console
 from rich.markup import escape
 from rich.tree import Tree
 
-from flows.settings.flags import ArchiveName, AsJson, Switch
-from flows.settings.load import OF_THE_PLAN
-from flows.settings.survey_settings import ALWAYS, RECORDED, Settings
-from flows.tasks.scores import score_of
-from flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
-from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
-from storage.archive.archive import Archive
-from storage.archive.lineage import Catalogue, find_product
-from storage.archive.records import Run
-from storage.archive.whole_files import to_json
-from storage.maintenance.garbage import clear_up
-from storage.maintenance.verification import Finding, verify_everything
+from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Switch
+from spectralzoom.flows.settings.load import OF_THE_PLAN
+from spectralzoom.flows.settings.survey_settings import ALWAYS, RECORDED, Settings
+from spectralzoom.flows.tasks.scores import score_of
+from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
+from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
+from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.lineage import Catalogue, find_product
+from spectralzoom.storage.archive.records import Run
+from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.maintenance.garbage import clear_up
+from spectralzoom.storage.maintenance.verification import Finding, verify_everything
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "stage", "what")  # never folded

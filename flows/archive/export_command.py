@@ -17,7 +17,7 @@ from urllib.parse import quote
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.export_layers import (
+from spectralzoom.flows.archive.export_layers import (
     NO_PRODUCTS,
     ExportedRun,
     Layer,
@@ -28,17 +28,17 @@ from flows.archive.export_layers import (
     open_exported,
     prior_map_layers,
 )
-from flows.archive.export_polygons import check_doses, write_polygons
-from flows.archive.export_values import spectral_layers, write_areas
-from flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
-from flows.terminal.processes import DONE
-from flows.terminal.progress import print_json, stderr
-from pipeline.errors import ArchiveError, PipelineError
-from storage.archive.archive import Archive
-from storage.archive.manifests import read_manifest
-from storage.archive.staging import take_lock
-from storage.archive.whole_files import remove_leftovers, to_json, write_whole
-from storage.export.image_files import write_cog
+from spectralzoom.flows.archive.export_polygons import check_doses, write_polygons
+from spectralzoom.flows.archive.export_values import spectral_layers, write_areas
+from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
+from spectralzoom.flows.terminal.processes import DONE
+from spectralzoom.flows.terminal.progress import print_json, stderr
+from spectralzoom.pipeline.errors import ArchiveError, PipelineError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.manifests import read_manifest
+from spectralzoom.storage.archive.staging import take_lock
+from spectralzoom.storage.archive.whole_files import remove_leftovers, to_json, write_whole
+from spectralzoom.storage.export.image_files import write_cog
 
 COLLECTION = "collection.json"
 COG, CSV = "image/tiff; application=geotiff; profile=cloud-optimized", "text/csv"

@@ -15,23 +15,23 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from flows.publish.receipt import Receipt, check_receipt
-from flows.settings.flags import Switch, split_list
-from flows.settings.load import time_of_visit
-from flows.settings.survey_settings import RIG
-from flows.tasks.stages.maps import colours_of
-from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.georeference import zoomed_out
-from pipeline.products.indices import SpectralIndex, find_index
-from storage.archive.archive import Archive
-from storage.archive.keys import LATEST, StageRef
-from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
-from storage.arrays.georeference import grid_of, load_geobox
-from storage.arrays.ground_maps import StoredImage, open_image
-from storage.arrays.layout import open_group
-from storage.export.image_files import ANGULAR, CogImage, angular_geobox
+from spectralzoom.flows.publish.receipt import Receipt, check_receipt
+from spectralzoom.flows.settings.flags import Switch, split_list
+from spectralzoom.flows.settings.load import time_of_visit
+from spectralzoom.flows.settings.survey_settings import RIG
+from spectralzoom.flows.tasks.stages.maps import colours_of
+from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.georeference import zoomed_out
+from spectralzoom.pipeline.products.indices import SpectralIndex, find_index
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import LATEST, StageRef
+from spectralzoom.storage.archive.records import RECEIPT, read_run, read_store
+from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
+from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
+from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
+from spectralzoom.storage.arrays.layout import open_group
+from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
 
 
 @Parameter(name="*")

@@ -10,12 +10,12 @@ import numpy as np
 import shapely
 from affine import Affine
 
-from flows.archive.export_layers import ExportedRun, ProductChoice
-from pipeline.errors import ArchiveError, SettingsError
-from pipeline.geometry.grid import UNLABELLED
-from storage.archive.whole_files import written_aside
-from storage.arrays.class_maps import legend_of
-from storage.arrays.ground_maps import open_image
+from spectralzoom.flows.archive.export_layers import ExportedRun, ProductChoice
+from spectralzoom.pipeline.errors import ArchiveError, SettingsError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.archive.whole_files import written_aside
+from spectralzoom.storage.arrays.class_maps import legend_of
+from spectralzoom.storage.arrays.ground_maps import open_image
 
 GEOPACKAGE, SHAPEFILE = "application/geopackage+sqlite3", "application/vnd.shp"
 PARTS = (".shp", ".shx", ".dbf", ".cpg", ".prj")  # of a shapefile

@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 from odc.geo.geobox import GeoBox
 
-from flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
-from models.evaluation.metrics import stratified_fractions
-from pipeline.errors import SettingsError
-from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
-from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
-from storage.archive.whole_files import write_whole
-from storage.arrays.georeference import grid_of, load_geobox
-from storage.arrays.ground_maps import open_image
-from storage.arrays.layout import open_group, read_bands
-from storage.arrays.mosaics import Mosaic, open_mosaic
-from storage.export.image_files import CogImage
+from spectralzoom.flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
+from spectralzoom.models.evaluation.metrics import stratified_fractions
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
+from spectralzoom.pipeline.ground.view import GroundView, RigPose
+from spectralzoom.pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
+from spectralzoom.storage.archive.whole_files import write_whole
+from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
+from spectralzoom.storage.arrays.ground_maps import open_image
+from spectralzoom.storage.arrays.layout import open_group, read_bands
+from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
+from spectralzoom.storage.export.image_files import CogImage
 
 COLUMNS = (
     *("class", "pixels", "hectares", "fraction", "mean_confidence"),

@@ -15,28 +15,28 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.publish.findings import field_figures
-from flows.publish.receipt_table import finding_rows
-from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import ALWAYS, Settings
-from flows.settings.values import EXTENT_WHOLE
-from flows.tasks.capture_plan import as_figures
-from flows.tasks.open_survey import STAGES, OpenSurvey
-from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.scores import MOST_ERROR, format_prediction
-from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import load_plan
-from flows.terminal.figures import DASH, counted, format_bytes, format_count, format_seconds, known_number
-from flows.terminal.processes import DONE
-from flows.terminal.progress import put_out, table
-from pipeline.errors import IncompleteStoreError, PipelineError
-from pipeline.geometry.scan import exposing
-from pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
-from pipeline.planning.fine_pass import FinePlan
-from pipeline.planning.uniform_scans import format_scan, frontier
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef, is_archive, store_at
+from spectralzoom.flows.publish.findings import field_figures
+from spectralzoom.flows.publish.receipt_table import finding_rows
+from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import ALWAYS, Settings
+from spectralzoom.flows.settings.values import EXTENT_WHOLE
+from spectralzoom.flows.tasks.capture_plan import as_figures
+from spectralzoom.flows.tasks.open_survey import STAGES, OpenSurvey
+from spectralzoom.flows.tasks.run import SurveyRun, open_run
+from spectralzoom.flows.tasks.scores import MOST_ERROR, format_prediction
+from spectralzoom.flows.tasks.stages.accuracy import evaluate
+from spectralzoom.flows.tasks.stages.attention import load_plan
+from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_count, format_seconds, known_number
+from spectralzoom.flows.terminal.processes import DONE
+from spectralzoom.flows.terminal.progress import put_out, table
+from spectralzoom.pipeline.errors import IncompleteStoreError, PipelineError
+from spectralzoom.pipeline.geometry.scan import exposing
+from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
+from spectralzoom.pipeline.planning.fine_pass import FinePlan
+from spectralzoom.pipeline.planning.uniform_scans import format_scan, frontier
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef, is_archive, store_at
 
 
 def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
@@ -129,7 +129,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
 
     Raises PipelineError: the survey would be refused for another reason than its size.
     """
-    from flows.survey import draw_class_map  # Prefect takes a second
+    from spectralzoom.flows.survey import draw_class_map  # Prefect takes a second
 
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet

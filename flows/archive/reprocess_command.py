@@ -17,26 +17,26 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
-from flows.settings.load import load_settings, of_this_version, parse_settings
-from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
-from flows.survey_command import run_survey
-from flows.tasks.open_survey import STAGES, versions
-from flows.tasks.recorded_field import open_recorded
-from flows.tasks.scene import open_map, open_scene
-from flows.tasks.scores import score_of
-from flows.tasks.survey_model import weights_path
-from flows.terminal.figures import counted, format_points, format_seconds
-from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import put_out, show_text, stderr
-from models.weights.files import describe_weights
-from pipeline.errors import PipelineError, SceneError, SettingsError
-from storage.archive.archive import Archive
-from storage.archive.keys import canonical_json
-from storage.archive.lineage import Catalogue
-from storage.archive.records import Run, read_run
-from storage.parallel.pool import THREADS, WorkerPool
-from storage.readers.recordings import stores_of_lines
+from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
+from spectralzoom.flows.settings.load import load_settings, of_this_version, parse_settings
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.open_survey import STAGES, versions
+from spectralzoom.flows.tasks.recorded_field import open_recorded
+from spectralzoom.flows.tasks.scene import open_map, open_scene
+from spectralzoom.flows.tasks.scores import score_of
+from spectralzoom.flows.tasks.survey_model import weights_path
+from spectralzoom.flows.terminal.figures import counted, format_points, format_seconds
+from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
+from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
+from spectralzoom.models.weights.files import describe_weights
+from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import canonical_json
+from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.archive.records import Run, read_run
+from spectralzoom.storage.parallel.pool import THREADS, WorkerPool
+from spectralzoom.storage.readers.recordings import stores_of_lines
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
 

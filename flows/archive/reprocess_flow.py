@@ -11,9 +11,9 @@ from prefect import flow
 from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy
 from prefect.types.entrypoint import EntrypointType
 
-from flows.archive.reprocess_command import reprocess_fields
-from flows.terminal.progress import on_stderr
-from pipeline.errors import ArchiveError
+from spectralzoom.flows.archive.reprocess_command import reprocess_fields
+from spectralzoom.flows.terminal.progress import on_stderr
+from spectralzoom.pipeline.errors import ArchiveError
 
 ONE_AT_A_TIME: dict[str, Any] = {  # options of each deployment that is served
     "concurrency_limit": ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),

@@ -9,10 +9,10 @@ import sys
 
 from cyclopts import CycloptsError
 
-from flows.cli.app import GOES_ON, VERBS, build_app
-from flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
-from flows.terminal.progress import say, stderr
-from pipeline.errors import SettingsError
+from spectralzoom.flows.cli.app import GOES_ON, VERBS, build_app
+from spectralzoom.flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
+from spectralzoom.flows.terminal.progress import say, stderr
+from spectralzoom.pipeline.errors import SettingsError
 
 INTERRUPTED = 130
 

@@ -10,17 +10,17 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 from rich.console import Console
 
-from flows.evaluate.command import run_evaluate
-from flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
-from flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
-from flows.terminal.progress import print_json, stderr
-from flows.training.train import asked_command, check_counts, run_train
-from flows.training.train_scenes import TrainRequest
-from flows.training.train_temporal import LANDS, TemporalRequest, run_remember
-from models.network.machine import PROCESSOR, Device
-from models.training.temporal import TemporalTraining
-from models.training.train import TrainingSettings
-from pipeline.errors import SettingsError
+from spectralzoom.flows.evaluate.command import run_evaluate
+from spectralzoom.flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
+from spectralzoom.flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
+from spectralzoom.flows.terminal.progress import print_json, stderr
+from spectralzoom.flows.training.train import asked_command, check_counts, run_train
+from spectralzoom.flows.training.train_scenes import TrainRequest
+from spectralzoom.flows.training.train_temporal import LANDS, TemporalRequest, run_remember
+from spectralzoom.models.network.machine import PROCESSOR, Device
+from spectralzoom.models.training.temporal import TemporalTraining
+from spectralzoom.models.training.train import TrainingSettings
+from spectralzoom.pipeline.errors import SettingsError
 
 
 @Parameter(name="*")

@@ -17,16 +17,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.settings.flags import AsJson, Switch
-from flows.settings.load import load_settings
-from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import on_stdout, print_json, stderr
-from pipeline.errors import PipelineError, RigError
-from pipeline.rig.camera.camera_files import log_in
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.capture_runner import SETTLE_S
-from pipeline.rig.drivers import CameraDriver, MirrorDriver, open_camera_driver, open_mirror_driver
-from pipeline.rig.mirror_controller import MirrorController
+from spectralzoom.flows.settings.flags import AsJson, Switch
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
+from spectralzoom.flows.terminal.progress import on_stdout, print_json, stderr
+from spectralzoom.pipeline.errors import PipelineError, RigError
+from spectralzoom.pipeline.rig.camera.camera_files import log_in
+from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
+from spectralzoom.pipeline.rig.capture_runner import SETTLE_S
+from spectralzoom.pipeline.rig.drivers import CameraDriver, MirrorDriver, open_camera_driver, open_mirror_driver
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController
 
 Device = Literal["mirror", "camera"]
 

@@ -24,20 +24,20 @@ from prefect.runner import Runner
 from prefect.states import Cancelled, Crashed
 from pydantic import ValidationError
 
-from flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.survey import survey
-from flows.tasks.local_server import check_answers, local_server, quiet_environment
-from flows.tasks.open_survey import RIG_LIMIT
-from flows.tasks.run import open_run
-from flows.tasks.survey_model import weights_path
-from flows.terminal.processes import DONE, terminable
-from flows.terminal.progress import show_text
-from models.weights.files import describe_weights
-from pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
-from storage.archive.archive import Archive
-from storage.archive.staging import read_toml, take_lock
+from spectralzoom.flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey import survey
+from spectralzoom.flows.tasks.local_server import check_answers, local_server, quiet_environment
+from spectralzoom.flows.tasks.open_survey import RIG_LIMIT
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.tasks.survey_model import weights_path
+from spectralzoom.flows.terminal.processes import DONE, terminable
+from spectralzoom.flows.terminal.progress import show_text
+from spectralzoom.models.weights.files import describe_weights
+from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.staging import read_toml, take_lock
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

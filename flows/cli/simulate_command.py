@@ -12,24 +12,24 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt_table import print_effects
-from flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.tasks.capture_plan import PassLayout
-from flows.tasks.run import CaptureRun, make_source
-from flows.tasks.scene import SimulatedField, farm_refusal, open_scene
-from flows.tasks.stage import Stage, Wanted
-from flows.tasks.stages.capture import capture_coarse
-from flows.tasks.stages.effects import choose_effects, load_manifest
-from flows.terminal.figures import counted, format_bytes, format_seconds
-from flows.terminal.progress import StageProgress, print_json, stderr
-from models.network.machine import keep_freed_memory
-from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Sweep
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
+from spectralzoom.flows.publish.receipt_table import print_effects
+from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.tasks.capture_plan import PassLayout
+from spectralzoom.flows.tasks.run import CaptureRun, make_source
+from spectralzoom.flows.tasks.scene import SimulatedField, farm_refusal, open_scene
+from spectralzoom.flows.tasks.stage import Stage, Wanted
+from spectralzoom.flows.tasks.stages.capture import capture_coarse
+from spectralzoom.flows.tasks.stages.effects import choose_effects, load_manifest
+from spectralzoom.flows.terminal.figures import counted, format_bytes, format_seconds
+from spectralzoom.flows.terminal.progress import StageProgress, print_json, stderr
+from spectralzoom.models.network.machine import keep_freed_memory
+from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
 
 TITLES = {"effects": "choice of effects", "capture": "scan"}
 PATCH = 16  # of the shipped weights, so that scans are those of their surveys

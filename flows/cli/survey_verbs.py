@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
-from flows.settings.load import load_settings
-from flows.terminal.processes import format_failure
-from flows.terminal.progress import print_json, say, stderr
-from pipeline.errors import SurveyStopped
+from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.terminal.processes import format_failure
+from spectralzoom.flows.terminal.progress import print_json, say, stderr
+from spectralzoom.pipeline.errors import SurveyStopped
 
 Verbose = Annotated[
     bool, Parameter(name=("--verbose", "-v"), negative="", help="Print all savings, stages and effects.")
@@ -29,7 +29,7 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     settings
         Settings files (TOML), surveyed one after the other; flags override each. Default: none.
     """
-    from flows.survey_command import run_survey
+    from spectralzoom.flows.survey_command import run_survey
 
     every = [load_settings(file, by_setting(flags)) for file in settings or (None,)]
     printed: list[dict[str, Any]] = []

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.evaluate.frames import (
+from spectralzoom.flows.evaluate.frames import (
     Candidate,
     EvaluateRequest,
     checked_request,
@@ -20,14 +20,14 @@ from flows.evaluate.frames import (
     open_frames,
     sort_frames,
 )
-from flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
-from flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
-from flows.terminal.processes import writing
-from flows.terminal.progress import StageProgress, put_out, show_text, table
-from flows.training.data import Report, TrainingData
-from models.network.machine import choose_device, keep_freed_memory
-from models.weights.files import Weights, load_weights
-from storage.archive.whole_files import to_json, write_whole
+from spectralzoom.flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
+from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
+from spectralzoom.flows.terminal.processes import writing
+from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
+from spectralzoom.flows.training.data import Report, TrainingData
+from spectralzoom.models.network.machine import choose_device, keep_freed_memory
+from spectralzoom.models.weights.files import Weights, load_weights
+from spectralzoom.storage.archive.whole_files import to_json, write_whole
 
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
 CAPTION = (

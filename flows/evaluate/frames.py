@@ -15,8 +15,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.scene import check_labels, judged_labels, seen_in_training
-from flows.training.data import (
+from spectralzoom.flows.tasks.scene import check_labels, judged_labels, seen_in_training
+from spectralzoom.flows.training.data import (
     Report,
     TrainingData,
     alike_notes,
@@ -25,19 +25,19 @@ from flows.training.data import (
     open_training_data,
     scene_notes,
 )
-from flows.training.observed_scenes import observe_scene
-from models.network.machine import PROCESSOR
-from models.network.spectral import patches_of
-from models.policies.policies import POLICIES
-from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
-from models.training.examples import normalised
-from models.weights.checksummed_files import refusing
-from models.weights.files import Description, Weights, describe_weights
-from pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.simulator.scenes.built_in import built_in_laws
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.flows.training.observed_scenes import observe_scene
+from spectralzoom.models.network.machine import PROCESSOR
+from spectralzoom.models.network.spectral import patches_of
+from spectralzoom.models.policies.policies import POLICIES
+from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
+from spectralzoom.models.training.examples import normalised
+from spectralzoom.models.weights.checksummed_files import refusing
+from spectralzoom.models.weights.files import Description, Weights, describe_weights
+from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
+from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
 JUDGED = tuple(name for name in POLICIES if name != "mask")  # needs a file

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import EvaluateRequest, ObservedFrame
-from models.evaluation.metrics import (
+from spectralzoom.flows.evaluate.frames import EvaluateRequest, ObservedFrame
+from spectralzoom.models.evaluation.metrics import (
     average_accuracy,
     confusion,
     false_pixels,
@@ -23,12 +23,12 @@ from models.evaluation.metrics import (
     mean_iou,
     overall_accuracy,
 )
-from models.network.sizes import multiply_adds
-from models.policies.placement import mixed
-from models.policies.policies import score_multiply_adds, score_patches
-from models.reading.inference import segment
-from models.weights.files import Weights
-from pipeline.planning.coverage import frame_patches
+from spectralzoom.models.network.sizes import multiply_adds
+from spectralzoom.models.policies.placement import mixed
+from spectralzoom.models.policies.policies import score_multiply_adds, score_patches
+from spectralzoom.models.reading.inference import segment
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.planning.coverage import frame_patches
 
 RANDOM_DRAWS = 5
 ENDS = ("none", "all")  # no patch, every patch

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
-from flows.publish.quicklook import QuicklookData
-from flows.publish.receipt_table import format_days
-from flows.tasks.prior_maps import Prior
-from flows.terminal.figures import format_percent, spaced
-from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import class_counts
-from storage.arrays.layout import open_group, read_array
-from storage.arrays.mosaics import develop
+from spectralzoom.flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
+from spectralzoom.flows.publish.quicklook import QuicklookData
+from spectralzoom.flows.publish.receipt_table import format_days
+from spectralzoom.flows.tasks.prior_maps import Prior
+from spectralzoom.flows.terminal.figures import format_percent, spaced
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.arrays.class_maps import class_counts
+from spectralzoom.storage.arrays.layout import open_group, read_array
+from spectralzoom.storage.arrays.mosaics import develop
 
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent

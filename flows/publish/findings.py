@@ -11,23 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.receipt_table import FOREIGN
-from flows.settings.values import EXTENT_WHOLE
-from flows.tasks.run import SurveyRun
-from flows.tasks.scores import MOST_ERROR
-from flows.tasks.stages.maps import SPECTRA
-from flows.terminal.figures import format_points
-from models.evaluation.expected_scores import expected_counts
-from pipeline.geometry.grid import UNLABELLED, cuts
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
-from pipeline.ground.georeference import crs_name, pixel_side_m
-from pipeline.ground.zones import figures_of_plot
-from pipeline.planning.fine_pass import FinePlan
-from storage.archive.keys import StageRef
-from storage.archive.manifests import read_table
-from storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
-from storage.arrays.ground_maps import GroundMap
-from storage.arrays.layout import SHARD_ROWS
+from spectralzoom.flows.publish.receipt_table import FOREIGN
+from spectralzoom.flows.settings.values import EXTENT_WHOLE
+from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.flows.tasks.scores import MOST_ERROR
+from spectralzoom.flows.tasks.stages.maps import SPECTRA
+from spectralzoom.flows.terminal.figures import format_points
+from spectralzoom.models.evaluation.expected_scores import expected_counts
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
+from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
+from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
+from spectralzoom.pipeline.ground.zones import figures_of_plot
+from spectralzoom.pipeline.planning.fine_pass import FinePlan
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import read_table
+from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
+from spectralzoom.storage.arrays.ground_maps import GroundMap
+from spectralzoom.storage.arrays.layout import SHARD_ROWS
 
 PLOTS_FILE = "plots.csv"
 STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,17 +6,17 @@ import base64
 import io
 from contextlib import suppress
 
-from flows.publish.receipt_table import finding_rows, headline
-from flows.publish.report import render_markdown
-from flows.publish.run_folder import Published, publish_run
-from flows.settings.values import KEEP_SIGNAL
-from flows.tasks.open_survey import OpenSurvey, RunRef
-from flows.tasks.prefect_tasks import as_task, inside_flow
-from flows.tasks.stages.attention import load_plan
-from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import raw_differs
-from storage.archive.keys import StageRef
-from storage.archive.lineage import Catalogue
+from spectralzoom.flows.publish.receipt_table import finding_rows, headline
+from spectralzoom.flows.publish.report import render_markdown
+from spectralzoom.flows.publish.run_folder import Published, publish_run
+from spectralzoom.flows.settings.values import KEEP_SIGNAL
+from spectralzoom.flows.tasks.open_survey import OpenSurvey, RunRef
+from spectralzoom.flows.tasks.prefect_tasks import as_task, inside_flow
+from spectralzoom.flows.tasks.stages.attention import load_plan
+from spectralzoom.flows.tasks.stages.capture import capture_coarse, capture_fine
+from spectralzoom.flows.tasks.stages.condense import raw_differs
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.lineage import Catalogue
 
 PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
 WIDTH_PX = 800  # of the picture in the text

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.panels import STYLE, UNLABELLED_COLOUR, class_rgb, png
-from flows.terminal.figures import format_percent, spaced
-from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import class_counts
-from storage.arrays.mosaics import develop
+from spectralzoom.flows.publish.panels import STYLE, UNLABELLED_COLOUR, class_rgb, png
+from spectralzoom.flows.terminal.figures import format_percent, spaced
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.arrays.class_maps import class_counts
+from spectralzoom.storage.arrays.mosaics import develop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

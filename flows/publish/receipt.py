@@ -12,10 +12,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from flows.settings.survey_settings import RASTER
-from pipeline.errors import ShapeError
-from storage.archive.records import StageRecord
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.settings.survey_settings import RASTER
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.storage.archive.records import StageRecord
+from spectralzoom.storage.archive.whole_files import to_json
 
 Receipt = dict[str, Any]
 Facts = dict[str, Any]

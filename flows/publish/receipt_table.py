@@ -9,10 +9,10 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt import Receipt
-from flows.tasks.scene import TRAINING_SCENE
-from flows.tasks.scores import format_prediction, format_worst_class
-from flows.terminal.figures import (
+from spectralzoom.flows.publish.receipt import Receipt
+from spectralzoom.flows.tasks.scene import TRAINING_SCENE
+from spectralzoom.flows.tasks.scores import format_prediction, format_worst_class
+from spectralzoom.flows.terminal.figures import (
     counted,
     format_area,
     format_bytes,
@@ -24,9 +24,9 @@ from flows.terminal.figures import (
     spaced,
     three_digits,
 )
-from flows.terminal.progress import table
-from pipeline.planning.uniform_scans import format_scan
-from pipeline.simulator.selection.choice import UNIT_NAMES
+from spectralzoom.flows.terminal.progress import table
+from spectralzoom.pipeline.planning.uniform_scans import format_scan
+from spectralzoom.pipeline.simulator.selection.choice import UNIT_NAMES
 
 COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "capture_s": ("capture time", format_seconds),

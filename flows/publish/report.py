@@ -19,15 +19,21 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from flows.publish.field_map import FieldMap
-from flows.publish.panels import data_address
-from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import finding_rows, format_reference, headline, saving_rows, shown_accuracy
-from flows.tasks.scores import error_matrix, format_false_classes
-from flows.terminal.figures import format_percent, format_points
-from pipeline.errors import visible
-from storage.archive.records import LINE_PRODUCTS
-from storage.readers.open_cubes import split_variable
+from spectralzoom.flows.publish.field_map import FieldMap
+from spectralzoom.flows.publish.panels import data_address
+from spectralzoom.flows.publish.receipt import Receipt
+from spectralzoom.flows.publish.receipt_table import (
+    finding_rows,
+    format_reference,
+    headline,
+    saving_rows,
+    shown_accuracy,
+)
+from spectralzoom.flows.tasks.scores import error_matrix, format_false_classes
+from spectralzoom.flows.terminal.figures import format_percent, format_points
+from spectralzoom.pipeline.errors import visible
+from spectralzoom.storage.archive.records import LINE_PRODUCTS
+from spectralzoom.storage.readers.open_cubes import split_variable
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")
@@ -37,7 +43,7 @@ _MARKDOWN = "\\`*_{}[]<>#|"
 @cache
 def part(name: str) -> str:
     """Return a file of this folder for a page, without lines that refer to other files."""
-    text = files("flows.publish").joinpath(name).read_text(encoding="utf-8").replace("\r\n", "\n")
+    text = files("spectralzoom.flows.publish").joinpath(name).read_text(encoding="utf-8").replace("\r\n", "\n")
     elsewhere = "url(" if name.endswith(".css") else "//# sourceMappingURL="  # unused pictures; source maps
     return "\n".join(line for line in text.split("\n") if elsewhere not in line)
 
@@ -60,7 +66,7 @@ def render_markdown(template: str, **facts: Any) -> str:
 @cache
 def _environment(*, markdown: bool) -> Environment:
     found = Environment(
-        loader=PackageLoader("flows.publish", "templates"),
+        loader=PackageLoader("spectralzoom.flows.publish", "templates"),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

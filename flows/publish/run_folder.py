@@ -16,35 +16,43 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.field_map import field_map
-from flows.publish.findings import PLOTS_FILE, field_figures, find_areas, find_ground, find_map, find_zones, plots_csv
-from flows.publish.panels import thinned
-from flows.publish.quicklook import QuicklookData, draw_quicklook
-from flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
-from flows.publish.report import render_report
-from flows.settings.load import anchor_paths
-from flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
-from flows.tasks.capture_plan import as_figures
-from flows.tasks.open_survey import STAGES, OpenSurvey, Products
-from flows.tasks.prior_maps import PRIOR_FIGURES
-from flows.tasks.run import SurveyRun, now
-from flows.tasks.scene import seen_in_training
-from flows.tasks.stages.accuracy import load_accuracy
-from flows.tasks.stages.attention import READING, load_plan, read_in_full
-from flows.tasks.stages.effects import load_manifest
-from flows.tasks.stages.maps import STORE
-from flows.tasks.stages.placement import SIGNAL_RECORD, load_registration
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
-from pipeline.planning.fine_pass import FinePlan
-from storage.archive.keys import StageRef
-from storage.archive.manifests import CURE, read_table
-from storage.archive.records import RECEIPT, read_run
-from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import ProbabilityStore, load_class_map
-from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.mosaics import choose_bands, open_mosaic
+from spectralzoom.flows.publish.field_map import field_map
+from spectralzoom.flows.publish.findings import (
+    PLOTS_FILE,
+    field_figures,
+    find_areas,
+    find_ground,
+    find_map,
+    find_zones,
+    plots_csv,
+)
+from spectralzoom.flows.publish.panels import thinned
+from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook
+from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
+from spectralzoom.flows.publish.report import render_report
+from spectralzoom.flows.settings.load import anchor_paths
+from spectralzoom.flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
+from spectralzoom.flows.tasks.capture_plan import as_figures
+from spectralzoom.flows.tasks.open_survey import STAGES, OpenSurvey, Products
+from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
+from spectralzoom.flows.tasks.run import SurveyRun, now
+from spectralzoom.flows.tasks.scene import seen_in_training
+from spectralzoom.flows.tasks.stages.accuracy import load_accuracy
+from spectralzoom.flows.tasks.stages.attention import READING, load_plan, read_in_full
+from spectralzoom.flows.tasks.stages.effects import load_manifest
+from spectralzoom.flows.tasks.stages.maps import STORE
+from spectralzoom.flows.tasks.stages.placement import SIGNAL_RECORD, load_registration
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
+from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
+from spectralzoom.pipeline.planning.fine_pass import FinePlan
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import CURE, read_table
+from spectralzoom.storage.archive.records import RECEIPT, read_run
+from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
+from spectralzoom.storage.arrays.ground_maps import load_ground_map
+from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
 
 REPORT = "report.html"
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")

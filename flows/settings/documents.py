@@ -1,6 +1,6 @@
 """Write the declared settings as `survey.example.toml`, as the manual's table, and as the help of flags.
 
-`python -m flows.settings.documents > survey.example.toml` writes the example anew.
+`python -m spectralzoom.flows.settings.documents > survey.example.toml` writes the example anew.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import MISSING
 
-from flows.settings.load import SURVEY, TABLES, Declared
+from spectralzoom.flows.settings.load import SURVEY, TABLES, Declared
 
 WIDTH = 120
 COLUMN = 38  # of the help in the example

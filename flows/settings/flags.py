@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.settings.documents import about, toml_value
-from flows.settings.load import FLAGS, SURVEY, TABLES
-from pipeline.errors import SettingsError
-from pipeline.setting_fields import numbers_of
+from spectralzoom.flows.settings.documents import about, toml_value
+from spectralzoom.flows.settings.load import FLAGS, SURVEY, TABLES
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.setting_fields import numbers_of
 
 ArchiveName = Annotated[str, Parameter(help="The archive's folder.")]
 AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Print one JSON object on stdout.")]

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, g
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
-from flows.settings.survey_settings import (
+from spectralzoom.flows.settings.survey_settings import (
     ALWAYS,
     AUTO,
     BUILT_IN_SCENES,
@@ -35,17 +35,17 @@ from flows.settings.survey_settings import (
     Settings,
     source_of,
 )
-from flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
-from pipeline.errors import BudgetError, PoseError, SettingsError
-from pipeline.planning.fine_pass import FIRST_STEPS
-from pipeline.rig.device_settings import MOST_PAIRS
-from pipeline.setting_fields import format_number, span_of
-from pipeline.simulator.scenes.built_in import SCOUTING_NAMES
-from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
-from storage.archive.keys import is_archive
-from storage.archive.records import Run, moment_of
-from storage.archive.staging import read_toml
-from storage.readers.recordings import find_recorded_run
+from spectralzoom.flows.settings.values import EXTENT_PART, EXTENT_WHOLE, parse_moment, parse_text
+from spectralzoom.pipeline.errors import BudgetError, PoseError, SettingsError
+from spectralzoom.pipeline.planning.fine_pass import FIRST_STEPS
+from spectralzoom.pipeline.rig.device_settings import MOST_PAIRS
+from spectralzoom.pipeline.setting_fields import format_number, span_of
+from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_NAMES
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from spectralzoom.storage.archive.keys import is_archive
+from spectralzoom.storage.archive.records import Run, moment_of
+from spectralzoom.storage.archive.staging import read_toml
+from spectralzoom.storage.readers.recordings import find_recorded_run
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
-from flows.settings.documents import about, toml_value
-from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
-from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
-from pipeline.errors import PipelineError, SettingsError
+from spectralzoom.flows.settings.documents import about, toml_value
+from spectralzoom.flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
+from spectralzoom.flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
+from spectralzoom.pipeline.errors import PipelineError, SettingsError
 
 OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
 SECRET = "password"  # only from a settings file, since a server stores parameters

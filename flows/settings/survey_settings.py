@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, cast
 
 from pydantic import PlainValidator
 
-from flows.settings.values import (
+from spectralzoom.flows.settings.values import (
     EXTENT_WHOLE,
     Bands,
     Budget,
@@ -28,18 +28,18 @@ from flows.settings.values import (
     Wavelengths,
     parse_tolerance,
 )
-from models.network.machine import PROCESSOR, Device
-from models.policies.policies import Policy
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel
-from pipeline.ground.view import RigPose
-from pipeline.rectify.kernels import Kernel
-from pipeline.rig.device_settings import FAKE, SurveyRig
-from pipeline.setting_fields import stated
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
-from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
-from storage.parallel.pool import WorkerPool
+from spectralzoom.models.network.machine import PROCESSOR, Device
+from spectralzoom.models.policies.policies import Policy
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel
+from spectralzoom.pipeline.ground.view import RigPose
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rig.device_settings import FAKE, SurveyRig
+from spectralzoom.pipeline.setting_fields import stated
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
+from spectralzoom.storage.parallel.pool import WorkerPool
 
 BUILT_IN_SCENES = BUILT_IN_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"

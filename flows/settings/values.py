@@ -14,15 +14,15 @@ from typing import Annotated
 
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
-from pipeline.errors import BudgetError
-from pipeline.planning.partial_scans import LineRun
-from pipeline.setting_fields import format_number, numbers_of
-from pipeline.simulator.effects.probe import Unit
-from pipeline.simulator.render import BY_NAME
-from pipeline.simulator.selection.choice import named_effects
-from storage.archive.records import YEARS, moment_of
-from storage.archive.staging import is_name
-from storage.parallel.pool import WorkerPool
+from spectralzoom.pipeline.errors import BudgetError
+from spectralzoom.pipeline.planning.partial_scans import LineRun
+from spectralzoom.pipeline.setting_fields import format_number, numbers_of
+from spectralzoom.pipeline.simulator.effects.probe import Unit
+from spectralzoom.pipeline.simulator.render import BY_NAME
+from spectralzoom.pipeline.simulator.selection.choice import named_effects
+from spectralzoom.storage.archive.records import YEARS, moment_of
+from spectralzoom.storage.archive.staging import is_name
+from spectralzoom.storage.parallel.pool import WorkerPool
 
 LEAST_MEMORY = 256 * 1024**2
 EXTENT_WHOLE, EXTENT_PART = "whole", "part"

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import ALWAYS, AUTO, NEVER, RECORDED, Settings
-from flows.settings.values import EXTENT_WHOLE, parse_extent_runs
-from models.weights.files import Description
-from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep, exposing, memory_loads, merged_ms
-from pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
-from pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between
-from pipeline.planning.partial_scans import sweeps_of_runs
-from pipeline.planning.uniform_scans import (
+from spectralzoom.flows.settings.survey_settings import ALWAYS, AUTO, NEVER, RECORDED, Settings
+from spectralzoom.flows.settings.values import EXTENT_WHOLE, parse_extent_runs
+from spectralzoom.models.weights.files import Description
+from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, CostModel, Sweep, exposing, memory_loads, merged_ms
+from spectralzoom.pipeline.planning.coverage import cheapest_full, full_sweeps, sweeps_over, uniform_sweeps, with_margin
+from spectralzoom.pipeline.planning.fine_pass import FIRST_STEP, FIRST_STEPS, every_nth, lines_between
+from spectralzoom.pipeline.planning.partial_scans import sweeps_of_runs
+from spectralzoom.pipeline.planning.uniform_scans import (
     LOSS,
     MIOU,
     ScanPerformance,
@@ -34,7 +34,7 @@ from pipeline.planning.uniform_scans import (
     reference_scan,
     uniform_scans,
 )
-from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
+from spectralzoom.pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 
 LEAST_SWATHS = 8  # of a field on which two passes pay (docs/measurements/accuracy.md)
 NEARLY = 0.003  # of mIoU: expected scores that differ by less count as equal

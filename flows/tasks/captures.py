@@ -9,19 +9,19 @@ from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
 
-from flows.settings.parameters import SurveySettings, at_due_time
-from flows.settings.survey_settings import RIG, Settings
-from flows.settings.values import KEEP_RAW
-from flows.tasks.open_survey import OpenSurvey
-from flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
-from flows.tasks.run import SurveyRun, open_run
-from flows.tasks.scene import scene_of_visit
-from flows.tasks.stages.attention import score
-from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import condense_coarse, condense_fine
-from flows.tasks.stages.placement import rectify
-from pipeline.errors import IncompleteStoreError
-from storage.archive.keys import StageRef
+from spectralzoom.flows.settings.parameters import SurveySettings, at_due_time
+from spectralzoom.flows.settings.survey_settings import RIG, Settings
+from spectralzoom.flows.settings.values import KEEP_RAW
+from spectralzoom.flows.tasks.open_survey import OpenSurvey
+from spectralzoom.flows.tasks.prefect_tasks import as_task, current_observer, inside_flow
+from spectralzoom.flows.tasks.run import SurveyRun, open_run
+from spectralzoom.flows.tasks.scene import scene_of_visit
+from spectralzoom.flows.tasks.stages.attention import score
+from spectralzoom.flows.tasks.stages.capture import capture_coarse, capture_fine
+from spectralzoom.flows.tasks.stages.condense import condense_coarse, condense_fine
+from spectralzoom.flows.tasks.stages.placement import rectify
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.storage.archive.keys import StageRef
 
 OPENING = "plan"
 _opened: ContextVar[list[tuple[Settings, SurveyRun]] | None] = ContextVar("opened", default=None)

@@ -15,12 +15,20 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.field_work import GAIN, FieldWork, Scoring, WeightsFile, coarse_region, overview_file, seen_patches
-from flows.tasks.prior_maps import Prior
-from models.network.spectral import LineSpec, unlike_training
-from models.policies.policies import class_errors, gain_of
-from models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
-from models.reading.prior_map import (
+from spectralzoom.flows.tasks.field_work import (
+    GAIN,
+    FieldWork,
+    Scoring,
+    WeightsFile,
+    coarse_region,
+    overview_file,
+    seen_patches,
+)
+from spectralzoom.flows.tasks.prior_maps import Prior
+from spectralzoom.models.network.spectral import LineSpec, unlike_training
+from spectralzoom.models.policies.policies import class_errors, gain_of
+from spectralzoom.models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
+from spectralzoom.models.reading.prior_map import (
     ClassProbabilities,
     CurrentVisit,
     PriorMap,
@@ -33,13 +41,18 @@ from models.reading.prior_map import (
     in_classes,
     pooled,
 )
-from models.reading.regions import Region
-from models.weights.files import Weights
-from pipeline.geometry.grid import pad_by_reflection, patch_pixels
-from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ProbabilityStore, packed_probabilities, write_class_tile, write_probabilities_tile
-from storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
-from storage.parallel.pool import run_blocks
+from spectralzoom.models.reading.regions import Region
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.geometry.grid import pad_by_reflection, patch_pixels
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.arrays.class_maps import (
+    ProbabilityStore,
+    packed_probabilities,
+    write_class_tile,
+    write_probabilities_tile,
+)
+from spectralzoom.storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
+from spectralzoom.storage.parallel.pool import run_blocks
 
 MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
 MOST_OVERVIEWS = 16  # regions whose overviews are kept: 0.5 GB; they say how frequent each class is in the field

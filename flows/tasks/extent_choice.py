@@ -9,17 +9,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.values import format_extent
-from flows.tasks.capture_plan import PassLayout
-from flows.tasks.prior_maps import Prior
-from flows.terminal.figures import format_percent
-from models.reading.expected_errors import Floats, PatchExpectedErrors
-from models.reading.prior_map import COME_TRUE, EVERY_PX, HALO, ClassProbabilities, PriorMap, carried, in_classes
-from models.weights.files import Description, load_reader
-from pipeline.errors import BudgetError, SettingsError, WeightsError
-from pipeline.geometry.grid import SceneGrid, cuts
-from pipeline.planning.coverage import patches_shown
-from pipeline.planning.partial_scans import (
+from spectralzoom.flows.settings.values import format_extent
+from spectralzoom.flows.tasks.capture_plan import PassLayout
+from spectralzoom.flows.tasks.prior_maps import Prior
+from spectralzoom.flows.terminal.figures import format_percent
+from spectralzoom.models.reading.expected_errors import Floats, PatchExpectedErrors
+from spectralzoom.models.reading.prior_map import (
+    COME_TRUE,
+    EVERY_PX,
+    HALO,
+    ClassProbabilities,
+    PriorMap,
+    carried,
+    in_classes,
+)
+from spectralzoom.models.weights.files import Description, load_reader
+from spectralzoom.pipeline.errors import BudgetError, SettingsError, WeightsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
+from spectralzoom.pipeline.planning.coverage import patches_shown
+from spectralzoom.pipeline.planning.partial_scans import (
     PartialScan,
     PatchRows,
     RunTimes,
@@ -27,8 +35,8 @@ from pipeline.planning.partial_scans import (
     choose_runs,
     sweeps_of_runs,
 )
-from pipeline.planning.uniform_scans import LOSS, MIOU, ScanPerformance, exposures_between, format_scan
-from storage.arrays.class_maps import ProbabilityStore
+from spectralzoom.pipeline.planning.uniform_scans import LOSS, MIOU, ScanPerformance, exposures_between, format_scan
+from spectralzoom.storage.arrays.class_maps import ProbabilityStore
 
 Mask = NDArray[np.bool_]
 SWATH_PATCHES = 4  # rows of patches whose class probabilities are read at a time

@@ -16,31 +16,31 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from flows.tasks.patch_budget import SHARD
-from models.network.machine import PROCESSOR, give_back_freed_memory
-from models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
-from models.policies.placement import classes_by
-from models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
-from models.reading.expected_errors import PatchExpectedErrors
-from models.reading.inference import (
+from spectralzoom.flows.tasks.patch_budget import SHARD
+from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memory
+from spectralzoom.models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
+from spectralzoom.models.policies.placement import classes_by
+from spectralzoom.models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
+from spectralzoom.models.reading.expected_errors import PatchExpectedErrors
+from spectralzoom.models.reading.inference import (
     CoarsePass,
     CoarsePrediction,
     read_coarse_pass,
     read_coarse_prediction,
     save_overview,
 )
-from models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
-from models.weights.checksummed_files import SEAL
-from models.weights.files import Weights, describe_weights, load_reader, load_weights
-from pipeline.errors import WeightsError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.rectify.region import free_tiles
-from storage.archive.keys import StageRef
-from storage.arrays.mosaics import open_mosaic
-from storage.parallel.pool import RESERVED_BYTES, Report, WorkerPool, memory_refusal, mib, run_blocks
+from spectralzoom.models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
+from spectralzoom.models.weights.checksummed_files import SEAL
+from spectralzoom.models.weights.files import Weights, describe_weights, load_reader, load_weights
+from spectralzoom.pipeline.errors import WeightsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.rectify.region import free_tiles
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.parallel.pool import RESERVED_BYTES, Report, WorkerPool, memory_refusal, mib, run_blocks
 
 if TYPE_CHECKING:
-    from models.network.temporal_reader import TemporalReader
+    from spectralzoom.models.network.temporal_reader import TemporalReader
 
 NO_PATCHES = np.empty(0, np.int64)
 GAIN = "gain"

@@ -25,8 +25,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
-from flows.terminal.processes import cache_folder, place_pages
-from pipeline.errors import SettingsError
+from spectralzoom.flows.terminal.processes import cache_folder, place_pages
+from spectralzoom.pipeline.errors import SettingsError
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0

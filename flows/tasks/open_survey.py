@@ -10,21 +10,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
-from flows.tasks.run import SurveyRun, now
-from flows.tasks.stage import Stage
-from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import load_plan, score
-from flows.tasks.stages.capture import capture_coarse, capture_fine
-from flows.tasks.stages.condense import condense_coarse, condense_fine, condense_raster
-from flows.tasks.stages.effects import choose_effects
-from flows.tasks.stages.maps import ground, segment
-from flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
-from pipeline.errors import SurveyStopped
-from storage.archive.keys import StageRef
-from storage.archive.manifests import manifest_sha256
-from storage.archive.records import StageRecord
-from storage.archive.staging import bytes_below
+from spectralzoom.flows.tasks.prefect_tasks import Observer, current_observer, inside_flow
+from spectralzoom.flows.tasks.run import SurveyRun, now
+from spectralzoom.flows.tasks.stage import Stage
+from spectralzoom.flows.tasks.stages.accuracy import evaluate
+from spectralzoom.flows.tasks.stages.attention import load_plan, score
+from spectralzoom.flows.tasks.stages.capture import capture_coarse, capture_fine
+from spectralzoom.flows.tasks.stages.condense import condense_coarse, condense_fine, condense_raster
+from spectralzoom.flows.tasks.stages.effects import choose_effects
+from spectralzoom.flows.tasks.stages.maps import ground, segment
+from spectralzoom.flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
+from spectralzoom.pipeline.errors import SurveyStopped
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import manifest_sha256
+from spectralzoom.storage.archive.records import StageRecord
+from spectralzoom.storage.archive.staging import bytes_below
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 LEASE_S = 60  # until a lost process frees that limit
@@ -140,7 +140,7 @@ class OpenSurvey:
             return
         if capture.find(self.run.archive, capture.wants(self.run, *inputs)) is not None:
             return
-        from flows.tasks.rig_field import rig_to_oneself
+        from spectralzoom.flows.tasks.rig_field import rig_to_oneself
 
         while inside_flow():  # signals are handled between tries
             from prefect.concurrency.sync import concurrency

@@ -10,12 +10,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.sizes import MultiplyAdds, SegmenterConfig, multiply_adds
-from models.policies.policies import GLANCING_POLICIES, score_multiply_adds
-from models.reading.regions import Region, plan_regions
-from pipeline.errors import BudgetError
-from pipeline.geometry.grid import SceneGrid
-from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
+from spectralzoom.models.network.sizes import MultiplyAdds, SegmenterConfig, multiply_adds
+from spectralzoom.models.policies.policies import GLANCING_POLICIES, score_multiply_adds
+from spectralzoom.models.reading.regions import Region, plan_regions
+from spectralzoom.pipeline.errors import BudgetError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)  # written at once: a region consists of whole shards
 DIGITS = 2  # of the least percentage in an error

@@ -10,19 +10,19 @@ from pathlib import Path
 
 from odc.geo.geobox import GeoBox
 
-from flows.settings.load import anchor_paths
-from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.settings.values import EXTENT_PART
-from pipeline.errors import IncompleteStoreError, SettingsError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.ground.georeference import OFF_GRID_PX, shift_px
-from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
-from pipeline.simulator.scenes.scene import RasterScene
-from storage.archive.archive import Archive, run_stem
-from storage.archive.keys import StageRef, published_runs
-from storage.archive.records import Run, moment_of, read_run
-from storage.arrays.class_maps import ProbabilityStore
-from storage.arrays.georeference import load_geobox
+from spectralzoom.flows.settings.load import anchor_paths
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from spectralzoom.flows.settings.values import EXTENT_PART
+from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, shift_px
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.archive.archive import Archive, run_stem
+from spectralzoom.storage.archive.keys import StageRef, published_runs
+from spectralzoom.storage.archive.records import Run, moment_of, read_run
+from spectralzoom.storage.arrays.class_maps import ProbabilityStore
+from spectralzoom.storage.arrays.georeference import load_geobox
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from odc.geo.geobox import GeoBox
 
-from flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
-from flows.tasks.scene import FieldSource, unlit_scene
-from pipeline.capture.recorded import RecordedSource
-from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.capture.straight_scans import EDGE_PX, covered_field
-from pipeline.errors import SceneError, SettingsError
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.source import Source
-from storage.archive.keys import stage_key
-from storage.readers.recordings import RecordedWith, Recording, find_recorded_run, open_recording
-from storage.readers.scene_files import load_field_labels
+from spectralzoom.flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
+from spectralzoom.flows.tasks.scene import FieldSource, unlit_scene
+from spectralzoom.pipeline.capture.recorded import RecordedSource
+from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
+from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.source import Source
+from spectralzoom.storage.archive.keys import stage_key
+from spectralzoom.storage.readers.recordings import RecordedWith, Recording, find_recorded_run, open_recording
+from spectralzoom.storage.readers.scene_files import load_field_labels
 
 OFF_CENTRE_PX = 0.5  # least offset of a recorded field that is noted
 

@@ -14,22 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from flows.settings.survey_settings import RIG, Settings
-from flows.tasks.scene import FieldSource
-from pipeline.errors import RigError
-from pipeline.geometry.mirror import STRAIGHT
-from pipeline.geometry.scan import Sweep, exposing, sweep_positions
-from pipeline.rig import drivers
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.device_settings import FAKE, check_times
-from pipeline.rig.drivers import RigDevices
-from pipeline.rig.rig_source import RigSource
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import Source
-from storage.archive.keys import array_digest
-from storage.arrays.spool import FetchedFiles
+from spectralzoom.flows.settings.survey_settings import RIG, Settings
+from spectralzoom.flows.tasks.scene import FieldSource
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.geometry.mirror import STRAIGHT
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing, sweep_positions
+from spectralzoom.pipeline.rig import drivers
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.device_settings import FAKE, check_times
+from spectralzoom.pipeline.rig.drivers import RigDevices
+from spectralzoom.pipeline.rig.rig_source import RigSource
+from spectralzoom.pipeline.simulator.effects.effect import Effect
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import Source
+from spectralzoom.storage.archive.keys import array_digest
+from spectralzoom.storage.arrays.spool import FetchedFiles
 
 FETCHED = "camera"  # folder within a capture's spool
 

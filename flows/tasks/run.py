@@ -13,15 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, RIG, Settings
-from flows.settings.values import EXTENT_PART, EXTENT_WHOLE
-from flows.tasks.capture_plan import CapturePlan, PassLayout, ScanChoice, choose_uniform_scan, lay_out_passes
-from flows.tasks.extent_choice import ExtentChoice, choose_extent
-from flows.tasks.field_work import FieldWork, WeightsFile
-from flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
-from flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
-from flows.tasks.recorded_field import OpenedRecording, open_recorded
-from flows.tasks.scene import (
+from spectralzoom.flows.settings.survey_settings import RECORDED, RIG, Settings
+from spectralzoom.flows.settings.values import EXTENT_PART, EXTENT_WHOLE
+from spectralzoom.flows.tasks.capture_plan import (
+    CapturePlan,
+    PassLayout,
+    ScanChoice,
+    choose_uniform_scan,
+    lay_out_passes,
+)
+from spectralzoom.flows.tasks.extent_choice import ExtentChoice, choose_extent
+from spectralzoom.flows.tasks.field_work import FieldWork, WeightsFile
+from spectralzoom.flows.tasks.patch_budget import SHARD, PatchBudget, ReadingCosts
+from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
+from spectralzoom.flows.tasks.recorded_field import OpenedRecording, open_recorded
+from spectralzoom.flows.tasks.scene import (
     FieldSource,
     SimulatedField,
     check_labels,
@@ -33,45 +39,45 @@ from flows.tasks.scene import (
     open_scene,
     scene_of_visit,
 )
-from flows.tasks.stage import FieldFrame, Report
-from flows.tasks.stages.attention import PatchGains, all_seen
-from flows.tasks.stages.capture import SweepRecorder
-from flows.tasks.stages.placement import tile_budget
-from flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, training_note, weights_path
-from flows.tasks.zones import SurveyZones, open_zones, place_of_field
-from models.evaluation.expected_scores import MapScores
-from models.network.machine import PROCESSOR, choose_device
-from models.network.sizes import MultiplyAdds
-from models.network.spectral import LineSpec
-from models.policies.placement import CascadeTable
-from models.reading.prior_map import EVERY_PX
-from models.reading.regions import plan_regions
-from models.weights.checksummed_files import SEAL
-from models.weights.files import CASCADE, Description, ReaderPart, Weights
-from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import SceneError, SettingsError, WeightsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Sweep
-from pipeline.ground.field_places import PosedField
-from pipeline.ground.map_grid import GroundGrid
-from pipeline.once import Once
-from pipeline.planning.fine_pass import FinePlan, SecondPass
-from pipeline.planning.uniform_scans import ScanPerformance
-from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import MosaicWork, plan_tiles
-from pipeline.signal.subspace import SMOOTH
-from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from pipeline.source import References
-from storage.archive.archive import Archive
-from storage.archive.keys import is_archive
-from storage.arrays.layout import image_spec
-from storage.parallel.pool import WorkerPool
-from storage.readers.open_cubes import load_labels_array
-from storage.readers.scene_files import RasterPixels, SceneFile
+from spectralzoom.flows.tasks.stage import FieldFrame, Report
+from spectralzoom.flows.tasks.stages.attention import PatchGains, all_seen
+from spectralzoom.flows.tasks.stages.capture import SweepRecorder
+from spectralzoom.flows.tasks.stages.placement import tile_budget
+from spectralzoom.flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, training_note, weights_path
+from spectralzoom.flows.tasks.zones import SurveyZones, open_zones, place_of_field
+from spectralzoom.models.evaluation.expected_scores import MapScores
+from spectralzoom.models.network.machine import PROCESSOR, choose_device
+from spectralzoom.models.network.sizes import MultiplyAdds
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.policies.placement import CascadeTable
+from spectralzoom.models.reading.prior_map import EVERY_PX
+from spectralzoom.models.reading.regions import plan_regions
+from spectralzoom.models.weights.checksummed_files import SEAL
+from spectralzoom.models.weights.files import CASCADE, Description, ReaderPart, Weights
+from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.ground.field_places import PosedField
+from spectralzoom.pipeline.ground.map_grid import GroundGrid
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
+from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
+from spectralzoom.pipeline.rectify.placed import PixelGrid, place
+from spectralzoom.pipeline.rectify.region import MosaicWork, plan_tiles
+from spectralzoom.pipeline.signal.subspace import SMOOTH
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.source import References
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import is_archive
+from spectralzoom.storage.arrays.layout import image_spec
+from spectralzoom.storage.parallel.pool import WorkerPool
+from spectralzoom.storage.readers.open_cubes import load_labels_array
+from spectralzoom.storage.readers.scene_files import RasterPixels, SceneFile
 
 PRIOR_MAP_GAIN = 3.0  # least gain with a prior map over that without one: losses are then alike (prior-maps.md)
 REPRESENTATIVE = 3  # exposures of a second pass, for which effects are chosen
@@ -436,7 +442,7 @@ def _open_source(
     elif settings.is_map:
         source = FieldSource()
     elif settings.source == RIG:
-        from flows.tasks.rig_field import rig_field
+        from spectralzoom.flows.tasks.rig_field import rig_field
 
         source = rig_field(scene, settings, (*plan.coarse, *plan.full), simulated)
     if pixels is None:

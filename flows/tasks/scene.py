@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM, Settings
-from models.weights.files import Description
-from pipeline.errors import NoSceneYet, SceneError, SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.once import Once
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.scenes.built_in import built_in_scene
-from pipeline.simulator.scenes.daylight import sun_elevation_deg
-from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import Source
-from storage.readers.cube_sources import ONE_FILE, machine_bytes
-from storage.readers.open_cubes import split_variable
-from storage.readers.scene_files import SceneFile, load_scene_file, open_scene_file
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM, Settings
+from spectralzoom.models.weights.files import Description
+from spectralzoom.pipeline.errors import NoSceneYet, SceneError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.effects.effect import Effect
+from spectralzoom.pipeline.simulator.scenes.built_in import built_in_scene
+from spectralzoom.pipeline.simulator.scenes.daylight import sun_elevation_deg
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import Source
+from spectralzoom.storage.readers.cube_sources import ONE_FILE, machine_bytes
+from spectralzoom.storage.readers.open_cubes import split_variable
+from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file, open_scene_file
 
 # Peak of a survey of the farm, without the scene on disk: 1.42 GB for 1280 x 1024 px, 1.57 GB for 2560 x 2048 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_350_000_000, 60

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from flows.terminal.figures import format_count, format_points, known_number, spaced
+from spectralzoom.flows.terminal.figures import format_count, format_points, known_number, spaced
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
 

@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from flows.tasks.prefect_tasks import as_task
-from models.network.machine import give_back_freed_memory
-from pipeline.errors import ArchiveError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.ground.georeference import georeference_record
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef, array_digest, stage_key
-from storage.archive.manifests import is_cleared, try_manifest
-from storage.arrays.georeference import AngularGrid
+from spectralzoom.flows.tasks.prefect_tasks import as_task
+from spectralzoom.models.network.machine import give_back_freed_memory
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.ground.georeference import georeference_record
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef, array_digest, stage_key
+from spectralzoom.storage.archive.manifests import is_cleared, try_manifest
+from spectralzoom.storage.arrays.georeference import AngularGrid
 
 Report = Callable[[float], None]  # progress of a stage, 0..1
 

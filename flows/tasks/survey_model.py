@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from models.network.machine import choose_device
-from models.network.spectral import project
-from models.weights.files import (
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from spectralzoom.models.network.machine import choose_device
+from spectralzoom.models.network.spectral import project
+from spectralzoom.models.weights.files import (
     TRAINED_ON,
     Description,
     TrainedOn,
@@ -23,14 +23,14 @@ from models.weights.files import (
     load_reader,
     load_weights,
 )
-from pipeline.errors import SettingsError
-from pipeline.ground.map_grid import median_footprint_m
-from pipeline.ground.view import GroundView
-from pipeline.once import Once
-from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
-from pipeline.simulator.scenes.farm.land import sun_over_farm
-from pipeline.simulator.scenes.scene import RasterScene
-from storage.readers.scene_files import RasterPixels
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.ground.map_grid import median_footprint_m
+from spectralzoom.pipeline.ground.view import GroundView
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
+from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.readers.scene_files import RasterPixels
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def weights_path(settings: Settings) -> Path:
 
 def shipped_weights() -> Path:
     """Return the file of the shipped weights."""
-    return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
+    return Path(str(resources.files("spectralzoom.models") / "shipped" / "farm.safetensors"))
 
 
 OTHER_UNIT = 20.0  # largest ratio of medians

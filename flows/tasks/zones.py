@@ -11,16 +11,16 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from flows.settings.survey_settings import Settings, ZoneChoice
-from pipeline.errors import ZoneError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture, PosedField
-from pipeline.ground.map_grid import ground_grid
-from pipeline.ground.view import GroundView
-from pipeline.ground.zones import Mask, extent_deg, on_field, patch_means, pixels_inside
-from pipeline.simulator.scenes.scene import RasterScene
-from storage.archive.keys import array_digest
-from storage.readers.polygons import ZoneFile, place_on_earth, read_zones
+from spectralzoom.flows.settings.survey_settings import Settings, ZoneChoice
+from spectralzoom.pipeline.errors import ZoneError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture, PosedField
+from spectralzoom.pipeline.ground.map_grid import ground_grid
+from spectralzoom.pipeline.ground.view import GroundView
+from spectralzoom.pipeline.ground.zones import Mask, extent_deg, on_field, patch_means, pixels_inside
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.archive.keys import array_digest
+from spectralzoom.storage.readers.polygons import ZoneFile, place_on_earth, read_zones
 
 
 @dataclass(frozen=True)

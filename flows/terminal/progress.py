@@ -17,9 +17,9 @@ from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
-from flows.terminal.figures import format_seconds
-from pipeline.errors import visible
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.terminal.figures import format_seconds
+from spectralzoom.pipeline.errors import visible
+from spectralzoom.storage.archive.whole_files import to_json
 
 PIPED_WIDTH = 120  # of tables without a terminal
 

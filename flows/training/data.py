@@ -12,15 +12,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.scene import scene_of_file
-from flows.terminal.figures import counted
-from pipeline.errors import SceneError, SettingsError, list_some
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
-from pipeline.simulator.scenes.scene import RasterScene
-from storage.readers.label_files import (
+from spectralzoom.flows.tasks.scene import scene_of_file
+from spectralzoom.flows.terminal.figures import counted
+from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.readers.label_files import (
     MatchedFiles,
     classes_of_files,
     folders_within,
@@ -33,10 +33,10 @@ from storage.readers.label_files import (
     scene_entries,
     scene_number,
 )
-from storage.readers.labels import load_codes
-from storage.readers.open_cubes import CUBE_ENDINGS, split_variable
-from storage.readers.scene_files import SceneFile, load_scene_file
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
+from spectralzoom.storage.readers.labels import load_codes
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
+from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
 FARM_SCENES, FARM_VALIDATION = 48, 3
 FARM_SHAPE = (512, 640)  # of a scene [px]

@@ -14,9 +14,9 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
 
-from flows.training.data import Report
-from models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
-from models.evaluation.metrics import (
+from spectralzoom.flows.training.data import Report
+from spectralzoom.models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
+from spectralzoom.models.evaluation.metrics import (
     Counts,
     Floats,
     JudgedMap,
@@ -28,15 +28,15 @@ from models.evaluation.metrics import (
     judge_confidence,
     mean_iou,
 )
-from models.network.spectral import LineSpec
-from models.policies.placement import ReadTwice
-from models.reading.inference import coarse_prediction_of_columns, map_of_columns
-from models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
-from models.training.examples import Example
-from models.training.train import LabelledPixels, halfway, with_linear
-from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.planning.coverage import frame_patches
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.policies.placement import ReadTwice
+from spectralzoom.models.reading.inference import coarse_prediction_of_columns, map_of_columns
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
+from spectralzoom.models.training.examples import Example
+from spectralzoom.models.training.train import LabelledPixels, halfway, with_linear
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
+from spectralzoom.pipeline.planning.coverage import frame_patches
 
 VALIDATED_FRACTION = 0.35  # of the patches: that of surveys with K = 35 %
 

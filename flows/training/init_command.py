@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flows.settings.documents import as_toml
-from flows.settings.flags import AsJson, Switch
-from flows.terminal.figures import counted
-from flows.terminal.processes import DONE, writing
-from flows.terminal.progress import put_out, show_text, stderr
-from pipeline.errors import PipelineError, SceneError, SettingsError, list_some
-from pipeline.geometry.grid import UNLABELLED
-from storage.archive.whole_files import write_whole
-from storage.readers import label_files
-from storage.readers.cube_sources import CubeSource
-from storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
+from spectralzoom.flows.settings.documents import as_toml
+from spectralzoom.flows.settings.flags import AsJson, Switch
+from spectralzoom.flows.terminal.figures import counted
+from spectralzoom.flows.terminal.processes import DONE, writing
+from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
+from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError, list_some
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.archive.whole_files import write_whole
+from spectralzoom.storage.readers import label_files
+from spectralzoom.storage.readers.cube_sources import CubeSource
+from spectralzoom.storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
+from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 
 KEPT = ("class_attribute", "unlabelled")  # of an existing file
 

@@ -14,24 +14,24 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.spectral import SpectralBasis, project
-from models.training.capture_augmentation import ColumnNoise, SceneSpectra
-from models.training.examples import Example, observe, value_of_electron
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.coverage import cheapest_full
-from pipeline.rectify.region import mosaic_rows
-from pipeline.signal.subspace import FEW_BANDS
-from pipeline.simulator.render import EFFECTS, Choice
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.built_in import LAWS
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import decide
-from pipeline.simulator.selection.survey_probe import probe_survey
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
-from pipeline.source import References
+from spectralzoom.models.network.spectral import SpectralBasis, project
+from spectralzoom.models.training.capture_augmentation import ColumnNoise, SceneSpectra
+from spectralzoom.models.training.examples import Example, observe, value_of_electron
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.planning.coverage import cheapest_full
+from spectralzoom.pipeline.rectify.region import mosaic_rows
+from spectralzoom.pipeline.signal.subspace import FEW_BANDS
+from spectralzoom.pipeline.simulator.render import EFFECTS, Choice
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.selection.choice import decide
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
+from spectralzoom.pipeline.source import References
 
 TOLERANCE_SIGMA = 0.1  # default of a survey
 _ROWS = 64  # rectified at a time

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flows.tasks.scene import masks_contain
-from flows.terminal.progress import one_after_the_other, table
-from flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
-from flows.training.figures import (
+from spectralzoom.flows.tasks.scene import masks_contain
+from spectralzoom.flows.terminal.progress import one_after_the_other, table
+from spectralzoom.flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
+from spectralzoom.flows.training.figures import (
     FEW_PIXELS,
     better_reading,
     judge_baselines,
@@ -25,15 +25,15 @@ from flows.training.figures import (
     read_twice,
     validate,
 )
-from flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
-from models.network.machine import PROCESSOR, choose_device
-from models.network.spectral import Normalisation
-from models.policies.placement import CascadeTable
-from models.training.capture_augmentation import REFERENCE_MS
-from models.training.examples import measured_normalisation
-from models.training.train import PIXELS, LabelledPixels, linear_classifier, train
-from models.weights.checksummed_files import load_checkpoint
-from models.weights.files import (
+from spectralzoom.flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
+from spectralzoom.models.network.machine import PROCESSOR, choose_device
+from spectralzoom.models.network.spectral import Normalisation
+from spectralzoom.models.policies.placement import CascadeTable
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
+from spectralzoom.models.training.examples import measured_normalisation
+from spectralzoom.models.training.train import PIXELS, LabelledPixels, linear_classifier, train
+from spectralzoom.models.weights.checksummed_files import load_checkpoint
+from spectralzoom.models.weights.files import (
     CALIBRATION,
     CASCADE,
     TRAINED_ON,
@@ -45,11 +45,11 @@ from models.weights.files import (
     save_weights,
     with_record,
 )
-from pipeline.errors import SettingsError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.simulator.scenes.built_in import built_in_laws
-from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
-from pipeline.simulator.scenes.farm.land import sun_over_farm
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
+from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 
 
 def train_weights(

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.scene import pack_mask
-from flows.terminal.figures import counted
-from flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
-from flows.training.observed_scenes import observe_scene
-from models.network.machine import PROCESSOR
-from models.network.sizes import SegmenterConfig
-from models.network.spectral import Normalisation, SpectralBasis
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import Example, normalised
-from models.training.train import TrainingSettings
-from pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.built_in import built_in_laws
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.flows.tasks.scene import pack_mask
+from spectralzoom.flows.terminal.figures import counted
+from spectralzoom.flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
+from spectralzoom.flows.training.observed_scenes import observe_scene
+from spectralzoom.models.network.machine import PROCESSOR
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
+from spectralzoom.models.training.examples import Example, normalised
+from spectralzoom.models.training.train import TrainingSettings
+from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
 COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files

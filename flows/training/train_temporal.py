@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from flows.terminal.progress import one_after_the_other
-from flows.training.data import Report, check_out
-from flows.training.observed_scenes import observe_finely
-from models.evaluation.metrics import confusion, mean_iou
-from models.network.spectral import LineSpec
-from models.network.temporal_reader import TemporalReader
-from models.reading.inference import map_of_columns
-from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
-from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
-from models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid, pad_by_reflection
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
+from spectralzoom.flows.terminal.progress import one_after_the_other
+from spectralzoom.flows.training.data import Report, check_out
+from spectralzoom.flows.training.observed_scenes import observe_finely
+from spectralzoom.models.evaluation.metrics import confusion, mean_iou
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.reading.inference import map_of_columns
+from spectralzoom.models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
+from spectralzoom.models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
+from spectralzoom.models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
 SHAPE = (512, 640)  # (y, x) of a land
 LANDS = 40

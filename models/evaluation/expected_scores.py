@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import Floats, iou_per_class, labelled_classes, mean_iou
+from spectralzoom.models.evaluation.metrics import Floats, iou_per_class, labelled_classes, mean_iou
 
 # Logit of the probability that a class is present: a constant, and factors of the logarithm of its expected pixels, the
 # logit of its expected IoU, the logarithm of the exposure (more for wider line spacings), and octaves of line spacing.

@@ -14,8 +14,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import UNLABELLED, cuts
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
 
 CONFIDENCE_BINS = 20
 BAD_ERROR = 0.02  # expected calibration error above which a temperature is fitted

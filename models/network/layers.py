@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import AROUND_PX
+from spectralzoom.models.network.sizes import AROUND_PX
 
 
 def pointwise(inputs: int, outputs: int) -> nn.Conv2d:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Literal, get_args
 
-from pipeline.errors import SettingsError
+from spectralzoom.pipeline.errors import SettingsError
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Present = Literal["cpu", "cuda", "mps"]

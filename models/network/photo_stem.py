@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.layers import pointwise
-from models.network.sizes import PHOTO_FIRST, PHOTO_STAGES, PLANES
+from spectralzoom.models.network.layers import pointwise
+from spectralzoom.models.network.sizes import PHOTO_FIRST, PHOTO_STAGES, PLANES
 
 EPSILON = 1e-3  # of its batch norms
 COLOUR_SPREAD = 0.5  # of the three colours; columns have a spread of 1

@@ -19,10 +19,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.layers import mean_around, pointwise
-from models.network.photo_stem import PhotoStem
-from models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
-from pipeline.errors import ShapeError
+from spectralzoom.models.network.layers import mean_around, pointwise
+from spectralzoom.models.network.photo_stem import PhotoStem
+from spectralzoom.models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
+from spectralzoom.pipeline.errors import ShapeError
 
 LONGEST_PERIOD = 128.0  # cells of a token; the shortest is 2
 

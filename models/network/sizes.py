@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from numbers import Integral
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
 # Larger sizes in a file are damage, or an attempt to fill the memory.

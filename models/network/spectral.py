@@ -11,8 +11,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import WavelengthError
-from pipeline.readings import MOST_STEPS, SIGMA_OF_MEDIAN
+from spectralzoom.pipeline.errors import WavelengthError
+from spectralzoom.pipeline.readings import MOST_STEPS, SIGMA_OF_MEDIAN
 
 REACH = 1.5  # a column is reached by a band within this many column spacings of its centre
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.layers import pointwise
-from models.network.sizes import CELL_PX, GATES, OTHERS, TemporalSizes
+from spectralzoom.models.network.layers import pointwise
+from spectralzoom.models.network.sizes import CELL_PX, GATES, OTHERS, TemporalSizes
 
 FAINT = 10.0  # least log-probability of the inputs, negated
 STARTS = (2.2, 0.0, -1.0)  # of the gates, before training

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import Counts, confusion, mean_iou
-from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, segment
-from models.weights.files import Weights
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.evaluation.metrics import Counts, confusion, mean_iou
+from spectralzoom.models.policies.policies import score_patches
+from spectralzoom.models.reading.inference import CoarsePrediction, segment
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 LEAST_GAINS = tuple(np.geomspace(0.005, 0.5, 25).round(4).tolist())  # thresholds of scores by ``gain``
 

@@ -9,11 +9,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from models.network.sizes import SegmenterConfig
-from models.network.spectral import patches_of
-from models.reading.inference import CoarsePrediction
-from pipeline.errors import SettingsError
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.network.spectral import patches_of
+from spectralzoom.models.reading.inference import CoarsePrediction
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]

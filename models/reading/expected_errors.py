@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 LEAST_EXPECTED_ERROR = 1e-4  # of a histogram of expected errors, even in their logarithm
 STEPS = 24  # of this histogram

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.sizes import PATCHES_AT_ONCE, TOKEN_PX
-from models.network.spectral import (
+from spectralzoom.models.network.sizes import PATCHES_AT_ONCE, TOKEN_PX
+from spectralzoom.models.network.spectral import (
     Capture,
     CaptureMap,
     LineSpec,
@@ -24,15 +24,15 @@ from models.network.spectral import (
     readable,
     with_planes,
 )
-from models.weights.files import Weights
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
-from pipeline.signal.components import Components
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, cuts, pad_by_reflection
+from spectralzoom.pipeline.signal.components import Components
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from models.network.segmenter import Overview
+    from spectralzoom.models.network.segmenter import Overview
 
 ROWS_DRAWN = 64  # at once
 # Factor of the octaves by which exposures are stated to be shorter than the reference. The network then relies more on
@@ -188,7 +188,7 @@ def load_overview(path: Path, weights: Weights) -> Overview | None:
         return None
     stored = torch.from_numpy(np.load(path)).to(weights.segmenter.device)
     width = weights.config.overview_width
-    from models.network.segmenter import Overview
+    from spectralzoom.models.network.segmenter import Overview
 
     return Overview(stored[:, :width], stored[:, width:])
 

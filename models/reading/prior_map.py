@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from models.evaluation.expected_scores import expected_counts
-from models.evaluation.metrics import confusion, overall_accuracy
-from models.network.sizes import CELL_PX
-from pipeline.geometry.grid import UNLABELLED
+from spectralzoom.models.evaluation.expected_scores import expected_counts
+from spectralzoom.models.evaluation.metrics import confusion, overall_accuracy
+from spectralzoom.models.network.sizes import CELL_PX
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from models.network.temporal_reader import TemporalReader
+    from spectralzoom.models.network.temporal_reader import TemporalReader
 
 FAINTEST = -12.7  # least log-probability that is stored: one in 330 000
 LIGHT_FADES_DAYS = 30.0  # in which the exposure of a prior map loses weight by a factor of e

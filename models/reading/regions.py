@@ -16,8 +16,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.sizes import PATCHES_AT_ONCE, PHOTO_STAGES, PLANES, TOKEN_PX, SegmenterConfig, level_widths
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.sizes import (
+    PATCHES_AT_ONCE,
+    PHOTO_STAGES,
+    PLANES,
+    TOKEN_PX,
+    SegmenterConfig,
+    level_widths,
+)
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 REGION_PX = 640  # a side, at most
 HALO_PX = TOKEN_PX  # around a region

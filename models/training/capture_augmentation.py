@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.machine import PROCESSOR
-from models.network.sizes import PLANES
-from models.network.spectral import LineSpec, Normalisation
-from pipeline.signal.components import Components
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
+from spectralzoom.models.network.machine import PROCESSOR
+from spectralzoom.models.network.sizes import PLANES
+from spectralzoom.models.network.spectral import LineSpec, Normalisation
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 
 REFERENCE_MS = DEFAULT_EXPOSURE_MS  # exposures are fractions of this one
 STEPS = MappingProxyType({1: 0.4, 2: 0.25, 4: 0.27, 8: 0.08})  # line spacing [px]: fraction of crops

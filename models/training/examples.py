@@ -11,10 +11,10 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.machine import PROCESSOR
-from models.network.sizes import TOKEN_PX
-from models.network.spectral import LineSpec, Normalisation, SpectralBasis
-from models.training.capture_augmentation import (
+from spectralzoom.models.network.machine import PROCESSOR
+from spectralzoom.models.network.sizes import TOKEN_PX
+from spectralzoom.models.network.spectral import LineSpec, Normalisation, SpectralBasis
+from spectralzoom.models.training.capture_augmentation import (
     REFERENCE_MS,
     CaptureAugmentation,
     ColumnNoise,
@@ -22,10 +22,10 @@ from models.training.capture_augmentation import (
     normal,
     with_capture,
 )
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 NOISY = 0.25  # fraction of crops with added noise
 BRIGHTNESS = 0.04  # standard deviation of the factor of a crop's light

@@ -15,10 +15,10 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.segmenter import Segmenter, cut
-from models.network.sizes import SegmenterConfig
-from models.training.examples import Batch
-from pipeline.geometry.grid import UNLABELLED
+from spectralzoom.models.network.segmenter import Segmenter, cut
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.training.examples import Batch
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 OVERVIEW_WEIGHT = 0.6  # the map with patches has 1
 PATCHED = 0.1  # of the steps of deep networks, whose full network corrects little and costs as much as the rest

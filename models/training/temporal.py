@@ -19,12 +19,12 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.sizes import CELL_PX, TemporalSizes
-from models.network.temporal_reader import TemporalReader
-from models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS, season_of
-from models.training.objective import class_weights, map_loss
-from models.training.train import Progress
-from pipeline.geometry.grid import UNLABELLED
+from spectralzoom.models.network.sizes import CELL_PX, TemporalSizes
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS, season_of
+from spectralzoom.models.training.objective import class_weights, map_loss
+from spectralzoom.models.training.train import Progress
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 FAINT = 1e-5  # least probability of a pass
 PARTLY_SEEN = 0.3  # fraction of later visits that capture a part of the land

@@ -21,15 +21,15 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import LogisticRegression
 from torch import Tensor, nn
 
-from models.network.machine import PROCESSOR, give_back_freed_memory, keep_freed_memory
-from models.network.segmenter import Segmenter
-from models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
-from models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from models.training.examples import BRIGHTNESS, CropSampler, Example
-from models.training.objective import PHASES, batch_loss, class_weights
-from models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from pipeline.errors import PipelineError, SceneError
-from pipeline.geometry.grid import UNLABELLED
+from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memory, keep_freed_memory
+from spectralzoom.models.network.segmenter import Segmenter
+from spectralzoom.models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
+from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example
+from spectralzoom.models.training.objective import PHASES, batch_loss, class_weights
+from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
+from spectralzoom.pipeline.errors import PipelineError, SceneError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 KEEP_EVERY_S = 120.0  # between checkpoints
 FREED_EVERY = 50  # steps: crops of several sizes leave gaps of 9 MB a step in kept memory

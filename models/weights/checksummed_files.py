@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError, safe_open
 
-from pipeline.errors import WeightsError
+from spectralzoom.pipeline.errors import WeightsError
 
 if TYPE_CHECKING:
     from torch import Tensor

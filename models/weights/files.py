@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.evaluation.expected_scores import MapScores
-from models.network.sizes import SegmenterConfig, TemporalSizes
-from models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
-from models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
-from pipeline.errors import WavelengthError, WeightsError
-from pipeline.readings import readings_alone
-from pipeline.signal.components import Components
+from spectralzoom.models.evaluation.expected_scores import MapScores
+from spectralzoom.models.network.sizes import SegmenterConfig, TemporalSizes
+from spectralzoom.models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
+from spectralzoom.models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
+from spectralzoom.pipeline.errors import WavelengthError, WeightsError
+from spectralzoom.pipeline.readings import readings_alone
+from spectralzoom.pipeline.signal.components import Components
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from models.network.segmenter import Segmenter
-    from models.network.temporal_reader import TemporalReader
+    from spectralzoom.models.network.segmenter import Segmenter
+    from spectralzoom.models.network.temporal_reader import TemporalReader
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/6"
@@ -206,7 +206,7 @@ def load_reader(weights: Path) -> TemporalReader:
             f"{weights} has no temporal reader; train one with: spectralzoom train DATASET --train-temporal "
             f"{weights} -o {weights}"
         )
-    from models.network.temporal_reader import TemporalReader
+    from spectralzoom.models.network.temporal_reader import TemporalReader
 
     with torch.device("meta"):
         reader = TemporalReader(described.reader.sizes)
@@ -225,7 +225,7 @@ def load_weights(path: Path) -> Weights:
     """
     import torch
 
-    from models.network.segmenter import Segmenter
+    from spectralzoom.models.network.segmenter import Segmenter
 
     described = describe_weights(path)
     config = described.config
@@ -248,7 +248,7 @@ def load_weights(path: Path) -> Weights:
 
 def load_encoder() -> dict[str, Tensor]:
     """Read the encoder for large frames, trained on ImageNet, as tensors of the segmenter; a copy is shipped."""
-    path = Path(str(resources.files("models") / "shipped" / "imagenet.safetensors"))
+    path = Path(str(resources.files("spectralzoom.models") / "shipped" / "imagenet.safetensors"))
     tensors = read_tensors(path, read_about(path, ENCODER))
     return {f"overview_stem.{name}": tensor for name, tensor in tensors.items()}
 

@@ -19,11 +19,11 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import NotRecordedError, SceneError, ShapeError
-from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_direction
-from pipeline.geometry.scan import Floats, Sweep
-from pipeline.source import Line, References
+from spectralzoom.pipeline.errors import NotRecordedError, SceneError, ShapeError
+from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep
+from spectralzoom.pipeline.source import Line, References
 
 Numbers = NDArray[np.intp]
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.capture.recorded import RecordedSource
-from pipeline.errors import SceneError
-from pipeline.geometry.scan import Axis, Sweep, exposing
-from pipeline.planning.fine_pass import FIRST_STEP
+from spectralzoom.pipeline.capture.recorded import RecordedSource
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.scan import Axis, Sweep, exposing
+from spectralzoom.pipeline.planning.fine_pass import FIRST_STEP
 
 MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # largest excess of a plan over a recording, for the kernel and turned lines
 

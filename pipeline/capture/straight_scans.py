@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import (
     REST_TANGENT,
     direction_to_normal,
     direction_to_position,
@@ -24,7 +24,7 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.geometry.scan import Axis, Floats, Sweep, points_of_scan
+from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, points_of_scan
 
 MOST_DEG = 89.0  # a direction at a larger angle misses the scene plane
 

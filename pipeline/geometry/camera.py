@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.setting_fields import assumed, stated
+from spectralzoom.pipeline.setting_fields import assumed, stated
 
 Number = TypeVar("Number", float, NDArray[np.float64])
 ONE_DRAW_READ_NOISE_E = 10.0

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
+from spectralzoom.pipeline.errors import ShapeError
 
 Kind = TypeVar("Kind", bound=np.generic)
 UNLABELLED = 255  # pixel without a class, in (y, x) uint8 images of class indices

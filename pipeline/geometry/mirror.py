@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import PoseError, SettingsError, ShapeError
+from spectralzoom.pipeline.errors import PoseError, SettingsError, ShapeError
 
 Floats = NDArray[Any]  # float64, or float32 where that came in
 

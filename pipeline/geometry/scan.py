@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import (
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import (
     camera_slope,
     direction_to_position,
     direction_to_scene,
@@ -24,7 +24,7 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.setting_fields import stated
+from spectralzoom.pipeline.setting_fields import stated
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]

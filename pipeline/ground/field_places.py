@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.errors import PoseError
-from pipeline.ground.georeference import Floats, pixel_rows_m2, pixel_side_m
-from pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
-from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.ground.georeference import Floats, pixel_rows_m2, pixel_side_m
+from spectralzoom.pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
+from spectralzoom.pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
 
 M2_PER_HECTARE = 10_000.0
 SECONDS_PER_HOUR = 3600.0

@@ -18,11 +18,11 @@ import pyproj
 from numpy.typing import ArrayLike, NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import PoseError
-from pipeline.geometry.grid import cuts
-from pipeline.ground.georeference import WGS84, Floats
-from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
-from pipeline.rectify.resample import resample
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.ground.georeference import WGS84, Floats
+from spectralzoom.pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
+from spectralzoom.pipeline.rectify.resample import resample
 
 Pixel = TypeVar("Pixel", bound=np.generic)
 

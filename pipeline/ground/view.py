@@ -25,8 +25,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import PoseError, ShapeError
-from pipeline.setting_fields import misfits, stated
+from spectralzoom.pipeline.errors import PoseError, ShapeError
+from spectralzoom.pipeline.setting_fields import misfits, stated
 
 Floats = NDArray[np.float64]
 

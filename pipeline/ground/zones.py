@@ -11,9 +11,9 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.ground.field_places import FieldPlace, GroundPlace
-from pipeline.ground.georeference import WGS84, Floats
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
+from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace
+from spectralzoom.pipeline.ground.georeference import WGS84, Floats
 
 Mask = NDArray[np.bool_]
 ROUND_THE_FIELD = 1.0  # times its size, on every side, within which polygons are converted

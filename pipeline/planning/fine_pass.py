@@ -15,12 +15,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, merged_ms
-from pipeline.planning.coverage import some_lines
-from pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
-from pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, merged_ms
+from spectralzoom.pipeline.planning.coverage import some_lines
+from spectralzoom.pipeline.planning.partial_scans import LineRun, PatchRows, RunTimes, choose_runs
+from spectralzoom.pipeline.planning.uniform_scans import MIOU, ScanPerformance, format_scan, longest_exposure
 
 FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
 FIRST_STEPS = (4, 8)  # allowed values

@@ -17,11 +17,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
-from pipeline.planning.coverage import lines_showing, some_lines
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
+from spectralzoom.pipeline.planning.coverage import lines_showing, some_lines
 
 LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in fractions of the total gain: all runs pay, or none
 HALVINGS = 48  # of the logarithm of the interval between them

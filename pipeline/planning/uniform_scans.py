@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import BudgetError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.coverage import raw_bytes
+from spectralzoom.pipeline.errors import BudgetError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.planning.coverage import raw_bytes
 
 EXPOSURES_AN_OCTAVE = 8  # candidates
 LOSS = 0.001  # of mIoU: scans that differ by less count as equal

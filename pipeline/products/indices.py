@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import SettingsError, WavelengthError
+from spectralzoom.pipeline.errors import SettingsError, WavelengthError
 
 Floats = NDArray[np.float32]
 

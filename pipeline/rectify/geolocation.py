@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import camera_slope, line_centre
-from pipeline.geometry.scan import Axis, Floats
-from pipeline.rectify.scan_paths import ScanPath
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import camera_slope, line_centre
+from spectralzoom.pipeline.geometry.scan import Axis, Floats
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath
 
 NEWTON_ROUNDS = 4
 HALVINGS = 34  # from one knot to 1e-10 of it

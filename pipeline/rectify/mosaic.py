@@ -9,12 +9,12 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.placed import TAPS, PlacedSweep, member_lines
-from pipeline.rectify.resample import merge_lines, resample
-from pipeline.rectify.scan_paths import ScanPath
-from pipeline.signal.lines import ReadWindow
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rectify.placed import TAPS, PlacedSweep, member_lines
+from spectralzoom.pipeline.rectify.resample import merge_lines, resample
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath
+from spectralzoom.pipeline.signal.lines import ReadWindow
 
 LEAST_EDGE_PX = 1e-3  # the very edge of a sweep counts where no other sweep reaches
 RUN_ELEMENTS = 250_000  # cost of one more window, in calibrated elements (sample and band of a line)

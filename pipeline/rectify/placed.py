@@ -11,13 +11,13 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Floats, points_of_scan
-from pipeline.rectify.geolocation import KnotCurve, drop_unseen, knots_of_points, path_geolocation
-from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.signal.lines import CondensedSignal, Signal, signal_of
-from pipeline.source import SweepLines
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, Floats, points_of_scan
+from spectralzoom.pipeline.rectify.geolocation import KnotCurve, drop_unseen, knots_of_points, path_geolocation
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from spectralzoom.pipeline.signal.lines import CondensedSignal, Signal, signal_of
+from spectralzoom.pipeline.source import SweepLines
 
 SAFETY = 1.05  # on the bound of tie points, which holds to the second order
 PIECE_SAMPLES = 64

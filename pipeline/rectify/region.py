@@ -12,14 +12,22 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid, cuts
-from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
-from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, PlacedSweep, ScanPathReach, member_lines, place
-from pipeline.rectify.scan_paths import ScanPath
-from pipeline.signal.lines import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
-from pipeline.source import SweepLines
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
+from spectralzoom.pipeline.rectify.placed import (
+    TAPS,
+    ColumnReach,
+    PixelGrid,
+    PlacedSweep,
+    ScanPathReach,
+    member_lines,
+    place,
+)
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath
+from spectralzoom.pipeline.signal.lines import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
+from spectralzoom.pipeline.source import SweepLines
 
 COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard
 GROUP_COLUMNS = 32  # tiles are cut between groups of so many columns

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rectify.kernels import TAPS, Kernel, Rows, Unlocked, Windows, weighted_rows, windows
+from spectralzoom.pipeline.rectify.kernels import TAPS, Kernel, Rows, Unlocked, Windows, weighted_rows, windows
 
 if TYPE_CHECKING:
     import torch

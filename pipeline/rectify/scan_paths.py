@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import RIM_SLACK, direction_to_scene, position_to_direction
-from pipeline.readings import SIGMA_OF_MEDIAN
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, direction_to_scene, position_to_direction
+from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
 
 STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
 DWELL_STEPS = 0.25  # lines closer than this show the same place

@@ -10,14 +10,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, exposing, merged_ms
-from pipeline.rectify.placed import PixelGrid, PlacedSweep, place
-from pipeline.rectify.registration.alignment import SweepShift
-from pipeline.rectify.scan_paths import JudgedStamps, judge_stamps
-from pipeline.signal.components import Components
-from pipeline.signal.lines import CondensedLines, Raw
-from pipeline.source import References, SweepLines
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing, merged_ms
+from spectralzoom.pipeline.rectify.placed import PixelGrid, PlacedSweep, place
+from spectralzoom.pipeline.rectify.registration.alignment import SweepShift
+from spectralzoom.pipeline.rectify.scan_paths import JudgedStamps, judge_stamps
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.lines import CondensedLines, Raw
+from spectralzoom.pipeline.source import References, SweepLines
 
 LEAST_LINES = 2  # of a run, so that it has a direction
 CELL_PX = 4  # of the map of captures

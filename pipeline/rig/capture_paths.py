@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RigError, SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import wire_positions
-from pipeline.geometry.scan import Sweep, exposing, line_positions, memory_loads, sweep_positions
-from pipeline.rig.camera.camera_cubes import CapturedLines
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import wire_positions
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing, line_positions, memory_loads, sweep_positions
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]

@@ -17,14 +17,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from pipeline.errors import RigError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, exposing
-from pipeline.rig.camera.camera_files import Kept
-from pipeline.rig.capture_paths import CapturePath, CaptureRecord, LinePositions, capture_prefix
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import RigDevices
-from pipeline.source import AT_REST
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing
+from spectralzoom.pipeline.rig.camera.camera_files import Kept
+from spectralzoom.pipeline.rig.capture_paths import CapturePath, CaptureRecord, LinePositions, capture_prefix
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.drivers import RigDevices
+from spectralzoom.pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)
 JOURNAL = "captures.jsonl"  # beside the files fetched from the camera

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.mirror import Axes, Mounting
-from pipeline.geometry.scan import Ends
-from pipeline.setting_fields import assumed, stated
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.mirror import Axes, Mounting
+from spectralzoom.pipeline.geometry.scan import Ends
+from spectralzoom.pipeline.setting_fields import assumed, stated
 
 FAKE = "fake"  # of a driver's name
 CONTROL_PORT = 8100  # of the camera's commands; the maker's

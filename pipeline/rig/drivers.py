@@ -16,15 +16,15 @@ from typing import Any, Literal, Protocol, cast
 
 from numpy.typing import ArrayLike
 
-from pipeline.errors import RigError, SettingsError
-from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
-from pipeline.rig.camera.camera_files import Capture, Kept, Progress
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import CONTROL_PORT, FAKE, SurveyRig
-from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from pipeline.rig.mirror_controller import open_mirror
-from pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport
-from pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
+from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress
+from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
+from spectralzoom.pipeline.rig.device_settings import CONTROL_PORT, FAKE, SurveyRig
+from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
+from spectralzoom.pipeline.rig.mirror_controller import open_mirror
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 
 __all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
 LOG = logging.getLogger(__name__)

@@ -17,16 +17,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import RigError, SettingsError
-from pipeline.geometry.mirror import wire_positions
-from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
-from pipeline.rig.camera.camera_files import Capture, Kept, Progress
-from pipeline.rig.camera.frame_indices import LineTimes
-from pipeline.rig.capture_paths import announced
-from pipeline.rig.device_settings import FAKE
-from pipeline.rig.transports import Clock, DeviceRefused
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import AT_REST
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.geometry.mirror import wire_positions
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
+from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress
+from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
+from spectralzoom.pipeline.rig.capture_paths import announced
+from spectralzoom.pipeline.rig.device_settings import FAKE
+from spectralzoom.pipeline.rig.transports import Clock, DeviceRefused
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import AT_REST
 
 STARTED_US = 1_500_000_000_000_000  # by the fake camera's clock, of a capture's first frame
 _FOLDER = re.compile(r"/fake/(.*)_\d+-(\d+)-([\d.e+-]+)-([\d.e+-]+)")  # prefix, frames, exposure and period [ms]

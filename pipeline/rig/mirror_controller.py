@@ -19,12 +19,12 @@ from itertools import chain
 
 from numpy.typing import ArrayLike
 
-from pipeline.errors import RigError, SettingsError, ShapeError
-from pipeline.geometry.mirror import wire_positions
-from pipeline.geometry.scan import device_range
-from pipeline.rig import pro_mode as pro
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.transports import (
+from spectralzoom.pipeline.errors import RigError, SettingsError, ShapeError
+from spectralzoom.pipeline.geometry.mirror import wire_positions
+from spectralzoom.pipeline.geometry.scan import device_range
+from spectralzoom.pipeline.rig import pro_mode as pro
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
     Clock,

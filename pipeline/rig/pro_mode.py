@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from functools import cache
 
-from pipeline.errors import ShapeError
+from spectralzoom.pipeline.errors import ShapeError
 
 LOG = logging.getLogger(__name__)
 TURNED = 0x20  # the bit that an escape inverts

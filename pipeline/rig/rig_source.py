@@ -19,19 +19,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RigError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import STRAIGHT
-from pipeline.geometry.scan import Sweep, exposing
-from pipeline.rig.camera.camera_cubes import as_references
-from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
-from pipeline.rig.capture_paths import REFERENCES, CaptureRecord, UnusableCaptureError, locate_lines, next_path, path_of
-from pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import RigDevices
-from pipeline.rig.transports import DeviceRefused, StateUnknown
-from pipeline.signal.calibrate import full_scale_notes
-from pipeline.source import Line, References
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import STRAIGHT
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing
+from spectralzoom.pipeline.rig.camera.camera_cubes import as_references
+from spectralzoom.pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
+from spectralzoom.pipeline.rig.capture_paths import (
+    REFERENCES,
+    CaptureRecord,
+    UnusableCaptureError,
+    locate_lines,
+    next_path,
+    path_of,
+)
+from spectralzoom.pipeline.rig.capture_runner import CaptureJournal, CaptureRunner, Say
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.drivers import RigDevices
+from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
+from spectralzoom.pipeline.signal.calibrate import full_scale_notes
+from spectralzoom.pipeline.source import Line, References
 
 LOG = logging.getLogger(__name__)
 BARREN = 2  # captures in a row without a line, after which a sweep fails

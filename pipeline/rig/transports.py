@@ -14,7 +14,7 @@ from typing import Literal, Protocol, TypeVar
 import serial
 from serial.tools import list_ports
 
-from pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.errors import RigError, SettingsError
 
 
 class Clock(Protocol):

@@ -10,10 +10,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import PoseError, RigError, ShapeError
-from pipeline.geometry.mirror import mirror_throughput
-from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.source import References
+from spectralzoom.pipeline.errors import PoseError, RigError, ShapeError
+from spectralzoom.pipeline.geometry.mirror import mirror_throughput
+from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
+from spectralzoom.pipeline.source import References
 
 FILL_REACH = 8  # samples; elements farther away have seen something else
 
@@ -180,7 +180,7 @@ def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: 
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:
-    from pipeline.signal import compiled_loops
+    from spectralzoom.pipeline.signal import compiled_loops
 
     fill = elements.fill
     dark, gain = (np.ascontiguousarray(frame, np.float32) for frame in (elements.references.dark, elements.gain))

@@ -6,8 +6,8 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from pipeline.compiled import FLOATS, compiled, rows_of
-from pipeline.signal.subspace import BLOCK
+from spectralzoom.pipeline.compiled import FLOATS, compiled, rows_of
+from spectralzoom.pipeline.signal.subspace import BLOCK
 
 Values = NDArray[np.float32]
 _LINES, _FRAME, _BANDS = (rows_of(FLOATS, axes, read_only=True) for axes in (3, 2, 1))

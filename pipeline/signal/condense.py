@@ -13,15 +13,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import cuts
-from pipeline.geometry.scan import Sweep
-from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.calibrate import Bools, calibrate, judge_elements
-from pipeline.signal.components import Components, Scores
-from pipeline.signal.lines import BLOCK_LINES, CondensedLines
-from pipeline.signal.subspace import SignalStatistics
-from pipeline.source import Line, References, SweepLines
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
+from spectralzoom.pipeline.signal.calibrate import Bools, calibrate, judge_elements
+from spectralzoom.pipeline.signal.components import Components, Scores
+from spectralzoom.pipeline.signal.lines import BLOCK_LINES, CondensedLines
+from spectralzoom.pipeline.signal.subspace import SignalStatistics
+from spectralzoom.pipeline.source import Line, References, SweepLines
 
 WHOLE, PARTIAL, UNUSABLE = 0, 1, 2  # all bands seen; some restored from the others; fewer than half of the bands seen
 JOINT = ((2, 2), (1, 8), (8, 1))  # (line, sample) of neighbours whose residuals are tested together

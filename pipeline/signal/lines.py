@@ -15,10 +15,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.grid import cuts
-from pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
-from pipeline.signal.components import BROAD_BANDS, Components, broad_weights, spread_bands
-from pipeline.source import References, SweepLines
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
+from spectralzoom.pipeline.signal.components import BROAD_BANDS, Components, broad_weights, spread_bands
+from spectralzoom.pipeline.source import References, SweepLines
 
 BLOCK_LINES = 64  # a shard of a stored sweep: one line of it takes as long to read as all
 CHUNK_SAMPLES = 32  # likewise along the line

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.signal.components import Components, Floats
+from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
+from spectralzoom.pipeline.signal.components import Components, Floats
 
 BLOCK = 4  # spectra a side of a mean
 SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more add time and little accuracy
@@ -77,7 +77,7 @@ class SignalStatistics:
 
     def add(self, values: Values, valid: Bools) -> None:
         """Add some neighbouring lines: (line, sample, band) scene values, and their validity by `calibrate`."""
-        from pipeline.signal import compiled_loops
+        from spectralzoom.pipeline.signal import compiled_loops
 
         if not values.size or not valid.any():
             return

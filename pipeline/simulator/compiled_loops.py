@@ -15,8 +15,8 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from pipeline.compiled import DOUBLES, FLOATS, OFFSETS, compiled, record_of, rows_of
-from pipeline.simulator.optics.kernel_fit import Floats, TapTable
+from spectralzoom.pipeline.compiled import DOUBLES, FLOATS, OFFSETS, compiled, record_of, rows_of
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Floats, TapTable
 
 Radiance = NDArray[np.float32]
 _AT_ONCE = 1024  # numbers that stay in the processor's first cache

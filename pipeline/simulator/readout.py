@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from pipeline.simulator.effects.counting import (
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
     EXACT,
@@ -28,8 +28,8 @@ from pipeline.simulator.effects.counting import (
     photon_counts,
     rounded_counts,
 )
-from pipeline.simulator.effects.effect import OFF, Radiance, SweepBlock
-from pipeline.simulator.render import Choice
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Radiance, SweepBlock
+from spectralzoom.pipeline.simulator.render import Choice
 
 
 def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
@@ -76,7 +76,7 @@ class Readout:
         cheap = self._variant(SHOT.name) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
         if not cheap:  # shot and read noise are draws of their own
             return self.converted(self.electrons(light, number))
-        from pipeline.simulator import compiled_loops
+        from spectralzoom.pipeline.simulator import compiled_loops
 
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
         deviate = self._deviates(SHOT.name, number)

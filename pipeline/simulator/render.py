@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
-from pipeline.geometry.scan import Floats, Sweep, line_positions, shifted_position
-from pipeline.simulator.effects.air import ABSORPTION, PARALLAX, PATH_RADIANCE, TURBULENCE, WIND
-from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.counting import (
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, line_positions, shifted_position
+from spectralzoom.pipeline.simulator.effects.air import ABSORPTION, PARALLAX, PATH_RADIANCE, TURBULENCE, WIND
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
     GAUSSIAN,
@@ -24,16 +24,16 @@ from pipeline.simulator.effects.counting import (
     SATURATION,
     SHOT,
 )
-from pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
-from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
-from pipeline.simulator.effects.line import BOXES, FOLDED, ROTATION, SLIT, SMEAR, box_of, smeared_positions
-from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
-from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRAY_LIGHT, STRIPING
-from pipeline.simulator.optics.kernel_fit import Moments, fold
-from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
-from pipeline.simulator.optics.scene_radiance import SceneSampler
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
+from spectralzoom.pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
+from spectralzoom.pipeline.simulator.effects.line import BOXES, FOLDED, ROTATION, SLIT, SMEAR, box_of, smeared_positions
+from spectralzoom.pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
+from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRAY_LIGHT, STRIPING
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Moments, fold
+from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
+from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 PROBES = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 

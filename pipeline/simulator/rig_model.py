@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Literal
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, exposing
-from pipeline.setting_fields import assumed, misfits, stated
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing
+from spectralzoom.pipeline.setting_fields import assumed, misfits, stated
 
 Coating = Literal["aluminium", "ideal"]  # ideal: reflects everything, at any angle
 Relief = Literal["flat", "step", "plane"]

@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import wire_positions
-from pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
-from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
-from pipeline.simulator.effects.effect import OFF, SweepBlock
-from pipeline.simulator.effects.lighting import VIGNETTING
-from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
-from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.render import USUAL, Choice, expected_light
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.source import AT_REST, Line, References
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import wire_positions
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
+from spectralzoom.pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
+from spectralzoom.pipeline.simulator.effects.effect import OFF, SweepBlock
+from spectralzoom.pipeline.simulator.effects.lighting import VIGNETTING
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
+from spectralzoom.pipeline.simulator.readout import dark_frame, read_out
+from spectralzoom.pipeline.simulator.render import USUAL, Choice, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.source import AT_REST, Line, References
 
 Raw = NDArray[np.uint16]
 REFERENCE_FRAMES = 32  # of whole numbers, of which a dark or white frame is the mean

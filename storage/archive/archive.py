@@ -21,8 +21,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import IncompleteStoreError, NoRunError
-from storage.archive.keys import (
+from spectralzoom.pipeline.errors import IncompleteStoreError, NoRunError
+from spectralzoom.storage.archive.keys import (
     LATEST,
     StageRef,
     in_text,
@@ -33,8 +33,8 @@ from storage.archive.keys import (
     stage_key,
     store_at,
 )
-from storage.archive.lineage import rests_on
-from storage.archive.manifests import (
+from spectralzoom.storage.archive.lineage import rests_on
+from spectralzoom.storage.archive.manifests import (
     CLEARED,
     check_files,
     clear_files,
@@ -47,8 +47,8 @@ from storage.archive.manifests import (
     try_manifest,
     write_manifest,
 )
-from storage.archive.run_folders import RunDraft
-from storage.archive.staging import (
+from spectralzoom.storage.archive.run_folders import RunDraft
+from spectralzoom.storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
     check_name,
@@ -59,7 +59,7 @@ from storage.archive.staging import (
     sync_path,
     take_lock,
 )
-from storage.arrays.layout import consolidate_stores
+from spectralzoom.storage.arrays.layout import consolidate_stores
 
 __all__ = ["Archive", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ArchiveError
-from storage.archive.staging import MANIFEST_NAME, PART_SUFFIX, check_name, is_name, refusals, sync_path
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.storage.archive.staging import MANIFEST_NAME, PART_SUFFIX, check_name, is_name, refusals, sync_path
 
 KEY_LENGTH = 20
 SIGNIFICANT_DIGITS = 12

@@ -11,10 +11,10 @@ from functools import cached_property
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-from pipeline.errors import ArchiveError, NoRunError, list_some
-from storage.archive.keys import LATEST, StageRef, in_text, published_runs, published_stores
-from storage.archive.records import LINE_PRODUCTS, Run, Store, read_run, read_store
-from storage.archive.staging import MANIFEST_NAME, check_name
+from spectralzoom.pipeline.errors import ArchiveError, NoRunError, list_some
+from spectralzoom.storage.archive.keys import LATEST, StageRef, in_text, published_runs, published_stores
+from spectralzoom.storage.archive.records import LINE_PRODUCTS, Run, Store, read_run, read_store
+from spectralzoom.storage.archive.staging import MANIFEST_NAME, check_name
 
 CAPTURED = "capture"  # stage of lines as they came
 RASTER_ROLE = "condense_raster"  # the stage that reads the pixels of a raster

@@ -15,8 +15,8 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
-from pipeline.errors import IncompleteStoreError
-from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, remove_tree, sync_path
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.storage.archive.staging import MANIFEST_NAME, file_hash, files_below, remove_tree, sync_path
 
 FORMAT = 2
 CLEARED = "cleared"  # file that marks a store whose other files were deleted; its manifest stays as it is

@@ -15,9 +15,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import as_table, is_cleared, listed_bytes, try_manifest
-from storage.archive.staging import MANIFEST_NAME, file_hash
+from spectralzoom.storage.archive.keys import StageRef, in_text
+from spectralzoom.storage.archive.manifests import as_table, is_cleared, listed_bytes, try_manifest
+from spectralzoom.storage.archive.staging import MANIFEST_NAME, file_hash
 
 RECEIPT = "receipt.json"
 YEARS = range(1900, 2201)

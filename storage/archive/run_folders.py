@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from storage.archive.keys import plain
-from storage.archive.manifests import write_manifest
-from storage.archive.staging import check_name, refusals, remove_tree, rename_into_place
+from spectralzoom.storage.archive.keys import plain
+from spectralzoom.storage.archive.manifests import write_manifest
+from spectralzoom.storage.archive.staging import check_name, refusals, remove_tree, rename_into_place
 
 
 class RunDraft:

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ArchiveError
+from spectralzoom.pipeline.errors import ArchiveError
 
 MOST_BYTES = 10_000_000  # settings are a page long
 

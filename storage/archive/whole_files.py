@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.errors import ArchiveError, PipelineError, visible
-from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
+from spectralzoom.pipeline.errors import ArchiveError, PipelineError, visible
+from spectralzoom.storage.archive.staging import PART_SUFFIX, refusals, remove_tree, sync_path
 
 _PREFIX = ".export-"
 PROBE_BYTES = 1 << 20  # a disk without room for so much is full

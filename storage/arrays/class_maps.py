@@ -17,10 +17,10 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import UNLABELLED, cuts
-from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
-from storage.arrays.layout import (
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
+from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
+from spectralzoom.storage.arrays.layout import (
     MAP_PACKING,
     SHARD_ROWS,
     array_of,

@@ -11,11 +11,11 @@ import numpy as np
 import zarr
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.scan import Sweep
-from pipeline.signal.subspace import SignalStatistics
-from pipeline.source import Line, References
-from storage.arrays.layout import (
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.signal.subspace import SignalStatistics
+from spectralzoom.pipeline.source import Line, References
+from spectralzoom.storage.arrays.layout import (
     RAW_PACKING,
     SHARD_ROWS,
     create_array,

@@ -11,10 +11,17 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.rectify.placed import TieTable
-from pipeline.rectify.scan_paths import ScanPath
-from storage.archive.keys import KEY_LENGTH
-from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small
+from spectralzoom.pipeline.rectify.placed import TieTable
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath
+from spectralzoom.storage.archive.keys import KEY_LENGTH
+from spectralzoom.storage.arrays.layout import (
+    create_group,
+    damage_named,
+    open_group,
+    read_array,
+    write_image,
+    write_small,
+)
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 

@@ -19,9 +19,9 @@ import zarr
 from affine import Affine
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import PoseError
-from pipeline.ground.georeference import zoomed_out
-from storage.arrays.layout import SmallArray, create_group, damage_named, open_group
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.ground.georeference import zoomed_out
+from spectralzoom.storage.arrays.layout import SmallArray, create_group, damage_named, open_group
 
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one

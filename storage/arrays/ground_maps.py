@@ -12,11 +12,24 @@ import zarr
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import IncompleteStoreError, ShapeError
-from pipeline.ground.field_places import M2_PER_HECTARE
-from storage.arrays.class_maps import CONFIDENCE, OLD_CLASS, ClassNames, check_named, class_flags, old_class_flags
-from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, map_coordinates
-from storage.arrays.layout import (
+from spectralzoom.pipeline.errors import IncompleteStoreError, ShapeError
+from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE
+from spectralzoom.storage.arrays.class_maps import (
+    CONFIDENCE,
+    OLD_CLASS,
+    ClassNames,
+    check_named,
+    class_flags,
+    old_class_flags,
+)
+from spectralzoom.storage.arrays.georeference import (
+    ON_THE_MAP,
+    geobox_of_group,
+    load_geobox,
+    map_attributes,
+    map_coordinates,
+)
+from spectralzoom.storage.arrays.layout import (
     SHARD_COLUMNS,
     SHARD_ROWS,
     array_of,

@@ -23,10 +23,10 @@ import zarr.codecs as zarr_codecs
 import zarr.storage as zarr_storage
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.signal.components import Components
-from pipeline.signal.condense import whole_steps
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import whole_steps
 
 CHUNK_PX = 32
 SHARD_ROWS = 64

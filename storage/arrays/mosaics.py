@@ -11,11 +11,11 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import cuts
-from pipeline.signal.components import Components, broad_weights
-from storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
-from storage.arrays.layout import (
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.signal.components import Components, broad_weights
+from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
+from spectralzoom.storage.arrays.layout import (
     LARGEST_SHORT,
     SHARD_ROWS,
     array_of,

@@ -20,12 +20,12 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.geometry.mirror import mirror_throughput
-from pipeline.signal.calibrate import judge_elements
-from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
-from pipeline.source import References
-from storage.arrays.cubes import (
+from spectralzoom.pipeline.geometry.mirror import mirror_throughput
+from spectralzoom.pipeline.signal.calibrate import judge_elements
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
+from spectralzoom.pipeline.source import References
+from spectralzoom.storage.arrays.cubes import (
     RawCube,
     StoredSweep,
     SweepHeader,
@@ -35,7 +35,7 @@ from storage.arrays.cubes import (
     write_line_facts,
     write_references,
 )
-from storage.arrays.layout import (
+from spectralzoom.storage.arrays.layout import (
     ArraySpec,
     create_array,
     create_group,

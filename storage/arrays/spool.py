@@ -35,11 +35,11 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.errors import RigError, list_some
-from pipeline.rig.transports import NotKept
-from pipeline.source import Line
-from storage.archive.keys import plain
-from storage.archive.staging import format_disk_error, sync_path, write_all
+from spectralzoom.pipeline.errors import RigError, list_some
+from spectralzoom.pipeline.rig.transports import NotKept
+from spectralzoom.pipeline.source import Line
+from spectralzoom.storage.archive.keys import plain
+from spectralzoom.storage.archive.staging import format_disk_error, sync_path, write_all
 
 SYNC_LINES = 64
 MOST_NAMED = 8

@@ -14,10 +14,10 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import ArchiveError
-from storage.archive.whole_files import written_aside
-from storage.arrays.class_maps import ClassNames
-from storage.arrays.georeference import AngularGrid
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.storage.archive.whole_files import written_aside
+from spectralzoom.storage.arrays.class_maps import ClassNames
+from spectralzoom.storage.arrays.georeference import AngularGrid
 
 TILE = 512  # px: rasters within one tile need no overviews
 ANGULAR = (

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline.errors import SettingsError
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef, without_manifest
-from storage.archive.lineage import Catalogue
-from storage.archive.staging import MANIFEST_NAME, refusals
-from storage.maintenance.verification import Finding
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef, without_manifest
+from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.archive.staging import MANIFEST_NAME, refusals
+from spectralzoom.storage.maintenance.verification import Finding
 
 DAY_S = 86400.0
 _CURE = "restore this folder from a copy, or delete it and with it the stores that only it names"

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from storage.archive.archive import Archive
-from storage.archive.keys import without_manifest
-from storage.archive.lineage import Catalogue
-from storage.archive.manifests import broken_files, is_cleared, listed_bytes, try_manifest
-from storage.archive.staging import MANIFEST_NAME
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import without_manifest
+from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.archive.manifests import broken_files, is_cleared, listed_bytes, try_manifest
+from spectralzoom.storage.archive.staging import MANIFEST_NAME
 
 Progress = Callable[[str, float], None]  # address being read, fraction of all bytes
 

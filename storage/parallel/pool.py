@@ -19,7 +19,7 @@ from multiprocessing import resource_tracker
 from operator import call
 from typing import Any, TypeVar
 
-from pipeline.errors import SettingsError, WorkerError
+from spectralzoom.pipeline.errors import SettingsError, WorkerError
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 RESTART_S = 60.0  # time limit until a process of this machine replaces one that died

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
-from pipeline.errors import SceneError
-from storage.arrays.georeference import find_geobox
-from storage.readers.cube_sources import (
+from spectralzoom.pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.arrays.georeference import find_geobox
+from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     MOST_RATIO,
     Bands,

@@ -20,9 +20,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from storage.readers.array_cubes import Arrays, FileArray
-from storage.readers.cube_sources import DEFLATE_RATIO
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.array_cubes import Arrays, FileArray
+from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO
 
 ARRAY_ENDINGS = (".npy", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import SceneError
-from pipeline.signal.calibrate import calibrate
-from pipeline.source import References
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.source import References
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
-from pipeline.errors import SceneError
-from pipeline.rig.camera.frame_indices import (
+from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.rig.camera.frame_indices import (
     FRAME_INDEX,
     LONGEST_LINE,
     FrameIndex,
@@ -32,8 +32,8 @@ from pipeline.rig.camera.frame_indices import (
     place_parts,
     times_of_lines,
 )
-from storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
+from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")

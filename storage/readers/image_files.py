@@ -23,9 +23,9 @@ import pyproj
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.envi_headers import finite_number, wavelengths_nm
-from pipeline.errors import SceneError
-from storage.readers.cube_sources import (
+from spectralzoom.pipeline.envi_headers import finite_number, wavelengths_nm
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
     MOST_RATIO,

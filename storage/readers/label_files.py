@@ -15,11 +15,17 @@ from pathlib import Path
 
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import SceneError, list_some
-from storage.readers.labels import Labels, found_classes, load_labels
-from storage.readers.open_cubes import CUBE_ENDINGS
-from storage.readers.polygons import POLYGON_ENDINGS, is_polygon_file, load_polygon_labels, polygon_classes, split_layer
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
+from spectralzoom.pipeline.errors import SceneError, list_some
+from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
+from spectralzoom.storage.readers.polygons import (
+    POLYGON_ENDINGS,
+    is_polygon_file,
+    load_polygon_labels,
+    polygon_classes,
+    split_layer,
+)
+from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
 
 LABEL_WORDS = (
     *("mask", "masks", "label", "labels", "annotation", "annotations"),

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import SceneError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from storage.readers.open_cubes import open_cube
-from storage.readers.scene_toml import ClassValue, Colour
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
+from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.scene_toml import ClassValue, Colour
 
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
 MOST_FOUND_CLASSES = 64

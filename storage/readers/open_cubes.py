@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from storage.readers.array_cubes import UNNAMED, cube_source, find_cube
-from storage.readers.array_files import (
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
+from spectralzoom.storage.readers.array_files import (
     ARRAY_ENDINGS,
     HDF_ENDINGS,
     check_picture,
@@ -23,8 +23,8 @@ from storage.readers.array_files import (
     load_npy,
     marked_bands,
 )
-from storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
-from storage.readers.envi_files import (
+from spectralzoom.storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
+from spectralzoom.storage.readers.envi_files import (
     DATA_ENDINGS,
     find_envi_pair,
     find_reference,
@@ -32,9 +32,9 @@ from storage.readers.envi_files import (
     open_envi_source,
     open_headwall_cube,
 )
-from storage.readers.image_files import IMAGE_ENDINGS, open_image
-from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
-from storage.readers.zarr_files import find_zarr_store, zarr_arrays
+from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
+from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
+from spectralzoom.storage.readers.zarr_files import find_zarr_store, zarr_arrays
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")

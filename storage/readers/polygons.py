@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from shapely.geometry.base import BaseGeometry
 
-from pipeline.errors import PipelineError, SceneError, ZoneError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture
-from pipeline.ground.zones import on_field
-from storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
+from spectralzoom.pipeline.errors import PipelineError, SceneError, ZoneError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture
+from spectralzoom.pipeline.ground.zones import on_field
+from spectralzoom.storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
+from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 if TYPE_CHECKING:
     import geopandas

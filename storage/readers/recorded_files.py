@@ -25,18 +25,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.straight_scans import angles_to_positions
-from pipeline.envi_headers import listed_numbers
-from pipeline.errors import SceneError, WavelengthError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
-from pipeline.signal.calibrate import Floats, find_bad_elements, full_scale_notes
-from pipeline.source import References
-from storage.readers.cube_sources import CubeSource
-from storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
-from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
-from storage.readers.scene_files import bands_text
-from storage.readers.zarr_files import find_zarr_store
+from spectralzoom.pipeline.capture.straight_scans import angles_to_positions
+from spectralzoom.pipeline.envi_headers import listed_numbers
+from spectralzoom.pipeline.errors import SceneError, WavelengthError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
+from spectralzoom.pipeline.signal.calibrate import Floats, find_bad_elements, full_scale_notes
+from spectralzoom.pipeline.source import References
+from spectralzoom.storage.readers.cube_sources import CubeSource
+from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
+from spectralzoom.storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
+from spectralzoom.storage.readers.scene_files import bands_text
+from spectralzoom.storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
 SAMPLED_LINES = 64  # for bits

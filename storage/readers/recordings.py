@@ -26,24 +26,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
-from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
-from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
-from pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
-from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
-from pipeline.ground.georeference import geobox_of_record
-from storage.archive.archive import Archive
-from storage.archive.keys import array_digest, is_archive, store_at
-from storage.archive.manifests import check_files, manifest_sha256
-from storage.archive.records import LINE_PRODUCTS, Run, read_run, read_store
-from storage.archive.staging import MANIFEST_NAME
-from storage.arrays.layout import array_of, open_group
-from storage.arrays.signal_cubes import RestoredCube, open_lines
-from storage.readers.cube_sources import CubeSource
-from storage.readers.envi_files import find_envi_pair, load_envi_header
-from storage.readers.open_cubes import reader_of
-from storage.readers.recorded_files import (
+from spectralzoom.pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
+from spectralzoom.pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
+from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
+from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
+from spectralzoom.pipeline.ground.georeference import geobox_of_record
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import array_digest, is_archive, store_at
+from spectralzoom.storage.archive.manifests import check_files, manifest_sha256
+from spectralzoom.storage.archive.records import LINE_PRODUCTS, Run, read_run, read_store
+from spectralzoom.storage.archive.staging import MANIFEST_NAME
+from spectralzoom.storage.arrays.layout import array_of, open_group
+from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
+from spectralzoom.storage.readers.cube_sources import CubeSource
+from spectralzoom.storage.readers.envi_files import find_envi_pair, load_envi_header
+from spectralzoom.storage.readers.open_cubes import reader_of
+from spectralzoom.storage.readers.recorded_files import (
     ENDINGS,
     WITHOUT_MIRROR,
     LinePointing,
@@ -55,7 +55,7 @@ from storage.readers.recorded_files import (
     open_recorded_cube,
     with_bits,
 )
-from storage.readers.zarr_files import lost_chunks
+from spectralzoom.storage.readers.zarr_files import lost_chunks
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"

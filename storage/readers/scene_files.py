@@ -14,16 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import EmptySceneError, SceneError
-from pipeline.geometry.grid import SceneGrid, cuts
-from pipeline.readings import MOST_VALUE, beyond_range, find_beyond
-from storage.archive.staging import file_hash
-from storage.parallel.pool import RESERVED_BYTES, memory_refusal
-from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines, unpacked
-from storage.readers.label_files import label_file, read_labels
-from storage.readers.labels import Labels
-from storage.readers.open_cubes import open_cube, split_variable
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
+from spectralzoom.pipeline.errors import EmptySceneError, SceneError
+from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
+from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
+from spectralzoom.storage.archive.staging import file_hash
+from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
+from spectralzoom.storage.readers.cube_sources import (
+    BLOCK_LINES,
+    Bands,
+    CubeSource,
+    check_memory,
+    scene_lines,
+    unpacked,
+)
+from spectralzoom.storage.readers.label_files import label_file, read_labels
+from spectralzoom.storage.readers.labels import Labels
+from spectralzoom.storage.readers.open_cubes import open_cube, split_variable
+from spectralzoom.storage.readers.scene_toml import (
+    SETTINGS_NAME,
+    ClassValue,
+    SceneSettings,
+    find_scene_settings,
+    settle_wavelengths,
+)
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed

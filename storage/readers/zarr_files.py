@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from pipeline.errors import SceneError
-from storage.readers.array_cubes import FileArray
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.array_cubes import FileArray
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 CODECS = {

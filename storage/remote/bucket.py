@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive.archive import Archive
-from storage.archive.keys import in_text
-from storage.archive.manifests import CLEARED, as_table, check_files, is_cleared, parse_manifest
-from storage.archive.records import RESTS_ON
-from storage.archive.staging import MANIFEST_NAME, is_name
-from storage.remote.objects import Objects, some_at_a_time
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import in_text
+from spectralzoom.storage.archive.manifests import CLEARED, as_table, check_files, is_cleared, parse_manifest
+from spectralzoom.storage.archive.records import RESTS_ON
+from spectralzoom.storage.archive.staging import MANIFEST_NAME, is_name
+from spectralzoom.storage.remote.objects import Objects, some_at_a_time
 
 Report = Callable[[str, float], None]  # address, and the fraction that is done
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 
 if TYPE_CHECKING:
     from obstore.store import S3Store

@@ -74,7 +74,7 @@ def _cells_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:
 
 def _machine() -> str:
     """Return processor, cores, load and versions in one line."""
-    from flows.tradeoff import describe_machine, mean_load
+    from spectralzoom.flows.tradeoff import describe_machine, mean_load
 
     it: dict[str, Any] = describe_machine(threads=1)
     versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())

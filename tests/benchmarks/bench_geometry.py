@@ -6,8 +6,8 @@ import numpy as np
 from measure import Row, time_in_turn
 from numpy.typing import NDArray
 
-from pipeline.geometry import mirror
-from pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry import mirror
+from spectralzoom.pipeline.geometry.camera import LineCamera
 from tests.pipeline.geometry.paper_equations import line_rotation, straight_slope_rotation
 from tests.pipeline.geometry.test_mirror import exact_direction
 from tests.pipeline.geometry.test_paper import paper_position, slope_rotation

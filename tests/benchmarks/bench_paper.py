@@ -21,18 +21,18 @@ from measure import Row, aligned, data_folder, not_run
 from numpy.typing import NDArray
 from paper_sets import CAMERA, INPUTS, DataSet, Image, Say, coarse_image, farm_all, farm_four, folder
 
-from flows.training.train_scenes import DEEP_PATCH_PX
-from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
-from models.network.machine import keep_freed_memory, one_thread
-from models.network.sizes import multiply_adds
-from models.network.spectral import LineSpec, patches_of
-from models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
-from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
-from models.training.examples import normalised, observe
-from models.weights.files import Weights
-from pipeline.errors import SceneError
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
-from pipeline.planning.coverage import select_patches
+from spectralzoom.flows.training.train_scenes import DEEP_PATCH_PX
+from spectralzoom.models.evaluation.metrics import confusion, mean_iou, overall_accuracy
+from spectralzoom.models.network.machine import keep_freed_memory, one_thread
+from spectralzoom.models.network.sizes import multiply_adds
+from spectralzoom.models.network.spectral import LineSpec, patches_of
+from spectralzoom.models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
+from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
+from spectralzoom.models.training.examples import normalised, observe
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, patch_pixels
+from spectralzoom.pipeline.planning.coverage import select_patches
 
 COUNTS = (100, 200, 300, 400, 500)
 NAMES = {4: "256", 2: "512", 1: "1024"}  # of inputs, by fine pixels a side of a coarse one

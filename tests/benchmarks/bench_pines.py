@@ -27,25 +27,25 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from flows.evaluate.frames import observe_frame
-from flows.tasks.scene import scene_of_file
-from flows.training.data import load_data_set
-from flows.training.figures import READINGS
-from flows.training.train import train_weights
-from flows.training.train_scenes import COLUMNS, TrainRequest
-from models.evaluation.metrics import average_accuracy, confusion, kappa, overall_accuracy
-from models.network.machine import one_thread
-from models.network.sizes import SegmenterConfig
-from models.network.spectral import SpectralBasis, patches_of
-from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
-from models.training.examples import Example, electrons_of, measured_normalisation, normalised
-from models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train, with_linear
-from models.weights.files import Weights, load_weights
-from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
-from pipeline.planning.coverage import frame_patches
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.flows.evaluate.frames import observe_frame
+from spectralzoom.flows.tasks.scene import scene_of_file
+from spectralzoom.flows.training.data import load_data_set
+from spectralzoom.flows.training.figures import READINGS
+from spectralzoom.flows.training.train import train_weights
+from spectralzoom.flows.training.train_scenes import COLUMNS, TrainRequest
+from spectralzoom.models.evaluation.metrics import average_accuracy, confusion, kappa, overall_accuracy
+from spectralzoom.models.network.machine import one_thread
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.network.spectral import SpectralBasis, patches_of
+from spectralzoom.models.policies.policies import score_patches
+from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
+from spectralzoom.models.training.examples import Example, electrons_of, measured_normalisation, normalised
+from spectralzoom.models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train, with_linear
+from spectralzoom.models.weights.files import Weights, load_weights
+from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.planning.coverage import frame_patches
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers

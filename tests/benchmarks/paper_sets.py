@@ -16,20 +16,20 @@ from measure import ROOT
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flows.tasks.scene import scene_of_file
-from flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
-from flows.training.train_scenes import Common, TrainRequest, network_config
-from models.network.spectral import LineSpec, SpectralBasis
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
-from models.training.examples import measured_normalisation, normalised, observe
-from models.training.train import LabelledPixels, Progress, TrainingSettings, linear_classifier, train
-from models.weights.files import Weights, load_encoder, load_weights
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.once import Once
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
+from spectralzoom.flows.tasks.scene import scene_of_file
+from spectralzoom.flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
+from spectralzoom.flows.training.train_scenes import Common, TrainRequest, network_config
+from spectralzoom.models.network.spectral import LineSpec, SpectralBasis
+from spectralzoom.models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
+from spectralzoom.models.training.examples import measured_normalisation, normalised, observe
+from spectralzoom.models.training.train import LabelledPixels, Progress, TrainingSettings, linear_classifier, train
+from spectralzoom.models.weights.files import Weights, load_encoder, load_weights
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance
 from tests.blocks import block_means
 
 SIDE = 1024  # px

@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LIST = Path(__file__).with_name("defects.toml")
-PACKAGES = ("flows", "models", "pipeline", "spectralzoom", "storage")
+PACKAGES = ("spectralzoom", *(f"spectralzoom.{name}" for name in ("flows", "models", "pipeline", "storage")))
 MOST_SECONDS = 600  # of the tests of one defect; a survey that never ends is noticed too
 
 
@@ -74,9 +74,12 @@ class TreeCopy:
             if (ROOT / name).is_file():
                 (root / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, root / name)
+            elif (ROOT / name).is_symlink():  # the folders by their import names
+                (root / name).parent.mkdir(parents=True, exist_ok=True)
+                (root / name).symlink_to((ROOT / name).readlink())
         copy = cls(root)
-        code = f"import {', '.join(PACKAGES)}\nfor one in ({', '.join(PACKAGES)}): print(one.__file__)"
-        places = copy.python("-c", code).stdout.split()
+        code = "import importlib, sys\nfor name in sys.argv[1:]: print(importlib.import_module(name).__file__)"
+        places = copy.python("-c", code, *PACKAGES).stdout.split()
         if [Path(place).resolve().parents[1] for place in places] != [root.resolve()] * len(PACKAGES):
             raise RuntimeError(f"Python imports {places}, expected the copy {root}")
         return copy

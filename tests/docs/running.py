@@ -25,10 +25,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from flows.cli.app import build_app
-from flows.cli.main import main
-from flows.settings.load import load_settings
-from storage.readers.scene_toml import load_scene_settings
+from spectralzoom.flows.cli.app import build_app
+from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.storage.readers.scene_toml import load_scene_settings
 from tests.docs.pages import ROOT, Block
 from tests.flows.conftest import FEW_BANDS
 
@@ -37,7 +37,7 @@ BUILT = ("{toctree}", "{eval-rst}")  # run by `make docs`
 BUCKET = "s3://bucket/prefix"
 EACH = """
 import json, sys
-from flows.cli.main import main
+from spectralzoom.flows.cli.main import main
 for words in json.loads(sys.argv[1]):
     try:
         main(words)
@@ -76,11 +76,12 @@ class Reader:
 
     @property
     def tree(self) -> Path:
-        """Return a copy of the four folders that a page may add to."""
+        """Return a copy of the folders that a page may add to."""
         root = self.folder / "tree"
         if not root.exists():
-            for name in ("pipeline", "models", "storage", "flows"):
-                shutil.copytree(ROOT / name, root / name)  # with bytecode, valid for files of the same dates
+            for name in ("pipeline", "models", "storage", "flows", "spectralzoom"):
+                # with bytecode, valid for files of the same dates
+                shutil.copytree(ROOT / name, root / name, symlinks=True)
         return root
 
     def _command(self, block: Block, command: str, word: str, rest: str) -> None:

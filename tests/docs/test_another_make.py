@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from spectral.io import envi
 
-from flows.cli.rig_commands import check_camera
-from pipeline.errors import RigError, SettingsError
-from pipeline.geometry.scan import line_positions
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture_paths import REFERENCES, capture_prefix
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import CameraDriver, RigDevices, open_camera_driver, open_mirror_driver
-from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from pipeline.rig.rig_source import RigSource
-from pipeline.rig.transports import StateUnknown
+from spectralzoom.flows.cli.rig_commands import check_camera
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.geometry.scan import line_positions
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.capture_paths import REFERENCES, capture_prefix
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.drivers import CameraDriver, RigDevices, open_camera_driver, open_mirror_driver
+from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
+from spectralzoom.pipeline.rig.rig_source import RigSource
+from spectralzoom.pipeline.rig.transports import StateUnknown
 from tests.docs.pages import DOCS, blocks_of
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 

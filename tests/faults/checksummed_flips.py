@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
-from models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from models.weights.files import describe_weights, load_weights, save_weights
-from pipeline.errors import WeightsError
+from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
+from spectralzoom.models.weights.files import describe_weights, load_weights, save_weights
+from spectralzoom.pipeline.errors import WeightsError
 from tests.conftest import RGB_NM, random_weights
 from tests.faults.fault_table import Row, reported_wrong
 

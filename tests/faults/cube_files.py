@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipeline.errors import PipelineError
-from storage.readers.open_cubes import open_cube
+from spectralzoom.pipeline.errors import PipelineError
+from spectralzoom.storage.readers.open_cubes import open_cube
 from tests.envi_files import listed, write_cube
 
 SHAPE = (20, 12, 5)

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from pipeline.geometry.scan import Sweep
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture_paths import CaptureRecord
-from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.capture_paths import CaptureRecord
+from spectralzoom.pipeline.rig.capture_runner import JOURNAL, CaptureJournal
 from tests.faults.fault_table import Row, reported_wrong
 
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -7.5, 40)

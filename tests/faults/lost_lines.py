@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.source import Line
-from storage.arrays.spool import SYNC_LINES, Spool
+from spectralzoom.pipeline.source import Line
+from spectralzoom.storage.arrays.spool import SYNC_LINES, Spool
 from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import ROOT
 
@@ -35,7 +35,7 @@ FATES = ("as written", "cut off", "cut short", "zeros", "other bytes", "some pag
 WRITER = """
 import os, sys
 from pathlib import Path
-from storage.arrays.spool import Spool
+from spectralzoom.storage.arrays.spool import Spool
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, line
 with Spool.open(Path(sys.argv[1]), SAMPLES, BANDS, header=HEADER) as spool:
     while True:

@@ -20,8 +20,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.envi_headers import parse_envi_header
-from pipeline.errors import PipelineError
+from spectralzoom.pipeline.envi_headers import parse_envi_header
+from spectralzoom.pipeline.errors import PipelineError
 from tests.faults.cube_files import FORMATS, try_reading
 from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import ROOT

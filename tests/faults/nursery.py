@@ -128,10 +128,30 @@ class Nursery:
 def serve(choices: Path) -> None:
     """Fork a child for each request on stdin, or wait for one; a folder keeps the children's choices of effects."""
     for name in (
-        *("flows.cli.main", "flows.publish.run_folder", "flows.survey_command", "flows.survey"),
-        *("flows.cli.survey_verbs", "flows.archive.commands", "matplotlib.backends.backend_agg"),
-        *("models.network.segmenter", "rich.status", "safetensors.torch", "scipy.optimize", "tests.faults.injection"),
-        *("pipeline.signal.compiled_loops", "pipeline.simulator.compiled_loops", "rasterio", "skimage.color"),
+        *(
+            "spectralzoom.flows.cli.main",
+            "spectralzoom.flows.publish.run_folder",
+            "spectralzoom.flows.survey_command",
+            "spectralzoom.flows.survey",
+        ),
+        *(
+            "spectralzoom.flows.cli.survey_verbs",
+            "spectralzoom.flows.archive.commands",
+            "matplotlib.backends.backend_agg",
+        ),
+        *(
+            "spectralzoom.models.network.segmenter",
+            "rich.status",
+            "safetensors.torch",
+            "scipy.optimize",
+            "tests.faults.injection",
+        ),
+        *(
+            "spectralzoom.pipeline.signal.compiled_loops",
+            "spectralzoom.pipeline.simulator.compiled_loops",
+            "rasterio",
+            "skimage.color",
+        ),
     ):
         importlib.import_module(name)
     importlib.import_module("PIL.Image").init()  # loads its formats
@@ -159,7 +179,7 @@ def _live(request: dict[str, Any]) -> None:
         if request["fault"] is not None:
             injection = importlib.import_module("tests.faults.injection")
             getattr(injection, request["fault"])(**request["arguments"])
-        importlib.import_module("flows.cli.main").main(request["words"])
+        importlib.import_module("spectralzoom.flows.cli.main").main(request["words"])
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     except BaseException:
@@ -171,7 +191,7 @@ def _live(request: dict[str, Any]) -> None:
 
 def _keep_place(path: Path) -> None:
     """Record the functions of this project that an error passed when the command line reports it."""
-    cli = importlib.import_module("flows.cli.main")
+    cli = importlib.import_module("spectralzoom.flows.cli.main")
     say = cli.say
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o644)
 

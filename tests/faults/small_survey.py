@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from models.weights.files import save_weights
-from storage.archive.archive import Archive
-from storage.maintenance.verification import verify_everything
+from spectralzoom.models.weights.files import save_weights
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.conftest import RGB_NM, patchy_scene, random_weights
 from tests.faults.injection import logged_calls
 from tests.faults.nursery import Ended, Nursery

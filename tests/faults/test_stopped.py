@@ -17,18 +17,24 @@ from typing import Any
 
 import pytest
 
-from flows.terminal.processes import TERMINATED
+from spectralzoom.flows.terminal.processes import TERMINATED
 from tests.faults.small_survey import SETTINGS, Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
 from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
-SYNCED: dict[str, Any] = {"place": "storage.archive.manifests:sync_path", "call": 60}  # before which it is stopped
+SYNCED: dict[str, Any] = {
+    "place": "spectralzoom.storage.archive.manifests:sync_path",
+    "call": 60,
+}  # before which it is stopped
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
-    "in the controls": ("flows.tasks.stages.accuracy:mixed", 1, signal.SIGTERM),
-    "before the publication": ("flows.publish.publishing:publish_run", 1, signal.SIGKILL),
-    "in the publication": ("storage.archive.run_folders:rename_into_place", 1, signal.SIGKILL),
+    "in the controls": ("spectralzoom.flows.tasks.stages.accuracy:mixed", 1, signal.SIGTERM),
+    "before the publication": ("spectralzoom.flows.publish.publishing:publish_run", 1, signal.SIGKILL),
+    "in the publication": ("spectralzoom.storage.archive.run_folders:rename_into_place", 1, signal.SIGKILL),
 }
-SECOND_PASS = {"storage.archive.archive:Archive.spool_folder": 2, "storage.arrays.spool:Spool.append": 20}  # as PLACES
+SECOND_PASS = {
+    "spectralzoom.storage.archive.archive:Archive.spool_folder": 2,
+    "spectralzoom.storage.arrays.spool:Spool.append": 20,
+}  # as PLACES
 KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`
 MOMENTS = (0.28, *(random.Random(0).uniform(0.05, 1.05) for _ in range(KILLS)))  # as fractions of its time
 

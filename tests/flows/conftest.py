@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.cli.main import main
-from flows.tasks.local_server import QUIET, local_server
-from flows.tasks.open_survey import STAGES
-from storage.archive.archive import Archive
-from storage.arrays.class_maps import load_class_map
-from storage.maintenance.verification import verify_everything
+from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.tasks.local_server import QUIET, local_server
+from spectralzoom.flows.tasks.open_survey import STAGES
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.arrays.class_maps import load_class_map
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.conftest import Flags, Survey
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects

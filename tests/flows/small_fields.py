@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from flows.evaluate.frames import open_frames
-from models.weights.files import save_weights
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.flows.evaluate.frames import open_frames
+from spectralzoom.models.weights.files import save_weights
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.models.conftest import make_weights
 
 FRAMES = ("001", "002", "003")

@@ -11,10 +11,19 @@ import pytest
 import torch
 from rich.console import Console
 
-from flows import tradeoff as tradeoff_module
-from flows.tradeoff import TRADEOFFS, Figures, Point, Result, Tradeoff, measure_tradeoff, print_tradeoff, tradeoff
-from pipeline.errors import ArchiveError, SettingsError
-from storage.archive.whole_files import to_json
+from spectralzoom.flows import tradeoff as tradeoff_module
+from spectralzoom.flows.tradeoff import (
+    TRADEOFFS,
+    Figures,
+    Point,
+    Result,
+    Tradeoff,
+    measure_tradeoff,
+    print_tradeoff,
+    tradeoff,
+)
+from spectralzoom.pipeline.errors import ArchiveError, SettingsError
+from spectralzoom.storage.archive.whole_files import to_json
 
 
 class Clock:

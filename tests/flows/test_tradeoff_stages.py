@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from flows import tradeoff as stages
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from flows.tradeoff import Tradeoff, measure_tradeoff, tradeoff
-from pipeline.errors import SceneError
+from spectralzoom.flows import tradeoff as stages
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tradeoff import Tradeoff, measure_tradeoff, tradeoff
+from spectralzoom.pipeline.errors import SceneError
 from tests.conftest import QUIET
 
 

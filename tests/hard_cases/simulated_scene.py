@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import Effect, SweepBlock
-from pipeline.simulator.effects.probe import Probe, noise_electrons
-from pipeline.simulator.render import EFFECTS, expected_light
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection import survey_probe
-from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.options import acts_on_light
-from pipeline.simulator.simulated import sweep_block
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.effect import Effect, SweepBlock
+from spectralzoom.pipeline.simulator.effects.probe import Probe, noise_electrons
+from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.selection import survey_probe
+from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
+from spectralzoom.pipeline.simulator.selection.options import acts_on_light
+from spectralzoom.pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.small_scenes import looking_at_less, made_scene
 
 ROUNDING = 4e-6  # times the light over its noise: float32 sums in another order

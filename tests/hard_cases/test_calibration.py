@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.signal.calibrate import calibrate, find_bad_elements
-from pipeline.source import References
+from spectralzoom.pipeline.signal.calibrate import calibrate, find_bad_elements
+from spectralzoom.pipeline.source import References
 
 FULL = 4095
 

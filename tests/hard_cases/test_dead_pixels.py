@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.sizes import TOKEN_PX
-from models.policies.policies import score_patches
-from models.reading.inference import read_coarse_pass
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.sizes import TOKEN_PX
+from spectralzoom.models.policies.policies import score_patches
+from spectralzoom.models.reading.inference import read_coarse_pass
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import coarse_prediction, plain_weights
 
 NM = np.linspace(400, 1000, 9)

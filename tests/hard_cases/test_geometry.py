@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.errors import PoseError
-from pipeline.geometry import mirror
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.geometry import mirror
 from tests.pipeline.geometry.paper_equations import line_rotation
 
 PRECISIONS = [np.float64, np.float32]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pyproj import Proj
 
-from pipeline.errors import PoseError
-from pipeline.ground.field_places import PosedField
-from pipeline.ground.map_grid import ground_grid
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.ground.field_places import PosedField
+from spectralzoom.pipeline.ground.map_grid import ground_grid
 from tests.pipeline.ground.test_ground_grid import whole
 from tests.pipeline.ground.test_view import IFOV
 from tests.pipeline.ground.test_view import view as view_of

@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import nn
 
-from models.evaluation.metrics import mean_iou
-from models.network.segmenter import ChannelNorm, Segmenter, TokenAttention
-from models.network.sizes import PLANES, SegmenterConfig
-from models.network.spectral import Normalisation
-from models.training.examples import Example
-from models.training.objective import map_loss, pixel_losses
-from models.training.train import Trainer, TrainingSettings
-from pipeline.geometry.grid import UNLABELLED
+from spectralzoom.models.evaluation.metrics import mean_iou
+from spectralzoom.models.network.segmenter import ChannelNorm, Segmenter, TokenAttention
+from spectralzoom.models.network.sizes import PLANES, SegmenterConfig
+from spectralzoom.models.network.spectral import Normalisation
+from spectralzoom.models.training.examples import Example
+from spectralzoom.models.training.objective import map_loss, pixel_losses
+from spectralzoom.models.training.train import Trainer, TrainingSettings
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from tests.models.conftest import SMALL, read_both
 
 SIZES: dict[str, Any] = SMALL | {"classes": 2}

@@ -14,19 +14,31 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
-from models.network.segmenter import Encoder, code_2d, cut
-from models.network.sizes import PLANES, SegmenterConfig
-from models.network.spectral import LineSpec, Normalisation, with_planes
-from models.policies.policies import pixel_entropy, score_patches
-from models.reading.inference import CoarsePrediction, check_patch_index, coarse_prediction_of_columns, segment
-from models.training import train as training
-from models.training.examples import Example
-from models.training.objective import map_loss, pixel_losses
-from models.training.train import TrainingSettings, train
-from models.weights.files import load_weights, save_weights
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import frame_patches, select_patches
+from spectralzoom.models.evaluation.metrics import (
+    average_accuracy,
+    confusion,
+    iou_per_class,
+    kappa,
+    mean_iou,
+    overall_accuracy,
+)
+from spectralzoom.models.network.segmenter import Encoder, code_2d, cut
+from spectralzoom.models.network.sizes import PLANES, SegmenterConfig
+from spectralzoom.models.network.spectral import LineSpec, Normalisation, with_planes
+from spectralzoom.models.policies.policies import pixel_entropy, score_patches
+from spectralzoom.models.reading.inference import (
+    CoarsePrediction,
+    check_patch_index,
+    coarse_prediction_of_columns,
+    segment,
+)
+from spectralzoom.models.training import train as training
+from spectralzoom.models.training.examples import Example
+from spectralzoom.models.training.objective import map_loss, pixel_losses
+from spectralzoom.models.training.train import TrainingSettings, train
+from spectralzoom.models.weights.files import load_weights, save_weights
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.coverage import frame_patches, select_patches
 from tests.models.conftest import SMALL, coarse_prediction, make_network, noise, plain_weights, read_both
 
 NONE = torch.zeros(1, 0, dtype=torch.int64)

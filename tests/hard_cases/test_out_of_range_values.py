@@ -10,11 +10,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models.network.spectral import MOST_COLUMN
-from models.policies.policies import score_patches
-from models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, segment
-from pipeline.geometry.grid import SceneGrid
-from pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
+from spectralzoom.models.network.spectral import MOST_COLUMN
+from spectralzoom.models.policies.policies import score_patches
+from spectralzoom.models.reading.inference import CoarsePrediction, DrawnMap, coarse_prediction_of_columns, segment
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond, readings_alone
 from tests.models.conftest import coarse_prediction, make_weights
 
 WEIGHTS = make_weights(0)

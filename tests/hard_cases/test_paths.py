@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.geolocation import path_geolocation
-from pipeline.rectify.scan_paths import judge_stamps, make_scan_paths
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import points_of_scan
+from spectralzoom.pipeline.rectify.geolocation import path_geolocation
+from spectralzoom.pipeline.rectify.scan_paths import judge_stamps, make_scan_paths
 from tests.pipeline.rectify.aiming import CAMERA, aim
 
 SWATH = 2600.0

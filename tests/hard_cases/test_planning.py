@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, Sweep, memory_loads
-from pipeline.planning.coverage import full_sweeps
-from pipeline.planning.fine_pass import FinePlan, SecondPass, every_nth
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, CostModel, Sweep, memory_loads
+from spectralzoom.pipeline.planning.coverage import full_sweeps
+from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass, every_nth
 
 CAMERA = LineCamera()
 COST = CostModel()

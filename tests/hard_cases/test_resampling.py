@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.resample import resample
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rectify.resample import resample
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.rectify.registration.alignment import pair_shift
+from spectralzoom.pipeline.rectify.registration.alignment import pair_shift
 
 Field = tuple[np.ndarray, np.ndarray]
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Detector, Optics
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT
+from spectralzoom.pipeline.simulator.readout import read_out
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Detector, Optics
 from tests.hard_cases.simulated_scene import CAMERA, EVERYTHING, RIG, SWEEP, block_of, decided, left_out, scene_of
 
 TEXTURE = np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3))

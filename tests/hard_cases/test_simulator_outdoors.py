@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.air import PARALLAX, PATH_RADIANCE, TURBULENCE, turbulence_px
-from pipeline.simulator.effects.blurs import DEFOCUS
-from pipeline.simulator.effects.lighting import DRIFT
-from pipeline.simulator.effects.line import ROTATION
-from pipeline.simulator.effects.pointing import LAG
-from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import EFFECTS, expected_light
-from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.daylight import sun_elevation_deg
-from pipeline.simulator.selection.choice import Decision, decide
+from spectralzoom.pipeline.simulator.effects.air import PARALLAX, PATH_RADIANCE, TURBULENCE, turbulence_px
+from spectralzoom.pipeline.simulator.effects.blurs import DEFOCUS
+from spectralzoom.pipeline.simulator.effects.lighting import DRIFT
+from spectralzoom.pipeline.simulator.effects.line import ROTATION
+from spectralzoom.pipeline.simulator.effects.pointing import LAG
+from spectralzoom.pipeline.simulator.readout import read_out
+from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.daylight import sun_elevation_deg
+from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
 from tests.hard_cases.simulated_scene import CAMERA, RIG, block_of, decided, left_out, probed, scene_of
 
 TEXTURE = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3)))

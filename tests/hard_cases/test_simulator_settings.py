@@ -12,15 +12,15 @@ import numpy as np
 from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.probe import Unit, unit_at
-from pipeline.simulator.render import EFFECTS, expected_light
-from pipeline.simulator.rig_model import Air, Detector, Rig
-from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
-from pipeline.simulator.selection.choice import decide
-from pipeline.simulator.selection.survey_probe import probe_survey
-from pipeline.simulator.simulated import sweep_block
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.probe import Unit, unit_at
+from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from spectralzoom.pipeline.simulator.selection.choice import decide
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
+from spectralzoom.pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.bound_trials import ROUNDING, misplaced_fraction
 from tests.pipeline.simulator.small_scenes import looking_at_less
 

@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.network.segmenter import Segmenter, cut
-from models.network.sizes import SegmenterConfig
-from models.network.spectral import Capture, LineSpec, Normalisation, SpectralBasis
-from models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
-from models.training.examples import Example
-from models.training.train import Progress
-from models.weights.files import Weights
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.segmenter import Segmenter, cut
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.network.spectral import Capture, LineSpec, Normalisation, SpectralBasis
+from spectralzoom.models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
+from spectralzoom.models.training.examples import Example
+from spectralzoom.models.training.train import Progress
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "width": 8, "overview_width": 8} | {
     "dim": 16,

@@ -13,11 +13,11 @@ import numba
 import numpy as np
 import pytest
 
-from pipeline.compiled import DOUBLES, compiled
+from spectralzoom.pipeline.compiled import DOUBLES, compiled
 
 ROOT = Path(__file__).parents[2]
 LOOP = """
-from pipeline.compiled import DOUBLES, compiled, rows_of
+from spectralzoom.pipeline.compiled import DOUBLES, compiled, rows_of
 
 
 @compiled(rows_of(DOUBLES, 1, read_only=True), rows_of(DOUBLES, 1))

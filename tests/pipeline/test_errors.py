@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ArchiveError, IncompleteStoreError, PipelineError, RigError, SceneError, is_visible, visible
+from spectralzoom.pipeline.errors import (
+    ArchiveError,
+    IncompleteStoreError,
+    PipelineError,
+    RigError,
+    SceneError,
+    is_visible,
+    visible,
+)
 
 
 @given(st.text(st.characters()))  # surrogates included

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from pipeline.once import Once
+from spectralzoom.pipeline.once import Once
 
 
 def test_threads_share_one_computation() -> None:

@@ -47,7 +47,7 @@ def rows(quick: bool) -> list[Row]:
 def run(*words: str) -> str:
     """Run a command to its end and return its output; progress appears on stderr."""
     print(f"  {' '.join(words)}", file=sys.stderr, flush=True)
-    command_line = [sys.executable, "-m", "flows.cli.main", *words]
+    command_line = [sys.executable, "-m", "spectralzoom.flows.cli.main", *words]
     return subprocess.run(command_line, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True).stdout
 
 

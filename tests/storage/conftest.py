@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from storage.archive.archive import Archive
+from spectralzoom.storage.archive.archive import Archive
 
 
 @pytest.fixture

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import line_positions
-from pipeline.rectify.region import Place, TileMaker
-from pipeline.signal.components import Components
-from storage.arrays.cubes import SweepHeader
-from storage.arrays.georeference import AngularGrid
-from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import line_positions
+from spectralzoom.pipeline.rectify.region import Place, TileMaker
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.storage.arrays.cubes import SweepHeader
+from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.arrays.mosaics import MosaicWriter
+from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 
 STEP = 2.0**-12  # of values: a power of two, so that its multiples are stored exactly
 

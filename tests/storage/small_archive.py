@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.archive.manifests import manifest_text
-from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
-from storage.maintenance.verification import verify_everything
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import manifest_text
+from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
+from spectralzoom.storage.maintenance.verification import verify_everything
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.cli.app import VERBS, build_app
-from flows.cli.main import main
+from spectralzoom.flows.cli.app import VERBS, build_app
+from spectralzoom.flows.cli.main import main
 from tests.conftest import WeightsMaker
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,6 +58,13 @@ def may_be_nobody(python: Path) -> bool:
     return subprocess.run(words, env={}, capture_output=True, check=False).returncode == 0
 
 
+def own_packages(project: Path) -> None:
+    """Make a project whose packages have the names of the product's folders, and cannot be imported."""
+    for name in PACKAGES[1:]:
+        (project / name).mkdir()
+        (project / name / "__init__.py").write_text(f"raise ImportError('{name} of the project was imported')\n")
+
+
 @pytest.fixture(scope="module")
 def ground() -> Iterator[Path]:
     """Yield a folder that every user of the machine may enter, unlike pytest's folders."""
@@ -73,7 +80,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     listed = run(["git", "ls-files", "-co", "--exclude-standard", *PACKAGES, *BESIDE], ROOT).splitlines()
     for name in filter(lambda one: (ROOT / one).exists(), listed):
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(ROOT / name, copy / name)
+        shutil.copyfile(ROOT / name, copy / name, follow_symlinks=False)
     return copy
 
 
@@ -104,8 +111,11 @@ def test_the_wheel_contains_exactly_the_files_of_the_packages(tree: Path, wheel:
     """The wheel contains every file of the packages, with weights and templates, byte by byte, and no other file."""
     with zipfile.ZipFile(wheel) as packed:
         found = {name: packed.read(name) for name in packed.namelist() if ".dist-info/" not in name}
-    there = (path for name in PACKAGES for path in (tree / name).rglob("*") if path.is_file())
-    known = {path.relative_to(tree).as_posix(): path.read_bytes() for path in there if "egg-info" not in str(path)}
+    known = {}
+    for name in PACKAGES:
+        below = "spectralzoom" if name == "spectralzoom" else f"spectralzoom/{name}"
+        for path in (path for path in (tree / name).rglob("*") if path.is_file() and "egg-info" not in str(path)):
+            known[f"{below}/{path.relative_to(tree / name).as_posix()}"] = path.read_bytes()
     assert set(found) == set(known)
     assert [name for name in known if found[name] != known[name]] == []
 
@@ -119,6 +129,7 @@ def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Pat
     for folder in (place, archive, temporary):
         folder.mkdir()
         folder.chmod(0o755 if folder == place else 0o777)
+    own_packages(place)
     shutil.copyfile(scene_files / "scene.png", place / "field.png")
     shutil.copyfile(make_weights(), place / "mine.safetensors")
     nobody = AS_NOBODY if may_be_nobody(installed / "python") else ()
@@ -133,6 +144,26 @@ def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Pat
     assert planned > 7
     assert [row["id"] for row in listed["runs"]] == [Path(report).parent.name]
     assert not list(temporary.glob("spectralzoom-*"))  # caches of libraries end with the process
+
+
+DEPLOYED = """
+from prefect.flows import load_flow_from_entrypoint
+from spectralzoom.flows.survey import survey
+print(load_flow_from_entrypoint(survey.to_deployment("north").entrypoint).name)
+"""
+
+
+@pytest.mark.parametrize("kind", ["wheel", "editable"])
+def test_a_project_with_folders_of_the_same_names_plans_and_deploys(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """Command, package and Prefect find the product's own modules; `test_the_wheel_needs_no_home` surveys."""
+    own_packages(tmp_path)
+    python = sys.executable if kind == "editable" else request.getfixturevalue("installed") / "python"
+    bare = {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1", "HOME": str(tmp_path), "DO_NOT_TRACK": "1"}
+    assert run([python, "-c", DEPLOYED], tmp_path, bare).split()[-1] == "survey"
+    words = [python, "-m", "spectralzoom.flows.cli.main", "plan", "--size", "32x32", "--json"]
+    assert json.loads(run(words, tmp_path, bare))["stages"]
 
 
 def test_the_container_copies_every_package() -> None:

@@ -18,15 +18,15 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from rasterio.enums import ColorInterp
 
-import models.reading.prior_map as prior_map
-from flows.archive.export_command import run_export
-from flows.publish.run_folder import Published
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from pipeline.ground.georeference import pixel_rows_m2
-from storage.archive.archive import Archive
-from storage.arrays.mosaics import open_mosaic
-from storage.maintenance.verification import verify_everything
+import spectralzoom.models.reading.prior_map as prior_map
+from spectralzoom.flows.archive.export_command import run_export
+from spectralzoom.flows.publish.run_folder import Published
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.pipeline.ground.georeference import pixel_rows_m2
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.prior_work import without_effects
 from tests.storage.readers.test_envi_cubes import write_envi

@@ -14,15 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.geometry.scan import Sweep
-from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
-from pipeline.source import References
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
+from spectralzoom.pipeline.source import References
 from spectralzoom.spectra import open_lazy_lines, open_lazy_mosaic
-from storage.arrays import layout
-from storage.arrays.cubes import SweepHeader
-from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.signal_cubes import LineRows, SignalCubeWriter
+from spectralzoom.storage.arrays import layout
+from spectralzoom.storage.arrays.cubes import SweepHeader
+from spectralzoom.storage.arrays.mosaics import MosaicWriter
+from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter
 
 LINES, SAMPLES, BANDS = 70, 90, 12
 COUNT = 4  # of components
@@ -123,7 +123,7 @@ def test_any_selection_equals_the_same_selection_of_all_values(
 def test_opening_reads_only_coordinates(sweep: Restored, mosaic: Restored, monkeypatch: pytest.MonkeyPatch) -> None:
     """Opening takes less than 0.2 s, and one requested value reads the scores once."""
     heard = Mock(wraps=layout.read_array)
-    for module in ("storage.arrays.mosaics", "storage.arrays.signal_cubes"):
+    for module in ("spectralzoom.storage.arrays.mosaics", "spectralzoom.storage.arrays.signal_cubes"):
         monkeypatch.setattr(f"{module}.read_array", heard)
     begun = time.process_time()
     lines, cube = open_lazy_lines(sweep[0]), open_lazy_mosaic(mosaic[0])

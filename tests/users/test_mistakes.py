@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from flows.settings.load import load_settings
-from flows.training.data import load_data_set
-from storage.archive.archive import Archive
-from storage.readers.scene_files import load_scene_file
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.training.data import load_data_set
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.readers.scene_files import load_scene_file
 from tests.flows.conftest import command_line
 from tests.users.mistaken_files import NM, write_files
 

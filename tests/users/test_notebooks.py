@@ -11,7 +11,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import pytest
 
-from flows.tasks.open_survey import STAGES
+from spectralzoom.flows.tasks.open_survey import STAGES
 from tests.prior_work import without_effects
 
 FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"

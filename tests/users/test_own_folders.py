@@ -12,13 +12,13 @@ import pytest
 from affine import Affine
 from PIL import Image
 
-from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
-from flows.settings.load import load_settings
-from flows.tasks.scene import open_scene
-from flows.training.data import load_data_set, open_training_data
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from storage.readers.scene_toml import load_scene_settings
+from spectralzoom.flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.scene import open_scene
+from spectralzoom.flows.training.data import load_data_set, open_training_data
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
 from tests.storage.readers.test_label_grids import write
 from tests.users.mistaken_files import write_files

@@ -13,9 +13,9 @@ import rioxarray  # noqa: F401 - registers the accessor that users have
 import xarray as xr
 from rasterio.transform import from_origin
 
-from flows.cli.main import main
-from models.weights.files import describe_weights
 from spectralzoom import open as open_archive
+from spectralzoom.flows.cli.main import main
+from spectralzoom.models.weights.files import describe_weights
 from tests.flows.conftest import command_line
 from tests.storage.readers.test_raster_tags import write
 

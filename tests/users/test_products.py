@@ -15,15 +15,15 @@ import rasterio
 import shapely
 from affine import Affine
 
-from flows.archive.export_command import run_export
-from flows.archive.export_layers import ProductFlags, choose_products
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from pipeline.errors import SettingsError, WavelengthError
-from pipeline.ground.map_grid import ground_grid, image_at
-from pipeline.ground.view import GroundView, RigPose
-from pipeline.products.indices import find_index
-from storage.arrays.mosaics import open_mosaic
+from spectralzoom.flows.archive.export_command import run_export
+from spectralzoom.flows.archive.export_layers import ProductFlags, choose_products
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.pipeline.errors import SettingsError, WavelengthError
+from spectralzoom.pipeline.ground.map_grid import ground_grid, image_at
+from spectralzoom.pipeline.ground.view import GroundView, RigPose
+from spectralzoom.pipeline.products.indices import find_index
+from spectralzoom.storage.arrays.mosaics import open_mosaic
 from tests.conftest import QUIET
 from tests.exported_run import Exported
 from tests.prior_work import without_effects

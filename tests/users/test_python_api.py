@@ -14,10 +14,10 @@ import pytest
 import rioxarray  # noqa: F401 - registers the accessor that users have
 
 import spectralzoom
-from pipeline.errors import NoRunError
 from spectralzoom.opened import OpenedRun
-from storage.arrays.class_maps import load_class_map
-from storage.arrays.ground_maps import load_geobox
+from spectralzoom.pipeline.errors import NoRunError
+from spectralzoom.storage.arrays.class_maps import load_class_map
+from spectralzoom.storage.arrays.ground_maps import load_geobox
 from tests.conftest import WeightsMaker
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects

@@ -16,26 +16,26 @@ import shapely
 from numpy.typing import NDArray
 from PIL import Image
 
-import storage.readers.recordings
-from flows.archive.commands import gc
-from flows.archive.reprocess_command import run_reprocess
-from flows.publish.run_folder import Published, load_receipt
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from flows.terminal.processes import DONE, PARTLY
-from models.weights.files import save_weights
-from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from storage.archive.archive import Archive
-from storage.archive.keys import array_digest
-from storage.arrays.class_maps import load_class_map
-from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.arrays.mosaics import open_mosaic
-from storage.maintenance.verification import verify_everything
+import spectralzoom.storage.readers.recordings
+from spectralzoom.flows.archive.commands import gc
+from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.publish.run_folder import Published, load_receipt
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.terminal.processes import DONE, PARTLY
+from spectralzoom.models.weights.files import save_weights
+from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import array_digest
+from spectralzoom.storage.arrays.class_maps import load_class_map
+from spectralzoom.storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.blocks import block_means
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.envi_files import write_recorded_files
@@ -130,7 +130,7 @@ def test_sweeps_of_the_rig_give_its_map(tmp_path: Path, asked: dict[str, Any]) -
 def counted_lines(patch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
     """Yield the set of the lines that are read as numbers from files or raw cubes."""
     read: set[tuple[str, int]] = set()
-    real = storage.readers.recordings._line_reader
+    real = spectralzoom.storage.readers.recordings._line_reader
 
     def line_reader(source: Any, own: NDArray[np.intp]) -> Any:
         reader = real(source, own)
@@ -142,7 +142,7 @@ def counted_lines(patch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
         return read_lines
 
     with patch.context() as within:
-        within.setattr(storage.readers.recordings, "_line_reader", line_reader)
+        within.setattr(spectralzoom.storage.readers.recordings, "_line_reader", line_reader)
         yield read
 
 

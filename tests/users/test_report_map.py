@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.publish.field_map import FieldMap, MapLayer, layer_address
-from flows.publish.report import LEAFLET, render_report
+from spectralzoom.flows.publish.field_map import FieldMap, MapLayer, layer_address
+from spectralzoom.flows.publish.report import LEAFLET, render_report
 from tests.flows.publish.test_receipt import make_receipt
 from tests.users.browser import Tab, chromium, needs_browser
 
@@ -140,4 +140,4 @@ def test_the_bundled_leaflet_is_unchanged() -> None:
     """Each of its files has the SHA-256 of the published release."""
     for name, known in SHA256.items():
         assert name.startswith(LEAFLET)
-        assert hashlib.sha256(files("flows.publish").joinpath(name).read_bytes()).hexdigest() == known
+        assert hashlib.sha256(files("spectralzoom.flows.publish").joinpath(name).read_bytes()).hexdigest() == known

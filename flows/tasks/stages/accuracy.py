@@ -12,20 +12,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.capture_plan import CapturePlan
-from flows.tasks.stage import Product, Report, Wanted, stage
-from flows.tasks.stages.attention import PatchGains
-from flows.tasks.stages.placement import load_registration
-from models.evaluation.metrics import agreement, average_accuracy, confusion, false_pixels, iou_per_class, kappa
-from models.policies.placement import mixed
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Axis
-from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.simulated import SimulatedSource
-from storage.archive.keys import StageRef, array_digest
-from storage.archive.manifests import read_table
-from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import load_class_map
+from spectralzoom.flows.tasks.capture_plan import CapturePlan
+from spectralzoom.flows.tasks.stage import Product, Report, Wanted, stage
+from spectralzoom.flows.tasks.stages.attention import PatchGains
+from spectralzoom.flows.tasks.stages.placement import load_registration
+from spectralzoom.models.evaluation.metrics import (
+    agreement,
+    average_accuracy,
+    confusion,
+    false_pixels,
+    iou_per_class,
+    kappa,
+)
+from spectralzoom.models.policies.placement import mixed
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.geometry.scan import Axis
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.storage.archive.keys import StageRef, array_digest
+from spectralzoom.storage.archive.manifests import read_table
+from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.arrays.class_maps import load_class_map
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=18, files=(RECORD,), by_weights=True)

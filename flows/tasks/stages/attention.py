@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.field_work import FieldWork, region_params
-from flows.tasks.patch_budget import PatchBudget
-from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from flows.tasks.zones import SurveyZones
-from models.network.spectral import LineSpec
-from models.policies.policies import SEEING_POLICIES, Scores, score_patches
-from models.reading.inference import CoarsePrediction
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.geometry.scan import Sweep, exposing
-from pipeline.planning.coverage import patches_shown
-from pipeline.planning.fine_pass import FinePlan, SecondPass
-from pipeline.planning.uniform_scans import ScanPerformance, format_scan
-from storage.archive.keys import StageRef, array_digest
-from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
+from spectralzoom.flows.tasks.field_work import FieldWork, region_params
+from spectralzoom.flows.tasks.patch_budget import PatchBudget
+from spectralzoom.flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from spectralzoom.flows.tasks.zones import SurveyZones
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.policies.policies import SEEING_POLICIES, Scores, score_patches
+from spectralzoom.models.reading.inference import CoarsePrediction
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
+from spectralzoom.pipeline.geometry.scan import Sweep, exposing
+from spectralzoom.pipeline.planning.coverage import patches_shown
+from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
+from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance, format_scan
+from spectralzoom.storage.archive.keys import StageRef, array_digest
+from spectralzoom.storage.archive.manifests import read_table, write_table
+from spectralzoom.storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
 ATTENTION = Product("score", version=20, files=("attention.zarr", "plan.json"), by_weights=True)

@@ -14,23 +14,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.capture_plan import CapturePlan
-from flows.tasks.scene import FieldSource
-from flows.tasks.stage import Product, Report, Wanted, stage
-from flows.tasks.stages.attention import load_plan
-from flows.tasks.stages.effects import chosen_effects, load_manifest
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.signal.condense import LineStatistics
-from pipeline.signal.subspace import SignalStatistics
-from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
-from pipeline.source import Line, Source
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef, stage_key
-from storage.archive.manifests import write_table
-from storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHeader
-from storage.arrays.spool import Spool
-from storage.parallel.pool import WorkerPool
+from spectralzoom.flows.tasks.capture_plan import CapturePlan
+from spectralzoom.flows.tasks.scene import FieldSource
+from spectralzoom.flows.tasks.stage import Product, Report, Wanted, stage
+from spectralzoom.flows.tasks.stages.attention import load_plan
+from spectralzoom.flows.tasks.stages.effects import chosen_effects, load_manifest
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.signal.condense import LineStatistics
+from spectralzoom.pipeline.signal.subspace import SignalStatistics
+from spectralzoom.pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
+from spectralzoom.pipeline.source import Line, Source
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef, stage_key
+from spectralzoom.storage.archive.manifests import write_table
+from spectralzoom.storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHeader
+from spectralzoom.storage.arrays.spool import Spool
+from spectralzoom.storage.parallel.pool import WorkerPool
 
 RAW = Product("capture", version=13)
 RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RASTER, SignalChoice
-from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from flows.tasks.stages.capture import RIG_RECORD
-from flows.tasks.stages.placement import MOSAIC, SIGNAL_RECORD
-from pipeline.errors import IncompleteStoreError, SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.readings import MOST_VALUE, readings_alone
-from pipeline.signal.calibrate import number_values
-from pipeline.signal.components import Components
-from pipeline.signal.condense import (
+from spectralzoom.flows.settings.survey_settings import RASTER, SignalChoice
+from spectralzoom.flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from spectralzoom.flows.tasks.stages.capture import RIG_RECORD
+from spectralzoom.flows.tasks.stages.placement import MOSAIC, SIGNAL_RECORD
+from spectralzoom.pipeline.errors import IncompleteStoreError, SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.readings import MOST_VALUE, readings_alone
+from spectralzoom.pipeline.signal.calibrate import number_values
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import (
     RESIDUAL_STEP,
     UNUSABLE,
     CondensedSweep,
@@ -29,16 +29,22 @@ from pipeline.signal.condense import (
     differing_lines,
     score_lines,
 )
-from pipeline.signal.subspace import FEW_BANDS, SignalStatistics, bands_alone, components_of_field, with_shared
-from pipeline.simulator.scenes.scene import RasterScene
-from storage.archive.keys import StageRef
-from storage.archive.manifests import check_files, read_table, write_table
-from storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
-from storage.arrays.layout import SHARD_ROWS
-from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
-from storage.arrays.spool import line_values
-from storage.readers.scene_files import RasterPixels
+from spectralzoom.pipeline.signal.subspace import (
+    FEW_BANDS,
+    SignalStatistics,
+    bands_alone,
+    components_of_field,
+    with_shared,
+)
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import check_files, read_table, write_table
+from spectralzoom.storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
+from spectralzoom.storage.arrays.layout import SHARD_ROWS
+from spectralzoom.storage.arrays.mosaics import MosaicWriter
+from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
+from spectralzoom.storage.arrays.spool import line_values
+from spectralzoom.storage.readers.scene_files import RasterPixels
 
 SIGNAL = Product("condense", version=5)
 SIGNAL_FINE = Product("condense_fine", version=6)

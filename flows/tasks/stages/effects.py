@@ -10,21 +10,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from flows.settings.survey_settings import plain_value
-from flows.settings.values import Tolerance
-from flows.tasks.scene import FieldSource
-from flows.tasks.stage import Product, Report, Wanted, stage
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.render import BY_NAME, EFFECTS
-from pipeline.simulator.rig_model import OF_THE_SCENE, Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import decide, list_effects, sum_up
-from pipeline.simulator.selection.survey_probe import probe_survey
-from storage.archive.keys import StageRef
-from storage.archive.manifests import read_table
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.settings.survey_settings import plain_value
+from spectralzoom.flows.settings.values import Tolerance
+from spectralzoom.flows.tasks.scene import FieldSource
+from spectralzoom.flows.tasks.stage import Product, Report, Wanted, stage
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.simulator.effects.effect import Effect
+from spectralzoom.pipeline.simulator.render import BY_NAME, EFFECTS
+from spectralzoom.pipeline.simulator.rig_model import OF_THE_SCENE, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.selection.choice import decide, list_effects, sum_up
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import read_table
+from spectralzoom.storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
 MANIFEST = Product("effects", version=12, files=(RECORD,))

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, draw_field
-from flows.tasks.field_work import region_params
-from flows.tasks.prior_maps import PRIOR_FIGURES, Prior
-from flows.tasks.stage import Product, Report, Wanted, stage
-from flows.tasks.stages.attention import READING, PatchGains
-from models.reading.prior_map import TemporalAgreement
-from models.weights.files import ReaderPart
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import PosedField, areas_by_number
-from pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
-from storage.archive.keys import StageRef
-from storage.archive.manifests import write_table
-from storage.arrays.class_maps import (
+from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, draw_field
+from spectralzoom.flows.tasks.field_work import region_params
+from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES, Prior
+from spectralzoom.flows.tasks.stage import Product, Report, Wanted, stage
+from spectralzoom.flows.tasks.stages.attention import READING, PatchGains
+from spectralzoom.models.reading.prior_map import TemporalAgreement
+from spectralzoom.models.weights.files import ReaderPart
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.field_places import PosedField, areas_by_number
+from spectralzoom.pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import write_table
+from spectralzoom.storage.arrays.class_maps import (
     NOT_BELIEVED,
     OLD_CLASS,
     ClassNames,
@@ -31,9 +31,9 @@ from storage.arrays.class_maps import (
     create_probabilities,
     load_class_map,
 )
-from storage.arrays.ground_maps import BLOCK, GroundMapWriter
-from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
+from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter
+from spectralzoom.storage.arrays.layout import NO_CLASS, blank_pixels
+from spectralzoom.storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
 
 CLASS_MAP = Product("segment", version=27, files=(MAP, PROBABILITIES), by_weights=True)
 SPECTRA = "spectra.json"  # beside a map: pixels out of range, and patches unlike the training data

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from models.network.spectral import LineSpec
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import exposing
-from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.placed import PixelGrid, PlacedSweep, TieTable
-from pipeline.rectify.region import (
+from spectralzoom.flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import exposing
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rectify.placed import PixelGrid, PlacedSweep, TieTable
+from spectralzoom.pipeline.rectify.region import (
     COPIES,
     Counts,
     MosaicWork,
@@ -35,19 +35,19 @@ from pipeline.rectify.region import (
     opened_work,
     plan_tiles,
 )
-from pipeline.rectify.registration.alignment import SweepShift
-from pipeline.rectify.registration.illumination import overlap_light, solve_lights
-from pipeline.rectify.registration.overlaps import BroadSweep
-from pipeline.rectify.registration.seams import Anchor, Registration, anchor_sweep, register_sweeps
-from pipeline.rectify.scan_paths import ScanPath
-from pipeline.rectify.sweep_paths import SweepPath, capture_numbers, interlaced_paths, sweep_paths
-from pipeline.signal.components import BROAD_BANDS, Components
-from storage.archive.keys import StageRef
-from storage.archive.manifests import read_table, write_table
-from storage.arrays.geolocation import Tables, open_geolocation, path_digest, write_geolocation
-from storage.arrays.mosaics import MosaicWriter, open_mosaic
-from storage.arrays.signal_cubes import open_signal_cubes
-from storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib, run_blocks
+from spectralzoom.pipeline.rectify.registration.alignment import SweepShift
+from spectralzoom.pipeline.rectify.registration.illumination import overlap_light, solve_lights
+from spectralzoom.pipeline.rectify.registration.overlaps import BroadSweep
+from spectralzoom.pipeline.rectify.registration.seams import Anchor, Registration, anchor_sweep, register_sweeps
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath
+from spectralzoom.pipeline.rectify.sweep_paths import SweepPath, capture_numbers, interlaced_paths, sweep_paths
+from spectralzoom.pipeline.signal.components import BROAD_BANDS, Components
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.manifests import read_table, write_table
+from spectralzoom.storage.arrays.geolocation import Tables, open_geolocation, path_digest, write_geolocation
+from spectralzoom.storage.arrays.mosaics import MosaicWriter, open_mosaic
+from spectralzoom.storage.arrays.signal_cubes import open_signal_cubes
+from spectralzoom.storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib, run_blocks
 
 REGISTRATION, TIE_POINTS = "registration.json", "geolocation.zarr"
 SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic

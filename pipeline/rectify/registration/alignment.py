@@ -11,7 +11,7 @@ import scipy
 import skimage
 from numpy.typing import NDArray
 
-from pipeline.rectify.kernels import kernel_taps
+from spectralzoom.pipeline.rectify.kernels import kernel_taps
 
 Status = Literal["found", "undecidable", "flat", "empty"]
 Floats = NDArray[np.float64]

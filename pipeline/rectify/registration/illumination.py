@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rectify.placed import PixelGrid, PlacedSweep
-from pipeline.rectify.region import mosaic_tile
-from pipeline.rectify.registration.overlaps import Window
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
+from spectralzoom.pipeline.rectify.placed import PixelGrid, PlacedSweep
+from spectralzoom.pipeline.rectify.region import mosaic_tile
+from spectralzoom.pipeline.rectify.registration.overlaps import Window
 
 Floats = NDArray[np.float64]
 

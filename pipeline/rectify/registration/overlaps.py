@@ -12,15 +12,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import Floats, Sweep, shifted_position
-from pipeline.rectify.geolocation import path_geolocation
-from pipeline.rectify.resample import resample
-from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from pipeline.signal.lines import signal_of
-from pipeline.source import SweepLines
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, shifted_position
+from spectralzoom.pipeline.rectify.geolocation import path_geolocation
+from spectralzoom.pipeline.rectify.resample import resample
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from spectralzoom.pipeline.signal.lines import signal_of
+from spectralzoom.pipeline.source import SweepLines
 
 LEAST_OVERLAP_PX = 64.0  # of the smaller side of a window, after the largest shift; below it errors grow fast
 EDGE_LINES = 16  # a sweep's edges are computed at every 16th line; they bend by 1e-3 px between

@@ -9,10 +9,10 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import field_px
-from pipeline.rectify.registration.alignment import (
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.coverage import field_px
+from spectralzoom.pipeline.rectify.registration.alignment import (
     Floats,
     PairShift,
     SweepShift,
@@ -24,8 +24,14 @@ from pipeline.rectify.registration.alignment import (
     solve_sweeps,
     tied_to,
 )
-from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep, PlacedImage, Window, overlap_windows
-from pipeline.rectify.resample import resample
+from spectralzoom.pipeline.rectify.registration.overlaps import (
+    LEAST_OVERLAP_PX,
+    BroadSweep,
+    PlacedImage,
+    Window,
+    overlap_windows,
+)
+from spectralzoom.pipeline.rectify.resample import resample
 
 WINDOW_PX = 512.0
 SETTLED_PRIOR_PX = 3.0  # after the first round

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.envi_headers import EnviHeader, parse_envi_header
-from pipeline.errors import RigError, SceneError, ShapeError
-from pipeline.rig.camera.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
-from pipeline.signal.calibrate import find_bad_elements
-from pipeline.source import References
+from spectralzoom.pipeline.envi_headers import EnviHeader, parse_envi_header
+from spectralzoom.pipeline.errors import RigError, SceneError, ShapeError
+from spectralzoom.pipeline.rig.camera.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
+from spectralzoom.pipeline.signal.calibrate import find_bad_elements
+from spectralzoom.pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[A-Za-z_]*", re.IGNORECASE)

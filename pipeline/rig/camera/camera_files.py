@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from pipeline.errors import PipelineError, RigError
-from pipeline.rig.device_settings import FileServer
-from pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeviceGone, DeviceRefused
+from spectralzoom.pipeline.errors import PipelineError, RigError
+from spectralzoom.pipeline.rig.device_settings import FileServer
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeviceGone, DeviceRefused
 
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: the user or the password is refused

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
+from spectralzoom.pipeline.errors import SceneError
 
 FRAME_INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)  # names of its files
 LONGEST_LINE = 1000  # characters; a frame's line has about 25

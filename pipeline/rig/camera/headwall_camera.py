@@ -13,11 +13,26 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from pipeline.errors import RigError
-from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, mean_frame, read_capture, read_references
-from pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
-from pipeline.rig.device_settings import FileServer
-from pipeline.rig.transports import SYSTEM_CLOCK, Answer, Clock, DeadlinePassed, DeviceRefused, StateUnknown, Transport
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.rig.camera.camera_cubes import (
+    CapturedLines,
+    MeanFrame,
+    Read,
+    mean_frame,
+    read_capture,
+    read_references,
+)
+from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
+from spectralzoom.pipeline.rig.device_settings import FileServer
+from spectralzoom.pipeline.rig.transports import (
+    SYSTEM_CLOCK,
+    Answer,
+    Clock,
+    DeadlinePassed,
+    DeviceRefused,
+    StateUnknown,
+    Transport,
+)
 
 LOG = logging.getLogger(__name__)
 DEADLINE_S = 5.0  # from a command's first byte to the prompt

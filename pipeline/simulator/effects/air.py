@@ -16,8 +16,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.geometry.scan import Floats, points_of_scan
-from pipeline.simulator.effects.effect import (
+from spectralzoom.pipeline.geometry.scan import Floats, points_of_scan
+from spectralzoom.pipeline.simulator.effects.effect import (
     Aim,
     Bound,
     Displacement,
@@ -27,10 +27,10 @@ from pipeline.simulator.effects.effect import (
     SweepBlock,
     survey_stream,
 )
-from pipeline.simulator.effects.lighting import DRIFT
-from pipeline.simulator.effects.probe import UNITS, GainRange, Probe
-from pipeline.simulator.rig_model import Air, Rig
-from pipeline.simulator.scenes.daylight import relative_daylight
+from spectralzoom.pipeline.simulator.effects.lighting import DRIFT
+from spectralzoom.pipeline.simulator.effects.probe import UNITS, GainRange, Probe
+from spectralzoom.pipeline.simulator.rig_model import Air, Rig
+from spectralzoom.pipeline.simulator.scenes.daylight import relative_daylight
 
 PLANE = 2.91  # angle of arrival of a star's light [1]
 NEAR_POINTS = 3 / 8  # of it from a path's end: the mean of (z / d)^(5/3); r0 [2] is (8/3)^(3/5) times as wide

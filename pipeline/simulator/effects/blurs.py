@@ -10,12 +10,12 @@ from types import MappingProxyType
 import numpy as np
 import scipy
 
-from pipeline.errors import SettingsError
-from pipeline.simulator.effects.effect import Blur, Bound
-from pipeline.simulator.effects.probe import UNITS, Probe
-from pipeline.simulator.optics.kernel_fit import Floats, Moments
-from pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.simulator.effects.effect import Blur, Bound
+from spectralzoom.pipeline.simulator.effects.probe import UNITS, Probe
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Floats, Moments
+from spectralzoom.pipeline.simulator.optics.rays import extreme_normals, pupil_contrast, spread_of_rays, spread_of_waves
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 MOST_BLUR_PX = 256  # diameter of a disc that is simulated
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph

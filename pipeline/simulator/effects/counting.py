@@ -15,9 +15,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.effect import Bound, Effect, Radiance, unit_stream
-from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.effects.effect import Bound, Effect, Radiance, unit_stream
+from spectralzoom.pipeline.simulator.effects.probe import Probe
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
 CHIP_SAMPLES = 1_000_000  # numbers of a patch that later stages judge as one: 61 x 61 px of 270 bands
@@ -35,7 +35,7 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
     [1] Box, Muller, "A note on the generation of random normal deviates", Ann. Math. Stat. 29, 1958.
            doi:10.1214/aoms/1177706645
     """
-    from pipeline.simulator import compiled_loops
+    from spectralzoom.pipeline.simulator import compiled_loops
 
     drawn = np.empty(count + count % 2, np.float32)
     compiled_loops.draw_pairs(rng.bit_generator.random_raw(len(drawn) // 2).view(np.uint32), PIECE, drawn)

@@ -16,11 +16,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.mirror import position_to_normal
-from pipeline.geometry.scan import Floats, Sweep, line_positions, sweep_positions
-from pipeline.simulator.effects.probe import GainRange, Probe
-from pipeline.simulator.optics.kernel_fit import Moments
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.geometry.mirror import position_to_normal
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, line_positions, sweep_positions
+from spectralzoom.pipeline.simulator.effects.probe import GainRange, Probe
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Moments
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 Radiance = NDArray[np.float32]
 OFF = "off"

@@ -14,12 +14,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Floats, Sweep, points_of_scan
-from pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, survey_stream
-from pipeline.simulator.effects.probe import GainRange, Probe
-from pipeline.simulator.rig_model import Coating, Rig
-from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, points_of_scan
+from spectralzoom.pipeline.simulator.effects.effect import Bound, Gain, Radiance, SweepBlock, survey_stream
+from spectralzoom.pipeline.simulator.effects.probe import GainRange, Probe
+from spectralzoom.pipeline.simulator.rig_model import Coating, Rig
+from spectralzoom.pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
 EDGE_FRACTION = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)

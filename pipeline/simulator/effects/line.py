@@ -8,15 +8,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Floats, Sweep, points_of_scan
-from pipeline.simulator.effects.air import turbulence_px
-from pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
-from pipeline.simulator.effects.pointing import beside_plan, greatest_lag_px, transient
-from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP
-from pipeline.simulator.optics.scene_radiance import TABULATED
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, points_of_scan
+from spectralzoom.pipeline.simulator.effects.air import turbulence_px
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
+from spectralzoom.pipeline.simulator.effects.pointing import beside_plan, greatest_lag_px, transient
+from spectralzoom.pipeline.simulator.effects.probe import Probe
+from spectralzoom.pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP
+from spectralzoom.pipeline.simulator.optics.scene_radiance import TABULATED
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 MARGIN = 1.5  # over what the probe measured at the roughest places found
 UPRIGHT = "1x1"  # the slit's variant of one box that does not lie turned

@@ -16,12 +16,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import position_to_normal
-from pipeline.geometry.scan import Floats, Sweep, line_positions, points_of_scan
-from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock, unit_stream
-from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.rig_model import MirrorMotion, Rig
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import position_to_normal
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, line_positions, points_of_scan
+from spectralzoom.pipeline.simulator.effects.effect import Aim, Bound, SweepBlock, unit_stream
+from spectralzoom.pipeline.simulator.effects.probe import Probe
+from spectralzoom.pipeline.simulator.rig_model import MirrorMotion, Rig
 
 EXCEEDED = 1e-3  # probability that any line of a survey lies beyond the bound
 _MODES = 6

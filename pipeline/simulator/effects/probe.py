@@ -13,9 +13,9 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Floats, Sweep
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 Unit = Literal["sigma", "dn"]
 UNITS = {"sigma": "sigma", "dn": "DN"}

@@ -11,10 +11,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.counting import EXACT, Floats, normal_deviates
-from pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, unit_stream
-from pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.effects.counting import EXACT, Floats, normal_deviates
+from spectralzoom.pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, unit_stream
+from spectralzoom.pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 FWHM2_PER_VARIANCE = 8 * math.log(2)
 BANDS_AT_ONCE = 32  # bands that one product makes
@@ -150,7 +150,7 @@ class Smile(LightChange):
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
         """Return light (line, sample, band) [e-] at the wavelengths that each sample sees."""
-        from pipeline.simulator import compiled_loops
+        from spectralzoom.pipeline.simulator import compiled_loops
 
         wavelength = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(wavelength, float(block.rig.optics.smile_nm), block.rig.camera.samples)

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator.optics.rays import pupil_contrast
+from spectralzoom.pipeline.simulator.optics.rays import pupil_contrast
 
 Floats = NDArray[np.float64]
 Axes = tuple[float, float]

@@ -13,9 +13,9 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import Floats, Sweep
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep
 
 REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
 

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.optics.kernel_fit import TAIL, Floats, Footprint, TapTable, disc_points
-from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
+from spectralzoom.pipeline.simulator.optics.kernel_fit import TAIL, Floats, Footprint, TapTable, disc_points
+from spectralzoom.pipeline.simulator.optics.rays import RayViews
+from spectralzoom.pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
 if TYPE_CHECKING:
-    from pipeline.simulator import compiled_loops
+    from spectralzoom.pipeline.simulator import compiled_loops
 
 Radiance = NDArray[np.float32]
 MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
@@ -39,7 +39,7 @@ class _Mixing:
     @staticmethod
     def of(fractions: Radiance, between: Floats, spectra: Radiance) -> _Mixing:
         """Return the mixing of spectra (component, band): bands between the same nodes are made at once."""
-        from pipeline.simulator import compiled_loops
+        from spectralzoom.pipeline.simulator import compiled_loops
 
         bands = spectra.shape[1]
         cuts = [0]
@@ -56,7 +56,7 @@ class _Mixing:
 
     def write(self, parts: Radiance, light: Radiance) -> None:
         """Write light (n, band) of components through kernels, (kernel, n, component)."""
-        from pipeline.simulator import compiled_loops
+        from spectralzoom.pipeline.simulator import compiled_loops
 
         nodes = np.empty((len(self.fractions), *parts.shape[1:]), np.float32)
         if self.fractions.size == 1:
@@ -130,7 +130,7 @@ class SceneSampler:
         They are sums over the parts, times ``gains`` (kernel, component). ``planes`` (y, x, component), by level, are
         C-contiguous. ``numbers`` (kernel,) say where in ``out`` kernels belong.
         """
-        from pipeline.simulator import compiled_loops
+        from spectralzoom.pipeline.simulator import compiled_loops
 
         for views in steps:
             for level, some, one in self.tables:
@@ -148,7 +148,7 @@ class KernelTables:
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
         """Take ``views`` that include the extremes of all that will be sampled."""
-        from pipeline.simulator import compiled_loops
+        from spectralzoom.pipeline.simulator import compiled_loops
 
         self.kernels = kernels_of(footprint)
         self.parts = int(self.kernels.place.shape[1])  # boxes that each kernel is summed over
@@ -170,7 +170,7 @@ class KernelTables:
 
 def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
-    from pipeline.simulator import compiled_loops
+    from spectralzoom.pipeline.simulator import compiled_loops
 
     across, along = footprint.parts
     slit, pixel = footprint.box

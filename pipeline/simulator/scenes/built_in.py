@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scenes.farm.farm_plan import (
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import (
     Canvas,
     FarmPlan,
     Ground,
@@ -32,7 +32,7 @@ from pipeline.simulator.scenes.farm.farm_plan import (
     moist_soil,
     plan_field,
 )
-from pipeline.simulator.scenes.farm.farm_scene import (
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import (
     FARM_LAW,
     FARM_NAMES,
     FARM_SHAPE,
@@ -41,9 +41,17 @@ from pipeline.simulator.scenes.farm.farm_scene import (
     farm_scene,
     planned_scene,
 )
-from pipeline.simulator.scenes.farm.fields import draw_weeds, field_weeds, paint_fields, plant_weeds
-from pipeline.simulator.scenes.farm.land import CROPS, Field, Parcel, Points, smooth_noise, stream, sun_over_farm
-from pipeline.simulator.scenes.scene import Drawn, RasterScene
+from spectralzoom.pipeline.simulator.scenes.farm.fields import draw_weeds, field_weeds, paint_fields, plant_weeds
+from spectralzoom.pipeline.simulator.scenes.farm.land import (
+    CROPS,
+    Field,
+    Parcel,
+    Points,
+    smooth_noise,
+    stream,
+    sun_over_farm,
+)
+from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene
 
 SCOUTING_LAW = "scouting@1"
 SCOUTING_NAMES = ("scouting", SCOUTING_LAW)

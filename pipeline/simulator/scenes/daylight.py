@@ -16,8 +16,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
-from pipeline.simulator.rig_model import Sky
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.simulator.rig_model import Sky
 
 Floats = NDArray[np.float64]
 KNOT_S = 10.0  # light is straight between such times: right to 2e-6 of that of a high sun

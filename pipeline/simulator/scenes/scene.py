@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import SceneError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED, cuts
-from pipeline.once import Once
-from pipeline.readings import MOST_VALUE, find_beyond
-from pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.errors import SceneError, ShapeError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.readings import MOST_VALUE, find_beyond
+from spectralzoom.pipeline.simulator.scenes.scratch import scratch
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)

@@ -14,11 +14,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from pipeline.errors import SettingsError
-from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.probe import Probe, Unit
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, list_options
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect
+from spectralzoom.pipeline.simulator.effects.probe import Probe, Unit
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, list_options
 
 Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
 UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}

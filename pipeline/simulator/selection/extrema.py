@@ -15,11 +15,11 @@ from itertools import pairwise, zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera, footprint_kernel
-from pipeline.geometry.scan import Floats, Sweep
-from pipeline.simulator.effects.probe import Radiance, fixed_variance, steepest_difference
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera, footprint_kernel
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep
+from spectralzoom.pipeline.simulator.effects.probe import Radiance, fixed_variance, steepest_difference
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
 BAND_GROUPS = 8
 CHOSEN_BANDS = 4

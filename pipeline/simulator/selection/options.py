@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.errors import SettingsError
-from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.probe import GainRange, Probe, fixed_variance, rising_gaps
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect
+from spectralzoom.pipeline.simulator.effects.probe import GainRange, Probe, fixed_variance, rising_gaps
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off differences
 LEAST_COST_NS = 1e-3  # nothing that is computed is free: of two that bound alike, the one without cost stays on longer

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
-from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import OFF, Radiance
-from pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
-from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, unit_at
-from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
-from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
-from pipeline.simulator.optics.scene_radiance import SceneSampler
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.extrema import CHOSEN_BANDS, band_groups, find_extrema
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from spectralzoom.pipeline.geometry.scan import CostModel, Floats, Sweep, exposing, scene_to_sweep
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Radiance
+from spectralzoom.pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, box_of
+from spectralzoom.pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, unit_at
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
+from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
+from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.simulator.selection.extrema import CHOSEN_BANDS, band_groups, find_extrema
 
 Way = tuple[float, float]  # along the line and the scan [px]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart

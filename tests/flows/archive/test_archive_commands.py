@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
-from flows.archive.commands import command, contents, explain, gc, ls, verify
-from flows.archive.reprocess_command import asked_again
-from flows.settings.load import load_settings, parse_settings
-from flows.survey_command import run_survey
-from flows.terminal.figures import format_bytes
-from flows.terminal.processes import DONE, FAILED, PARTLY
-from pipeline.errors import ArchiveError
-from storage.archive.archive import Archive
-from storage.archive.records import read_run
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.archive.commands import command, contents, explain, gc, ls, verify
+from spectralzoom.flows.archive.reprocess_command import asked_again
+from spectralzoom.flows.settings.load import load_settings, parse_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.terminal.figures import format_bytes
+from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.records import read_run
+from spectralzoom.storage.archive.whole_files import to_json
 from tests.conftest import QUIET
 from tests.storage.small_archive import flip, small_survey
 

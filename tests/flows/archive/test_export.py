@@ -17,13 +17,13 @@ import pytest
 import rasterio
 import xarray as xr
 
-from flows.archive.export_command import run_export
-from flows.archive.export_layers import ExportedRun
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
-from storage.archive.archive import Archive
-from storage.maintenance.verification import verify_everything
+from spectralzoom.flows.archive.export_command import run_export
+from spectralzoom.flows.archive.export_layers import ExportedRun
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET
 from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects

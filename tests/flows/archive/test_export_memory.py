@@ -12,11 +12,11 @@ import pytest
 import rasterio
 from PIL import Image
 
-import models.reading.prior_map as prior_map
-from flows.archive.export_command import run_export
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from models.weights.files import load_weights, save_weights, with_record
+import spectralzoom.models.reading.prior_map as prior_map
+from spectralzoom.flows.archive.export_command import run_export
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.models.weights.files import load_weights, save_weights, with_record
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects

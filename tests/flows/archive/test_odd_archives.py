@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.cli.main import main
-from storage.archive.archive import Archive
-from storage.archive.staging import file_hash
+from spectralzoom.flows.cli.main import main
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.staging import file_hash
 from tests.storage.small_archive import Small, rewrite, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")

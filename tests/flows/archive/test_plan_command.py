@@ -13,15 +13,15 @@ from unittest.mock import Mock
 import pytest
 from rich.console import Console
 
-from flows.archive.plan_command import plan_content, scan_table, show_plan
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.survey_command import run_survey
-from flows.tasks.run import open_run
-from flows.terminal.figures import format_seconds
-from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from pipeline.simulator.simulated import SimulatedSource
-from storage.archive.archive import Archive
+from spectralzoom.flows.archive.plan_command import plan_content, scan_table, show_plan
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.terminal.figures import format_seconds
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.storage.archive.archive import Archive
 from tests.conftest import QUIET, Flags, Survey
 from tests.flows.conftest import be_version, python
 
@@ -104,11 +104,10 @@ def test_a_plan_has_only_changed_stages_to_run(
 def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plan renders no field and no spectra, and shows the survey's refusal."""
     refuse = Mock(side_effect=AssertionError("the plan looked at the field"))
-    monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
-    monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
-    monkeypatch.setattr(
-        "storage.readers.cube_sources.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}[name]
-    )
+    monkeypatch.setattr("spectralzoom.pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
+    monkeypatch.setattr("spectralzoom.pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
+    memory = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}
+    monkeypatch.setattr("spectralzoom.storage.readers.cube_sources.os.sysconf", memory.__getitem__)
     asked = replace(settings, scene="farm", size=(4096, 4096), labels=None, weights=None, out=str(tmp_path / "a"))
     found = plan_content(asked)
     ahead = [row["stage"] for row in found["stages"] if row["state"] == "to run"]
@@ -125,7 +124,7 @@ def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, mo
 def test_a_plan_imports_no_heavy_library() -> None:
     """Their import takes seconds, so it is deferred to their first use."""
     heavy = {"torch", "matplotlib", "xarray", "rasterio", "scipy.stats", "pandas", "prefect", "distributed"}
-    code = "import sys, flows.cli.main, flows.archive.plan_command; print(*sys.modules)"
+    code = "import sys, spectralzoom.flows.cli.main, spectralzoom.flows.archive.plan_command; print(*sys.modules)"
     assert not heavy & set(python(code).stdout.split())
 
 

@@ -15,17 +15,17 @@ import xarray
 from affine import Affine
 from numpy.typing import NDArray
 
-from flows.archive.export_command import run_export
-from flows.archive.export_layers import ProductFlags, choose_products
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from flows.tasks.patch_budget import ReadingCosts
-from models.weights.files import describe_weights
-from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.grid import SceneGrid
-from storage.archive.archive import Archive
-from storage.arrays.mosaics import open_mosaic
-from storage.maintenance.verification import verify_everything
+from spectralzoom.flows.archive.export_command import run_export
+from spectralzoom.flows.archive.export_layers import ProductFlags, choose_products
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.patch_budget import ReadingCosts
+from spectralzoom.models.weights.files import describe_weights
+from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.blocks import block_means
 from tests.conftest import QUIET, RGB_NM, WeightsMaker, patchy_scene
 from tests.storage.readers.test_raster_tags import write

@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.archive import reprocess_command
-from flows.archive import reprocess_command as reprocessing
-from flows.archive.commands import verify
-from flows.archive.reprocess_command import run_reprocess
-from flows.settings.survey_settings import Settings
-from flows.survey_command import run_survey
-from flows.terminal.processes import DONE, FAILED, PARTLY
-from pipeline.errors import SettingsError, WeightsError
-from storage.archive.archive import Archive
-from storage.archive.lineage import Catalogue
+from spectralzoom.flows.archive import reprocess_command
+from spectralzoom.flows.archive import reprocess_command as reprocessing
+from spectralzoom.flows.archive.commands import verify
+from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
+from spectralzoom.pipeline.errors import SettingsError, WeightsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.lineage import Catalogue
 from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.flows.conftest import be_version, turned
 from tests.prior_work import without_effects

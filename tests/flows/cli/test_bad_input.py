@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.tasks.open_survey import STAGES
-from storage.archive.archive import Archive
+from spectralzoom.flows.tasks.open_survey import STAGES
+from spectralzoom.storage.archive.archive import Archive
 from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead, class_map, problems
 
 NM = "460,500,550,600,620,640"
@@ -175,7 +175,7 @@ def test_receipts_of_finished_surveys_are_printed_after_an_interrupt(
 ) -> None:
     """After Ctrl-C in the second survey the JSON object has the first one."""
     published = Mock(side_effect=[Mock(receipt={"survey": "a"}), KeyboardInterrupt])
-    monkeypatch.setattr("flows.survey_command.run_survey", published)
+    monkeypatch.setattr("spectralzoom.flows.survey_command.run_survey", published)
     ended = command_line("survey", field_file("a"), field_file("b"), "--json")
     assert (ended.code, json.loads(ended.out)) == (130, {"surveys": [{"survey": "a"}]})
 

@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
-from flows.cli import main as cli
-from flows.cli.app import GOES_ON, VERBS, build_app
-from flows.settings.flags import IN_TABLES
-from flows.settings.load import SURVEY, TABLES
-from flows.terminal.progress import print_json
+from spectralzoom.flows.cli import main as cli
+from spectralzoom.flows.cli.app import GOES_ON, VERBS, build_app
+from spectralzoom.flows.settings.flags import IN_TABLES
+from spectralzoom.flows.settings.load import SURVEY, TABLES
+from spectralzoom.flows.terminal.progress import print_json
 from tests.flows.conftest import python
 
 ONE_THREAD = """
 import os, sys
-from flows.cli.main import main
+from spectralzoom.flows.cli.main import main
 assert "numpy" not in sys.modules, "numpy has read its number of threads already"
 try:
     main(["--version"])
@@ -46,9 +46,8 @@ def _flags(verb: str) -> dict[str, str | None]:
 
 def test_help_lists_every_command_and_imports_none(capsys: pytest.CaptureFixture[str]) -> None:
     """The list has the first sentence of each command's help; a command's own help is complete."""
-    script = (
-        "import sys\nfrom flows.cli.main import main\ntry:\n    main(sys.argv[1:])\nfinally:\n    print(*sys.modules)"
-    )
+    called = "try:\n    main(sys.argv[1:])\nfinally:\n    print(*sys.modules)"
+    script = f"import sys\nfrom spectralzoom.flows.cli.main import main\n{called}"
     ended = python(script, "--help")
     shown = ended.stdout.rsplit("\n", 2)[0]
     assert not {"numpy", "torch", "prefect", "matplotlib", *VERBS.values()} & set(ended.stdout.split())
@@ -124,7 +123,7 @@ def test_sigterm_ends_commands(verb: str, monkeypatch: pytest.MonkeyPatch, capsy
 
 ENDING = """
 import atexit, os, signal, sys
-from flows.cli.main import main
+from spectralzoom.flows.cli.main import main
 atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM))
 sys.argv[1:] = ["--version"]
 main()

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from flows.evaluate.command import evaluate_weights
-from flows.evaluate.frames import EvaluateRequest
+from spectralzoom.flows.evaluate.command import evaluate_weights
+from spectralzoom.flows.evaluate.frames import EvaluateRequest
 from tests.flows.small_fields import QUICK, write_weights
 
 Judged = tuple[EvaluateRequest, dict[str, Any]]

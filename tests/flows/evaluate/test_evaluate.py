@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.cli.main import main
-from flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
-from flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
-from flows.evaluate.judge import collect_row, judge_frame, seeds_of, summarise
-from flows.tasks.scene import pack_mask
-from flows.training.data import farm_test_data
-from flows.training.train import train_weights
-from flows.training.train_scenes import TrainRequest
-from models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
-from models.training.train import TrainingSettings
-from models.weights.files import load_weights, save_weights
-from pipeline.errors import SceneError, SettingsError, WeightsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.render import USUAL
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
+from spectralzoom.flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
+from spectralzoom.flows.evaluate.judge import collect_row, judge_frame, seeds_of, summarise
+from spectralzoom.flows.tasks.scene import pack_mask
+from spectralzoom.flows.training.data import farm_test_data
+from spectralzoom.flows.training.train import train_weights
+from spectralzoom.flows.training.train_scenes import TrainRequest
+from spectralzoom.models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
+from spectralzoom.models.training.train import TrainingSettings
+from spectralzoom.models.weights.files import load_weights, save_weights
+from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.render import USUAL
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.evaluate.conftest import Judged
 from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_weights
 from tests.models.conftest import make_weights
@@ -164,7 +164,7 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
 ):
     """The table of one frame shows them; the command keeps freed memory for reuse."""
     kept: list[bool] = []
-    monkeypatch.setattr("flows.evaluate.command.keep_freed_memory", lambda: kept.append(True))
+    monkeypatch.setattr("spectralzoom.flows.evaluate.command.keep_freed_memory", lambda: kept.append(True))
     weights = (write_weights(tmp_path / "w.safetensors"),)
     request = EvaluateRequest(str(data), weights, frames=("001",), **QUICK)
     row = run_evaluate(request, Console(stderr=True))["rows"][0]
@@ -228,8 +228,9 @@ def test_weights_without_a_common_frame_are_one_seed() -> None:
 
 def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The built-in fields of the test data have seeds of their own, apart from training."""
-    monkeypatch.setattr("flows.training.data.FARM_SHAPE", (32, 48))
-    monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
+    monkeypatch.setattr("spectralzoom.flows.training.data.FARM_SHAPE", (32, 48))
+    # choosing takes seconds
+    monkeypatch.setattr("spectralzoom.flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)
     weights = tmp_path / "w.safetensors"
     save_weights(replace(make_weights(classes=len(CLASSES), columns=6), class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "fractions": (0.25,)}

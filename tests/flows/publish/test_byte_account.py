@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from flows.archive.commands import contents
-from flows.publish.receipt_table import saving_rows
-from flows.publish.report import render_report
-from storage.archive.archive import Archive
+from spectralzoom.flows.archive.commands import contents
+from spectralzoom.flows.publish.receipt_table import saving_rows
+from spectralzoom.flows.publish.report import render_report
+from spectralzoom.storage.archive.archive import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
 from tests.flows.publish.test_receipt import make_receipt, printed

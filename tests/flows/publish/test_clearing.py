@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import spectralzoom
-from flows.publish import publishing
-from storage.archive.archive import Archive
-from storage.arrays import signal_cubes
+from spectralzoom.flows.publish import publishing
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.arrays import signal_cubes
 from tests.conftest import Survey
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects
@@ -26,7 +26,7 @@ def surveyed(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """Return an archive of a survey that was stopped before it cleared its raw lines; do not change it."""
     root = tmp_path_factory.mktemp("clearing") / "archive"
     with without_effects(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("flows.survey.clear_raw", lambda plan, run: run)
+        patch.setattr("spectralzoom.flows.survey.clear_raw", lambda plan, run: run)
         survey_png(root, accuracy=False)
     return root
 

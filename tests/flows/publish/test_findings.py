@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.publish.findings import changed_hectares
-from flows.publish.receipt_table import finding_rows, format_score
-from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
-from models.weights.files import MAP_SCORES, TRAINED_ON, _add_part, load_weights, save_weights, with_record
-from pipeline.errors import WeightsError
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import NoPlace
-from storage.arrays.class_maps import ClassMap
+from spectralzoom.flows.publish.findings import changed_hectares
+from spectralzoom.flows.publish.receipt_table import finding_rows, format_score
+from spectralzoom.models.evaluation.expected_scores import MapScores, expected_counts, expected_score
+from spectralzoom.models.weights.files import MAP_SCORES, TRAINED_ON, _add_part, load_weights, save_weights, with_record
+from spectralzoom.pipeline.errors import WeightsError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.field_places import NoPlace
+from spectralzoom.storage.arrays.class_maps import ClassMap
 from tests.conftest import CLASSES, Survey
 from tests.flows.tasks.test_unlike_training import SEEN, of_other_scenes
 

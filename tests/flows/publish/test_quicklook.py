@@ -12,11 +12,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from flows.publish import panels, quicklook
-from flows.publish.panels import class_rgb
-from flows.publish.quicklook import QuicklookData, _panels, draw_quicklook
-from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.mosaics import choose_bands
+from spectralzoom.flows.publish import panels, quicklook
+from spectralzoom.flows.publish.panels import class_rgb
+from spectralzoom.flows.publish.quicklook import QuicklookData, _panels, draw_quicklook
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.arrays.mosaics import choose_bands
 
 WAVES = np.linspace(400, 1000, 61)
 

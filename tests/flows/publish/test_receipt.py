@@ -15,15 +15,15 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from flows.publish.field_map import ERROR_COLOURS, FieldMap, error_address
-from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
-from flows.publish.receipt_table import format_score, headline, print_summary
-from flows.publish.report import render_report
-from flows.settings.survey_settings import Settings
-from flows.terminal.figures import format_area
-from pipeline.errors import ShapeError
-from storage.archive.records import StageRecord
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.publish.field_map import ERROR_COLOURS, FieldMap, error_address
+from spectralzoom.flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
+from spectralzoom.flows.publish.receipt_table import format_score, headline, print_summary
+from spectralzoom.flows.publish.report import render_report
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.terminal.figures import format_area
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.storage.archive.records import StageRecord
+from spectralzoom.storage.archive.whole_files import to_json
 from tests.flows.conftest import Page
 
 

@@ -22,14 +22,14 @@ from unittest.mock import Mock
 import pytest
 import yaml
 
-from flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
-from flows.settings.load import load_settings
-from flows.tasks.local_server import local_server
-from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
-from flows.tasks.prefect_tasks import Observer
-from storage.archive.archive import Archive
-from storage.archive.records import read_run
-from storage.parallel.pool import THREADS
+from spectralzoom.flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.local_server import local_server
+from spectralzoom.flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
+from spectralzoom.flows.tasks.prefect_tasks import Observer
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.records import read_run
+from spectralzoom.storage.parallel.pool import THREADS
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
@@ -73,7 +73,7 @@ def run_here(run: Any) -> Any:
     """Run it with Prefect's engine in this process, as a runner does in its own; return the state."""
     from prefect.flow_engine import run_flow
 
-    from flows.survey import survey
+    from spectralzoom.flows.survey import survey
 
     return run_flow(survey, flow_run=run, return_type="state")
 
@@ -182,8 +182,8 @@ def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
     """`prefect deploy --all --no-prompt` makes two deployments, with schedule, pools, limits and valid parameters."""
     from prefect.client.schemas.actions import WorkPoolCreate
 
-    from flows.archive.reprocess_flow import reprocess
-    from flows.survey import survey
+    from spectralzoom.flows.archive.reprocess_flow import reprocess
+    from spectralzoom.flows.survey import survey
 
     with client() as asked:
         asked.create_work_pool(WorkPoolCreate(name="reading", type="process"))
@@ -244,7 +244,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
     names = ("north", "south")
     files = [field_file(name, source="raster", budget=None) for name in names]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
-    words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
+    words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "spectralzoom.flows.cli.main"]
     words += ["serve", *map(str, files), "--every", "365d"]
     with (
         (tmp_path / "said").open("w") as said,

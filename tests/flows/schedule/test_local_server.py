@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from flows.tasks.local_server import ServerUnavailable, create_database, local_server
+from spectralzoom.flows.tasks.local_server import ServerUnavailable, create_database, local_server
 
 
 def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_a_user_without_a_cache_folder_waits_for_the_migrations(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server creates its own tables then."""
-    monkeypatch.setattr("flows.tasks.local_server.cache_folder", lambda _: None)
+    monkeypatch.setattr("spectralzoom.flows.tasks.local_server.cache_folder", lambda _: None)
     create_database(tmp_path / "home" / "prefect.db")
     assert [*tmp_path.rglob("*")] == [tmp_path / "home"]
 

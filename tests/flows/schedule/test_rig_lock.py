@@ -12,15 +12,15 @@ from unittest.mock import Mock
 
 import pytest
 
-from flows.tasks import rig_field
-from flows.tasks.rig_field import rig_to_oneself
-from pipeline.errors import RigError
+from spectralzoom.flows.tasks import rig_field
+from spectralzoom.flows.tasks.rig_field import rig_to_oneself
+from spectralzoom.pipeline.errors import RigError
 
 ROOT = Path(__file__).parents[3]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine use two rigs
 TAKES = """
 import sys
-from flows.tasks.rig_field import rig_to_oneself
+from spectralzoom.flows.tasks.rig_field import rig_to_oneself
 try:
     with rig_to_oneself(sys.argv[1]):
         print(True, flush=True)

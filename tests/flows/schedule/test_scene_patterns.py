@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.cli.serve_command import load_fields
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.tasks.scene import scene_of_visit
-from pipeline.errors import NoSceneYet, SettingsError, WeightsError
+from spectralzoom.flows.cli.serve_command import load_fields
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.tasks.scene import scene_of_visit
+from spectralzoom.pipeline.errors import NoSceneYet, SettingsError, WeightsError
 
 JUNE = datetime(2026, 6, 1, 12, tzinfo=UTC)
 

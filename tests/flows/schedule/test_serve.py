@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from flows.cli.serve_command import load_fields, schedule_of, survey_deployment
-from storage.archive.archive import Archive
-from storage.archive.staging import take_lock
+from spectralzoom.flows.cli.serve_command import load_fields, schedule_of, survey_deployment
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.staging import take_lock
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -83,8 +83,8 @@ def test_serve_without_a_server_is_refused(
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:
     """Its parameters have file, field and archive and pass the flow's checks; a second run at a time is cancelled."""
-    from flows.archive.reprocess_flow import reprocess_deployment
-    from flows.survey import survey
+    from spectralzoom.flows.archive.reprocess_flow import reprocess_deployment
+    from spectralzoom.flows.survey import survey
 
     ((file, north),) = load_fields([field_file("north")], out=str(tmp_path / "other")).items()
     made = survey_deployment(file, north, schedule_of("0 6 * * *", None, "Europe/Berlin"))

@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from flows.evaluate.command import evaluate_weights
-from flows.evaluate.frames import EvaluateRequest
-from flows.tasks.run import SurveyRun
-from flows.tasks.survey_model import shipped_weights
-from flows.training.train import train_weights
-from flows.training.train_scenes import TrainRequest
-from pipeline.errors import SettingsError
+from spectralzoom.flows.evaluate.command import evaluate_weights
+from spectralzoom.flows.evaluate.frames import EvaluateRequest
+from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.flows.tasks.survey_model import shipped_weights
+from spectralzoom.flows.training.train import train_weights
+from spectralzoom.flows.training.train_scenes import TrainRequest
+from spectralzoom.pipeline.errors import SettingsError
 from tests.conftest import Survey
 
 REFUSED = "--device mps: torch can use none on this machine; there is .*: give that, or auto"

@@ -12,17 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.settings.documents import example_toml, settings_table
-from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
-from flows.settings.survey_settings import Settings
-from flows.settings.values import Tolerance
-from pipeline.errors import BudgetError, SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel
-from pipeline.ground.view import RigPose
-from pipeline.simulator.render import EFFECTS
-from pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.settings.documents import example_toml, settings_table
+from spectralzoom.flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.values import Tolerance
+from spectralzoom.pipeline.errors import BudgetError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel
+from spectralzoom.pipeline.ground.view import RigPose
+from spectralzoom.pipeline.simulator.render import EFFECTS
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
+from spectralzoom.storage.archive.whole_files import to_json
 
 EXAMPLE = Path(__file__).parents[3] / "survey.example.toml"
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}
@@ -69,7 +69,7 @@ def test_flags_and_files_give_the_same_settings(toml):
 
 
 def test_the_example_file_has_every_default():
-    """It is valid and equals the output of `python -m flows.settings.documents > survey.example.toml`."""
+    """It is valid and equals the output of `python -m spectralzoom.flows.settings.documents > survey.example.toml`."""
     assert replace(load_settings(EXAMPLE), out=Settings.out) == Settings()
     assert [load_settings(EXAMPLE, one).plain for one in ({"seconds": "5"}, {"policy": "gain"})] == [True, False]
     assert EXAMPLE.read_text(encoding="utf-8") == example_toml()

@@ -8,16 +8,16 @@ from unittest.mock import Mock
 
 import pytest
 
-from flows.cli.simulate_command import open_simulation
-from flows.settings.load import load_settings
-from flows.tasks.run import CaptureRun
-from flows.tasks.scene import SimulatedField
-from flows.tasks.stages import effects as effect_choice
-from flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest
-from pipeline.errors import IncompleteStoreError
-from pipeline.simulator.render import EFFECTS
-from pipeline.simulator.scenes.scene import SceneRaster
-from storage.archive.keys import StageRef
+from spectralzoom.flows.cli.simulate_command import open_simulation
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.run import CaptureRun
+from spectralzoom.flows.tasks.scene import SimulatedField
+from spectralzoom.flows.tasks.stages import effects as effect_choice
+from spectralzoom.flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.simulator.render import EFFECTS
+from spectralzoom.pipeline.simulator.scenes.scene import SceneRaster
+from spectralzoom.storage.archive.keys import StageRef
 
 Decided = tuple[Path, StageRef]  # an archive, and the decision in it
 ASKED = "rotation,vignetting,shot,read-noise"

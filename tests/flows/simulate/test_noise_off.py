@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from pipeline.geometry.camera import LineCamera, footprint_kernel
-from storage.arrays.mosaics import open_mosaic
-from storage.arrays.signal_cubes import open_signal_cubes
+from spectralzoom.pipeline.geometry.camera import LineCamera, footprint_kernel
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.arrays.signal_cubes import open_signal_cubes
 from tests.conftest import Survey, WeightsMaker
 from tests.pipeline.rectify.test_analytic_scene import waves
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.cli.rig_commands import SQUARE, CheckRow, check_camera, check_mirror, failed, works
-from pipeline.errors import RigError
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FileServer
-from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from pipeline.rig.transports import DeviceGone
+from spectralzoom.flows.cli.rig_commands import SQUARE, CheckRow, check_camera, check_mirror, failed, works
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
+from spectralzoom.pipeline.rig.device_settings import FileServer
+from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
+from spectralzoom.pipeline.rig.transports import DeviceGone
 from tests.pipeline.rig.camera.scripted_files import ScriptedFiles, served
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport, scripted

@@ -14,10 +14,10 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
-from flows.publish.receipt_table import print_effects
-from pipeline.simulator.render import EFFECTS
-from pipeline.simulator.scenes.scene import SceneRaster
-from pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.flows.publish.receipt_table import print_effects
+from spectralzoom.pipeline.simulator.render import EFFECTS
+from spectralzoom.pipeline.simulator.scenes.scene import SceneRaster
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from tests.flows.conftest import python
 
 SAMPLES = 192  # samples of a line; a narrow camera is quick to simulate
@@ -153,7 +153,7 @@ def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path)
 
 WITHOUT = """
 import sys
-from flows.cli.main import main
+from spectralzoom.flows.cli.main import main
 try:
     main(sys.argv[1:])
 except SystemExit as ended:

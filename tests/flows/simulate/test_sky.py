@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.settings.load import load_settings
-from flows.tasks.run import open_run
-from flows.tasks.scene import open_scene
-from pipeline.errors import SettingsError
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.tasks.scene import open_scene
+from spectralzoom.pipeline.errors import SettingsError
 
 SMALL: dict[str, Any] = {"scene": "scouting", "size": "96x64", "bands": "20,80,140,200", "engine": "plain"}
 

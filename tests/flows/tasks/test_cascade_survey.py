@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.archive.plan_command import plan_content
-from flows.settings.load import load_settings
-from models.policies.placement import CascadeTable
-from models.weights.files import CASCADE, save_weights
+from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.models.policies.placement import CascadeTable
+from spectralzoom.models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Flags, Survey, random_weights
 from tests.prior_work import without_effects
 

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.tasks.scene import judged_labels
-from flows.tasks.scores import format_false_classes, format_worst_class, score_of
-from flows.tasks.stages import accuracy as evaluation
-from flows.tasks.stages import placement
-from models.evaluation.metrics import confusion
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.rectify.registration.illumination import LightRatio
-from pipeline.rectify.sweep_paths import sweep_paths
-from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from storage.archive.archive import Archive
+from spectralzoom.flows.tasks.scene import judged_labels
+from spectralzoom.flows.tasks.scores import format_false_classes, format_worst_class, score_of
+from spectralzoom.flows.tasks.stages import accuracy as evaluation
+from spectralzoom.flows.tasks.stages import placement
+from spectralzoom.models.evaluation.metrics import confusion
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.rectify.registration.illumination import LightRatio
+from spectralzoom.pipeline.rectify.sweep_paths import sweep_paths
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.storage.archive.archive import Archive
 from tests.flows.publish.test_receipt import make_receipt
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]

@@ -10,20 +10,20 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from flows.settings.load import load_settings
-from flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
-from flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
-from flows.tasks.patch_budget import SHARD
-from flows.tasks.prior_maps import Prior
-from flows.tasks.run import SurveyRun, open_run
-from models.network.sizes import CELL_PX
-from models.reading.regions import plan_regions
-from pipeline.errors import SettingsError, WeightsError
-from pipeline.geometry.grid import SceneGrid
-from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
-from storage.arrays.layout import consolidate_stores, open_group, read_array
-from storage.parallel.pool import WorkerPool
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
+from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
+from spectralzoom.flows.tasks.patch_budget import SHARD
+from spectralzoom.flows.tasks.prior_maps import Prior
+from spectralzoom.flows.tasks.run import SurveyRun, open_run
+from spectralzoom.models.network.sizes import CELL_PX
+from spectralzoom.models.reading.regions import plan_regions
+from spectralzoom.pipeline.errors import SettingsError, WeightsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
+from spectralzoom.storage.arrays.layout import consolidate_stores, open_group, read_array
+from spectralzoom.storage.parallel.pool import WorkerPool
 from tests.conftest import Flags, Survey
 
 Surveyed = tuple[SurveyRun, Path]
@@ -35,7 +35,7 @@ ALL_PX = 96  # a halo that reaches over the whole field
 def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> Surveyed:
     """Return a survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
-    with mock.patch("flows.publish.publishing._clear_first_mosaic"):
+    with mock.patch("spectralzoom.flows.publish.publishing._clear_first_mosaic"):
         survey_png(out)
     return open_run(load_settings(None, flags_png(out, budget="0.8"))), out / "stages"
 
@@ -91,9 +91,9 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
     run, stages = surveyed
     gain = run.work.score("gain", _mosaics(stages)[1], run.capture, lambda done: None)
     least = float(np.quantile(gain, 0.7)) + 1e-9
-    monkeypatch.setattr("flows.tasks.drawing.MOST_OVERVIEWS", overviews)
+    monkeypatch.setattr("spectralzoom.flows.tasks.drawing.MOST_OVERVIEWS", overviews)
     if not stored:  # an overview that was not kept is computed again
-        monkeypatch.setattr("flows.tasks.drawing.load_overview", lambda path, weights: None)
+        monkeypatch.setattr("spectralzoom.flows.tasks.drawing.load_overview", lambda path, weights: None)
     regions = _draw(_work(run, WorkerPool(workers=2), ALL_PX), run, stages, tmp_path / "m", least)
     whole = _draw(run.work, run, stages, tmp_path / "one", least)
     assert (regions == whole) == (overviews == 16)  # one of two regions has other classes

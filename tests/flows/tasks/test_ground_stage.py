@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from flows.settings.survey_settings import Settings
-from flows.tasks.stages.maps import STORE, colours_of, ground
-from flows.tasks.zones import place_of_field
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import PosedField
-from pipeline.ground.map_grid import GroundGrid
-from pipeline.ground.view import pixel_places
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.arrays import class_maps
-from storage.arrays.georeference import AngularGrid
-from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.layout import open_group, read_array
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.tasks.stages.maps import STORE, colours_of, ground
+from spectralzoom.flows.tasks.zones import place_of_field
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.field_places import PosedField
+from spectralzoom.pipeline.ground.map_grid import GroundGrid
+from spectralzoom.pipeline.ground.view import pixel_places
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.arrays import class_maps
+from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.arrays.ground_maps import load_ground_map
+from spectralzoom.storage.arrays.layout import open_group, read_array
 from tests.exported_run import POSE
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.tasks.stages.placement import MosaicRecipe, tile_budget, write_mosaic
-from pipeline.errors import SettingsError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
-from pipeline.source import References
-from storage.archive.keys import StageRef
-from storage.arrays.cubes import SweepHeader
-from storage.arrays.signal_cubes import SignalCube, open_signal_cubes
-from storage.parallel.pool import WorkerPool
+from spectralzoom.flows.tasks.stages.placement import MosaicRecipe, tile_budget, write_mosaic
+from spectralzoom.pipeline.errors import SettingsError, ShapeError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.rectify.placed import PixelGrid, place
+from spectralzoom.pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
+from spectralzoom.pipeline.source import References
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.arrays.cubes import SweepHeader
+from spectralzoom.storage.arrays.signal_cubes import SignalCube, open_signal_cubes
+from spectralzoom.storage.parallel.pool import WorkerPool
 from tests.storage.plain_mosaic import plain_writer, write_plain_sweep
 
 CAMERA = LineCamera()

@@ -15,21 +15,21 @@ import torch
 import xarray as xr
 from rich.console import Console
 
-from flows.archive.reprocess_command import run_reprocess
-from flows.tasks import extent_choice
-from flows.tasks.drawing import Drawing
-from flows.tasks.extent_choice import ExtentGains
-from flows.tasks.patch_budget import SHARD
-from flows.tasks.run import SurveyRun
-from models.network.sizes import MultiplyAdds, TemporalSizes
-from models.network.temporal_reader import TemporalReader
-from models.reading.expected_errors import PatchExpectedErrors
-from models.reading.prior_map import ClassProbabilities, PriorMap, carried
-from models.reading.regions import plan_regions
-from pipeline.errors import BudgetError, PipelineError, SettingsError
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.uniform_scans import ScanPerformance
-from storage.archive.records import read_run
+from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.tasks import extent_choice
+from spectralzoom.flows.tasks.drawing import Drawing
+from spectralzoom.flows.tasks.extent_choice import ExtentGains
+from spectralzoom.flows.tasks.patch_budget import SHARD
+from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.models.network.sizes import MultiplyAdds, TemporalSizes
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.reading.expected_errors import PatchExpectedErrors
+from spectralzoom.models.reading.prior_map import ClassProbabilities, PriorMap, carried
+from spectralzoom.models.reading.regions import plan_regions
+from spectralzoom.pipeline.errors import BudgetError, PipelineError, SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
+from spectralzoom.storage.archive.records import read_run
 from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.prior_work import without_effects
 

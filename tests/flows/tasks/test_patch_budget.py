@@ -14,14 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.archive.plan_command import plan_content
-from flows.settings.load import load_settings, parse_settings
-from flows.tasks.patch_budget import PatchBudget, ReadingCosts
-from flows.tasks.run import open_run
-from models.network.sizes import SegmenterConfig, multiply_adds
-from models.policies.policies import score_multiply_adds
-from pipeline.errors import BudgetError, SettingsError
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.settings.load import load_settings, parse_settings
+from spectralzoom.flows.tasks.patch_budget import PatchBudget, ReadingCosts
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.models.network.sizes import SegmenterConfig, multiply_adds
+from spectralzoom.models.policies.policies import score_multiply_adds
+from spectralzoom.pipeline.errors import BudgetError, SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.conftest import Flags, Survey
 
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16), 30)

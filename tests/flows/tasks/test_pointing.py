@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.publish.receipt_table import finding_rows
-from flows.settings.load import load_settings, parse_settings
-from flows.survey_command import run_survey
-from flows.tasks.capture_plan import PassLayout
-from pipeline.errors import SettingsError
-from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.geometry.scan import Sweep
-from pipeline.planning.coverage import full_sweeps, reach_px
-from pipeline.planning.fine_pass import every_nth
-from pipeline.simulator.effects.pointing import PointingErrors
-from storage.arrays.mosaics import open_mosaic
+from spectralzoom.flows.publish.receipt_table import finding_rows
+from spectralzoom.flows.settings.load import load_settings, parse_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.capture_plan import PassLayout
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.planning.coverage import full_sweeps, reach_px
+from spectralzoom.pipeline.planning.fine_pass import every_nth
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.storage.arrays.mosaics import open_mosaic
 from tests.conftest import QUIET
 from tests.flows.conftest import FEW_BANDS
 from tests.prior_work import without_effects

@@ -18,16 +18,16 @@ from affine import Affine
 from PIL import Image
 from rich.console import Console
 
-import flows.tasks.prior_maps as memory
-from flows.archive.reprocess_command import run_reprocess
-from flows.settings.load import load_settings
-from models.network.sizes import TemporalSizes
-from models.network.temporal_reader import TemporalReader
-from models.weights.files import add_reader, load_weights
-from pipeline.errors import SettingsError, WeightsError
-from pipeline.geometry.grid import SceneGrid
-from storage.archive.archive import Archive
-from storage.archive.records import read_run
+import spectralzoom.flows.tasks.prior_maps as memory
+from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.models.network.sizes import TemporalSizes
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.weights.files import add_reader, load_weights
+from spectralzoom.pipeline.errors import SettingsError, WeightsError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.records import read_run
 from tests.conftest import CLASSES, QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects

@@ -8,19 +8,19 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from flows.settings.load import load_settings
-from flows.tasks.run import make_source
-from flows.tasks.stages.capture import take_lines
-from pipeline.errors import RigError, SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator import render, simulated
-from pipeline.simulator.render import BY_NAME
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import Line
-from storage.parallel.pool import WorkerPool
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.run import make_source
+from spectralzoom.flows.tasks.stages.capture import take_lines
+from spectralzoom.pipeline.errors import RigError, SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator import render, simulated
+from spectralzoom.pipeline.simulator.render import BY_NAME
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import Line
+from spectralzoom.storage.parallel.pool import WorkerPool
 from tests.pipeline.capture.recordings import assert_same
 from tests.pipeline.simulator.small_scenes import effects_on
 

@@ -7,23 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.settings.load import load_settings
-from flows.tasks.run import open_run
-from flows.tasks.survey_model import shipped_weights, weights_path
-from flows.tradeoff import coarse_of_sweeps
-from models.evaluation.metrics import mean_iou
-from models.policies.placement import ReadTwice
-from models.weights.files import Weights, describe_weights, load_weights
-from pipeline.errors import BudgetError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import frame_patches, full_sweeps
-from pipeline.planning.uniform_scans import ScanPerformance
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.built_in import SCOUTING_LAW
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
+from spectralzoom.flows.tradeoff import coarse_of_sweeps
+from spectralzoom.models.evaluation.metrics import mean_iou
+from spectralzoom.models.policies.placement import ReadTwice
+from spectralzoom.models.weights.files import Weights, describe_weights, load_weights
+from spectralzoom.pipeline.errors import BudgetError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.coverage import frame_patches, full_sweeps
+from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = shipped_weights()
 SHAPE = (512, 640)  # smaller farms have too few pixels of rare classes to rank policies

@@ -17,13 +17,13 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from flows.cli.main import main
-from flows.publish import run_folder as publish
-from flows.tasks import prefect_tasks
-from flows.tasks.open_survey import STAGES
-from flows.tasks.stage import Stage, Wanted
-from pipeline.errors import ArchiveError, RigError
-from storage.archive.archive import Archive
+from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.publish import run_folder as publish
+from spectralzoom.flows.tasks import prefect_tasks
+from spectralzoom.flows.tasks.open_survey import STAGES
+from spectralzoom.flows.tasks.stage import Stage, Wanted
+from spectralzoom.pipeline.errors import ArchiveError, RigError
+from spectralzoom.storage.archive.archive import Archive
 from tests.flows.conftest import Ended, class_map, newest_run, problems
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -198,7 +198,7 @@ def test_a_stage_that_fails_in_prefect_has_a_failed_task(
 
 def test_failed_reprocessing_resumes(server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The flow is Failed with the reason; the next one makes the missing store and completes."""
-    from flows.archive.reprocess_flow import reprocess
+    from spectralzoom.flows.archive.reprocess_flow import reprocess
 
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     archive = Archive.open(out)

@@ -14,24 +14,24 @@ import pytest
 import xarray as xr
 import zarr
 
-from flows.publish.publishing import clear_raw, publish
-from flows.settings.load import load_settings
-from flows.settings.parameters import SurveySettings
-from flows.settings.survey_settings import Settings
-from flows.survey import draw_class_map, survey
-from flows.survey_command import run_survey
-from flows.tasks.captures import plan_capture
-from flows.tasks.open_survey import STAGES, OpenSurvey
-from flows.tasks.run import SurveyRun
-from flows.tasks.stage import Product, Stage, Wanted
-from flows.tasks.stages.condense import SignalChoice, components_of
-from pipeline.errors import ArchiveError
-from pipeline.signal.subspace import SignalStatistics
-from pipeline.source import References
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.archive.records import read_run
-from storage.arrays.cubes import open_raw_cube
+from spectralzoom.flows.publish.publishing import clear_raw, publish
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey import draw_class_map, survey
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.captures import plan_capture
+from spectralzoom.flows.tasks.open_survey import STAGES, OpenSurvey
+from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.flows.tasks.stage import Product, Stage, Wanted
+from spectralzoom.flows.tasks.stages.condense import SignalChoice, components_of
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.pipeline.signal.subspace import SignalStatistics
+from spectralzoom.pipeline.source import References
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.records import read_run
+from spectralzoom.storage.arrays.cubes import open_raw_cube
 from tests.conftest import QUIET, Survey
 from tests.faults.small_survey import stored
 from tests.flows.conftest import problems
@@ -119,7 +119,7 @@ def test_processes_make_the_same_archive(
     """Two processes, one killed by kill -9, write the keys and bytes of a survey with threads; xarray opens the map."""
     roots = tmp_path / "threads", tmp_path / "processes"
     surveyed_png(roots[0])
-    monkeypatch.setattr("flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
+    monkeypatch.setattr("spectralzoom.flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
     survey_png(roots[1], scheduler="processes", workers=2)
     assert (tmp_path / "killed").exists()
     assert stored(roots[0]) == stored(roots[1])

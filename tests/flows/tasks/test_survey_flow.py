@@ -14,16 +14,16 @@ from unittest.mock import Mock
 import pytest
 from pydantic import ValidationError
 
-from flows import survey as survey_flow
-from flows import survey_command
-from flows.settings.load import load_settings
-from flows.settings.parameters import SurveySettings
-from flows.survey import draw_class_map
-from flows.tasks.local_server import ServerUnavailable
-from flows.tasks.open_survey import Products
-from flows.tasks.run import SurveyRun
-from pipeline.errors import IncompleteStoreError
-from storage.archive.keys import StageRef
+from spectralzoom.flows import survey as survey_flow
+from spectralzoom.flows import survey_command
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.survey import draw_class_map
+from spectralzoom.flows.tasks.local_server import ServerUnavailable
+from spectralzoom.flows.tasks.open_survey import Products
+from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.storage.archive.keys import StageRef
 from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
 
@@ -158,7 +158,7 @@ def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> 
 
 def test_every_setting_is_a_described_field_of_the_form() -> None:
     """Prefect makes its form from the parameters of the flow."""
-    from flows.settings.load import SURVEY
+    from spectralzoom.flows.settings.load import SURVEY
 
     schema = survey_flow.survey.parameters.definitions["SurveySettings"]["properties"]
     assert set(schema) == {*SURVEY, "settings_file"}

@@ -15,27 +15,27 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
-from flows.publish.receipt import check_receipt
-from flows.publish.receipt_table import finding_rows
-from flows.publish.run_folder import Published
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from flows.tasks.scene import open_scene
-from models.network.spectral import LineSpec
-from models.reading.inference import segment
-from models.weights.files import load_weights, save_weights
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.coverage import on_scene
-from pipeline.signal.components import Components
-from pipeline.signal.subspace import with_shared
-from pipeline.simulator.render import BY_NAME
-from storage.archive.archive import Archive
-from storage.arrays.class_maps import ClassMap, load_class_map
-from storage.arrays.mosaics import open_mosaic
-from storage.maintenance.verification import verify_everything
+from spectralzoom.flows.publish.receipt import check_receipt
+from spectralzoom.flows.publish.receipt_table import finding_rows
+from spectralzoom.flows.publish.run_folder import Published
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.scene import open_scene
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.reading.inference import segment
+from spectralzoom.models.weights.files import load_weights, save_weights
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.planning.coverage import on_scene
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.subspace import with_shared
+from spectralzoom.pipeline.simulator.render import BY_NAME
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.arrays.class_maps import ClassMap, load_class_map
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.conftest import CLASSES, QUIET, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page, problems
 from tests.models.conftest import coarse_prediction
@@ -293,8 +293,8 @@ def test_two_passes_share_components_of_rare_spectra(tmp_path: Path, monkeypatch
         assert 256 < len(residuals) <= 512 + 2  # a part of each of two sweeps
         return shared
 
-    monkeypatch.setattr("flows.tasks.stages.condense.with_shared", watched)
-    monkeypatch.setattr("flows.tasks.stages.condense.MOST_COMPARED", 512)
+    monkeypatch.setattr("spectralzoom.flows.tasks.stages.condense.with_shared", watched)
+    monkeypatch.setattr("spectralzoom.flows.tasks.stages.condense.MOST_COMPARED", 512)
     size = {"size": "128x112", "camera.samples": 192, "bands": ",".join(map(str, range(4, 270, 3)))}
     flags = {"zoom": "always", "seconds": "4", "effects": "none", "accuracy": "false", "engine": "plain"}
     found = load_settings(None, {"scene": "farm", "out": str(tmp_path), **size, **flags})

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 import zarr
 
-import flows.tasks.prefect_tasks
-import flows.tasks.rig_field
-from flows.publish.run_folder import Published
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.survey_command import run_survey
-from flows.tasks.run import open_run
-from pipeline.errors import PoseError, RigError, SettingsError
-from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.fakes import FakeCamera
-from pipeline.rig.transports import DeviceGone
-from storage.archive.archive import Archive
-from storage.arrays.class_maps import load_class_map
-from storage.arrays.cubes import open_raw_cube
-from storage.maintenance.verification import verify_everything
+import spectralzoom.flows.tasks.prefect_tasks
+import spectralzoom.flows.tasks.rig_field
+from spectralzoom.flows.publish.run_folder import Published
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
+from spectralzoom.pipeline.rig.fakes import FakeCamera
+from spectralzoom.pipeline.rig.transports import DeviceGone
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.arrays.class_maps import load_class_map
+from spectralzoom.storage.arrays.cubes import open_raw_cube
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.conftest import QUIET
 
 FAKE = {"rig.mirror_driver": "fake", "rig.camera_driver": "fake"}
@@ -150,7 +150,7 @@ def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, watch:
 def test_a_rig_on_hardware_is_for_one_survey(tmp_path: Path) -> None:
     """Stored lines need no rig, and a fake mirror no lock. A real mirror is used by one survey at a time."""
     settings = fake_settings(tmp_path, **{"rig.port": f"/dev/tty{tmp_path.name}"})
-    with flows.tasks.rig_field.rig_to_oneself(settings.rig.port):  # by another survey
+    with spectralzoom.flows.tasks.rig_field.rig_to_oneself(settings.rig.port):  # by another survey
         run_survey(settings, QUIET)
         real = replace(settings, visit="second", rig=replace(settings.rig, mirror_driver=""))
         with pytest.raises(RigError, match="in use by another survey"):

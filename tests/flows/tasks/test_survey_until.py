@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from flows.settings.load import load_settings
-from flows.settings.survey_settings import Settings
-from flows.survey_command import run_survey
-from pipeline.errors import SurveyStopped
-from storage.archive.archive import Archive
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.pipeline.errors import SurveyStopped
+from spectralzoom.storage.archive.archive import Archive
 from tests.conftest import QUIET
 from tests.flows.conftest import CommandLine
 

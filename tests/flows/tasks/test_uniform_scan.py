@@ -11,13 +11,13 @@ import pytest
 import xarray as xr
 from PIL import Image
 
-from flows.archive.plan_command import plan_content
-from flows.archive.reprocess_command import run_reprocess
-from flows.publish.receipt_table import finding_rows
-from flows.settings.load import load_settings
-from flows.survey_command import run_survey
-from flows.tasks.run import SurveyRun, open_run
-from pipeline.errors import BudgetError, SettingsError, WeightsError
+from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.publish.receipt_table import finding_rows
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.run import SurveyRun, open_run
+from spectralzoom.pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import QUIET, Flags, Survey, WeightsMaker
 from tests.prior_work import with_effects
 

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.publish.receipt_table import finding_rows
-from flows.settings.load import load_settings
-from flows.tasks.survey_model import beyond_training, training_note
-from models.network.spectral import UNLIKE, unlike_training
-from models.weights.files import TrainedOn, Weights, describe_weights, load_weights, save_weights
+from spectralzoom.flows.publish.receipt_table import finding_rows
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.survey_model import beyond_training, training_note
+from spectralzoom.models.network.spectral import UNLIKE, unlike_training
+from spectralzoom.models.weights.files import TrainedOn, Weights, describe_weights, load_weights, save_weights
 from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.terminal.processes import format_refusal, place_caches, place_pages
-from pipeline.errors import SettingsError
+from spectralzoom.flows.terminal.processes import format_refusal, place_caches, place_pages
+from spectralzoom.pipeline.errors import SettingsError
 from tests.flows.conftest import CommandLine, Ended
 from tests.users.test_first_steps import small_files
 
@@ -102,7 +102,7 @@ def test_refused_resources_get_a_message(error: Exception, words: str | None) ->
 
 def test_survey_within_narrow_memory_fails_with_one_message(tmp_path: Path) -> None:
     """The limit is 0.4 GB of address space: exit code 1, and no report of a defect."""
-    survey = f"{sys.executable} -m flows.cli.main {' '.join(SURVEY)} --out {tmp_path / 'a'}"
+    survey = f"{sys.executable} -m spectralzoom.flows.cli.main {' '.join(SURVEY)} --out {tmp_path / 'a'}"
     command = ["sh", "-c", f"ulimit -v 400000; exec {survey}"]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     Ended(ended.returncode, ended.stdout, ended.stderr).refused(1, "^memory ran out: ")

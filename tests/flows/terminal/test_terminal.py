@@ -15,11 +15,11 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from flows.publish.report import render_markdown, render_report
-from flows.terminal.figures import three_digits
-from flows.terminal.progress import StageProgress, Terminal
-from pipeline.errors import is_visible
-from storage.archive.whole_files import to_json
+from spectralzoom.flows.publish.report import render_markdown, render_report
+from spectralzoom.flows.terminal.figures import three_digits
+from spectralzoom.flows.terminal.progress import StageProgress, Terminal
+from spectralzoom.pipeline.errors import is_visible
+from spectralzoom.storage.archive.whole_files import to_json
 from tests.flows.publish.test_receipt import make_receipt
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
@@ -117,7 +117,7 @@ def test_a_log_gets_one_line_when_a_stage_ends(monkeypatch: pytest.MonkeyPatch) 
         progress.say("fetching 3 of 55 MB")
 
     assert progress_of(steps).splitlines() == ["mosaic: 100% ran"]
-    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
+    monkeypatch.setattr("spectralzoom.flows.terminal.progress.LINE_EVERY_S", -1.0)
     assert progress_of(long).splitlines()[-1] == "mosaic: 0% fetching 3 of 55 MB"
 
 
@@ -146,7 +146,7 @@ def test_messages_stand_beside_the_running_stage() -> None:
 def test_a_log_has_the_time_left_of_a_running_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     """An ended stage has none."""
     monkeypatch.setattr("rich.progress.Task.time_remaining", 75.0)
-    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
+    monkeypatch.setattr("spectralzoom.flows.terminal.progress.LINE_EVERY_S", -1.0)
     assert progress_of(lambda one: one.show("rectify", 0.5, "step 28")).splitlines() == [
         "mosaic: 50% step 28, 75 s left"
     ]

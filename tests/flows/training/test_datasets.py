@@ -9,8 +9,8 @@ import pytest
 import scipy.io
 from PIL import Image
 
-from flows.training.data import load_data_set
-from pipeline.errors import SceneError
+from spectralzoom.flows.training.data import load_data_set
+from spectralzoom.pipeline.errors import SceneError
 from tests.flows.small_fields import write_field
 
 NUMBERS = ("003", "010", "021")

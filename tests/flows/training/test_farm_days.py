@@ -9,24 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.archive.reprocess_command import asked_again, newest_runs
-from flows.settings.load import parse_settings
-from flows.settings.survey_settings import Settings
-from flows.tasks.scene import farm_refusal, open_scene
-from flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
-from flows.training.observed_scenes import observe_scene
-from flows.training.train_scenes import TrainRequest, observe_all
-from models.network.spectral import SpectralBasis
-from models.training.examples import observe
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
-from pipeline.simulator.scenes.farm.land import sun_over_farm
-from pipeline.simulator.scenes.scene import RasterScene
-from storage.archive.archive import Archive
-from storage.archive.lineage import Catalogue
+from spectralzoom.flows.archive.reprocess_command import asked_again, newest_runs
+from spectralzoom.flows.settings.load import parse_settings
+from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
+from spectralzoom.flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
+from spectralzoom.flows.training.observed_scenes import observe_scene
+from spectralzoom.flows.training.train_scenes import TrainRequest, observe_all
+from spectralzoom.models.network.spectral import SpectralBasis
+from spectralzoom.models.training.examples import observe
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
+from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.lineage import Catalogue
 
 BANDS = (20, 60, 110, 160, 210, 250)
 
@@ -136,7 +136,7 @@ def test_training_scenes_have_the_effects_of_the_rig(bands: tuple[int, ...]) -> 
 def test_a_farm_larger_than_the_memory_is_refused(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine with the measured bytes of a survey is too small; 10 % more suffice."""
     for there, refused in ((measured, True), (1.1 * measured, False)):
-        monkeypatch.setattr("flows.tasks.scene.machine_bytes", lambda there=there: int(there))
+        monkeypatch.setattr("spectralzoom.flows.tasks.scene.machine_bytes", lambda there=there: int(there))
         assert (farm_refusal(_settings(size=size)) is not None) == refused
 
 
@@ -147,9 +147,9 @@ def test_each_scene_has_a_noise_stream_of_its_own(monkeypatch: pytest.MonkeyPatc
     def imaged(scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: Any) -> None:
         streams.append(rng.bit_generator.state["state"]["state"])
 
-    monkeypatch.setattr("flows.training.train_scenes.observe_scene", imaged)
-    monkeypatch.setattr("flows.training.train_scenes.trained_pixels", lambda scene: np.ones(1, bool))
-    monkeypatch.setattr("flows.training.train_scenes.only_class", lambda scene: None)
+    monkeypatch.setattr("spectralzoom.flows.training.train_scenes.observe_scene", imaged)
+    monkeypatch.setattr("spectralzoom.flows.training.train_scenes.trained_pixels", lambda scene: np.ones(1, bool))
+    monkeypatch.setattr("spectralzoom.flows.training.train_scenes.only_class", lambda scene: None)
     data = open_training_data("farm", 2, 2, LineCamera())
     observe_all(TrainRequest("farm", Path()), data, lambda what, done, figure: None)
     assert len(set(streams)) == len(streams) == 4

@@ -15,26 +15,26 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from flows.cli.main import main
-from flows.cli.model_verbs import TrainFlags
-from flows.settings.load import load_settings
-from flows.tasks.run import open_run
-from flows.training import figures, train_scenes
-from flows.training import train as flow
-from flows.training.data import TrainingData
-from flows.training.figures import judge_baselines
-from flows.training.train import run_train, train_weights
-from flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
-from models.evaluation.metrics import mean_iou
-from models.network.spectral import SpectralBasis
-from models.policies.placement import ReadTwice
-from models.training.examples import Example
-from models.training.train import TrainingSettings
-from models.weights.files import TrainedOn, describe_weights, load_weights
-from pipeline.errors import SceneError, SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.cli.model_verbs import TrainFlags
+from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.training import figures, train_scenes
+from spectralzoom.flows.training import train as flow
+from spectralzoom.flows.training.data import TrainingData
+from spectralzoom.flows.training.figures import judge_baselines
+from spectralzoom.flows.training.train import run_train, train_weights
+from spectralzoom.flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
+from spectralzoom.models.evaluation.metrics import mean_iou
+from spectralzoom.models.network.spectral import SpectralBasis
+from spectralzoom.models.policies.placement import ReadTwice
+from spectralzoom.models.training.examples import Example
+from spectralzoom.models.training.train import TrainingSettings
+from spectralzoom.models.weights.files import TrainedOn, describe_weights, load_weights
+from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-import flows.training.train_temporal as remember
-from flows.cli.model_verbs import TrainFlags, run_training
-from flows.tasks.survey_model import shipped_weights
-from flows.training.train_temporal import TemporalRequest, _moments, run_remember, train_temporal
-from models.evaluation.metrics import confusion, mean_iou
-from models.network.sizes import TemporalSizes
-from models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
-from models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
-from models.weights.files import describe_weights, load_reader
-from pipeline.errors import SettingsError
-from pipeline.simulator.render import USUAL
+import spectralzoom.flows.training.train_temporal as remember
+from spectralzoom.flows.cli.model_verbs import TrainFlags, run_training
+from spectralzoom.flows.tasks.survey_model import shipped_weights
+from spectralzoom.flows.training.train_temporal import TemporalRequest, _moments, run_remember, train_temporal
+from spectralzoom.models.evaluation.metrics import confusion, mean_iou
+from spectralzoom.models.network.sizes import TemporalSizes
+from spectralzoom.models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
+from spectralzoom.models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
+from spectralzoom.models.weights.files import describe_weights, load_reader
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.simulator.render import USUAL
 from tests.conftest import QUIET
 
 QUICK = TemporalTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
@@ -77,7 +77,8 @@ def test_visit_days_are_in_order() -> None:
 
 def test_the_command_trains_and_writes_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reader belongs to the given weights; its record has seeds, settings and validation on another land."""
-    monkeypatch.setattr("flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)  # choosing takes seconds
+    # choosing takes seconds
+    monkeypatch.setattr("spectralzoom.flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)
     monkeypatch.setattr(remember, "VISITS", 2)
     for name, value in {"JUDGED_AFTER": (3,), "JUDGED_LANDS": 1, "SHAPE": (64, 96)}.items():
         monkeypatch.setattr(remember, name, value)

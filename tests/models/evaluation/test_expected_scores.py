@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.evaluation.expected_scores import (
+from spectralzoom.models.evaluation.expected_scores import (
     LEAST_ERROR,
     MapScores,
     ScoredMap,
@@ -16,7 +16,7 @@ from models.evaluation.expected_scores import (
     expected_score,
     fitted_bias,
 )
-from models.evaluation.metrics import confusion, iou_per_class, mean_iou
+from spectralzoom.models.evaluation.metrics import confusion, iou_per_class, mean_iou
 
 CLASSES = 4
 PLAIN = (LEAST_ERROR, 1, 100.0)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.evaluation import metrics
-from pipeline.errors import ShapeError
+from spectralzoom.models.evaluation import metrics
+from spectralzoom.pipeline.errors import ShapeError
 
 PAIRS = st.lists(st.tuples(st.sampled_from([0, 1, 2, 3, 255]), st.integers(0, 3)), max_size=60)
 

@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.machine import choose_device
-from models.network.segmenter import ChannelNorm, cut
-from models.network.spectral import LineSpec
-from models.reading.inference import overview_of, patch_logits
-from models.training.examples import Batch
-from models.training.objective import PHASES, draw_patches
-from models.weights.files import Weights
-from pipeline.errors import SettingsError
+from spectralzoom.models.network.machine import choose_device
+from spectralzoom.models.network.segmenter import ChannelNorm, cut
+from spectralzoom.models.network.spectral import LineSpec
+from spectralzoom.models.reading.inference import overview_of, patch_logits
+from spectralzoom.models.training.examples import Batch
+from spectralzoom.models.training.objective import PHASES, draw_patches
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.errors import SettingsError
 from tests.models.conftest import make_weights, scene_columns
 
 

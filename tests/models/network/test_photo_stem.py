@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from models.network.photo_stem import NormedConv, PhotoStem
-from models.network.segmenter import Segmenter
-from models.network.sizes import PLANES, SegmenterConfig
-from models.weights.files import load_encoder, load_weights, save_weights
+from spectralzoom.models.network.photo_stem import NormedConv, PhotoStem
+from spectralzoom.models.network.segmenter import Segmenter
+from spectralzoom.models.network.sizes import PLANES, SegmenterConfig
+from spectralzoom.models.weights.files import load_encoder, load_weights, save_weights
 from tests.models.conftest import make_weights
 
 

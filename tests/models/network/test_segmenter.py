@@ -10,12 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from models.network.layers import AROUND_PX, mean_around
-from models.network.segmenter import Head, Segmenter, Stem, cut, joined
-from models.network.sizes import CELL_PX, PLANES, TOKEN_PX, SegmenterConfig, TemporalSizes, level_widths, multiply_adds
-from models.network.temporal_reader import TemporalReader
-from models.policies.policies import score_multiply_adds
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.layers import AROUND_PX, mean_around
+from spectralzoom.models.network.segmenter import Head, Segmenter, Stem, cut, joined
+from spectralzoom.models.network.sizes import (
+    CELL_PX,
+    PLANES,
+    TOKEN_PX,
+    SegmenterConfig,
+    TemporalSizes,
+    level_widths,
+    multiply_adds,
+)
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.policies.policies import score_multiply_adds
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import make_network, noise, read_both
 
 IMAGE = noise(0, 1, 4 + PLANES, 64, 96)  # 2 x 3 tokens, 8 x 12 patches

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.spectral import LineSpec, Normalisation, SpectralBasis, band_widths
+from spectralzoom.models.network.spectral import LineSpec, Normalisation, SpectralBasis, band_widths
 
 BASIS = SpectralBasis(400.0, 1000.0, 24)
 BANDS = st.lists(st.sampled_from(range(400, 1001, 3)), min_size=1, max_size=40)  # repeats are likely

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from models.evaluation.metrics import confusion
-from models.policies import placement
-from models.reading.inference import coarse_prediction_of_columns, segment
-from models.weights.files import Weights
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.evaluation.metrics import confusion
+from spectralzoom.models.policies import placement
+from spectralzoom.models.reading.inference import coarse_prediction_of_columns, segment
+from spectralzoom.models.weights.files import Weights
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import make_weights, scene_columns
 
 

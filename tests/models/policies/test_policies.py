@@ -8,9 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models.policies.policies import LEAST_FRACTION, POLICIES, class_errors, gain_of, pixel_entropy, score_patches
-from models.reading.inference import CoarsePrediction
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.policies.policies import (
+    LEAST_FRACTION,
+    POLICIES,
+    class_errors,
+    gain_of,
+    pixel_entropy,
+    score_patches,
+)
+from spectralzoom.models.reading.inference import CoarsePrediction
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 
 def _coarse_prediction(height: int = 32, width: int = 48, patch: int = 8) -> CoarsePrediction:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.reading.expected_errors import PatchExpectedErrors, expected_error_of
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.reading.expected_errors import PatchExpectedErrors, expected_error_of
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 GRID = SceneGrid(8, 12, 4)
 

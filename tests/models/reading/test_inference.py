@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.sizes import TOKEN_PX
-from models.network.spectral import LineSpec, with_planes
-from models.reading import inference
-from models.weights.files import Weights, with_record
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.sizes import TOKEN_PX
+from spectralzoom.models.network.spectral import LineSpec, with_planes
+from spectralzoom.models.reading import inference
+from spectralzoom.models.weights.files import Weights, with_record
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import make_weights, noise, plain_weights, read_both, scene_columns
 
 NM = np.linspace(400, 1000, 9)

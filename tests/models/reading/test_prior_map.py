@@ -12,10 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-import models.reading.prior_map as prior_map
-from models.network.sizes import CELL_PX, TemporalSizes
-from models.network.temporal_reader import TemporalReader
-from models.reading.prior_map import ClassProbabilities, CurrentVisit, PriorMap, carried, first_probabilities, fuse
+import spectralzoom.models.reading.prior_map as prior_map
+from spectralzoom.models.network.sizes import CELL_PX, TemporalSizes
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.reading.prior_map import (
+    ClassProbabilities,
+    CurrentVisit,
+    PriorMap,
+    carried,
+    first_probabilities,
+    fuse,
+)
 
 CLASSES, COLUMNS = 3, 4
 SHAPE = (24, 20)

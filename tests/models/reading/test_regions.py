@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from models.network.sizes import PLANES, TOKEN_PX, SegmenterConfig
-from models.reading.regions import REGION_PX, Box, plan_regions, region_bytes
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.sizes import PLANES, TOKEN_PX, SegmenterConfig
+from spectralzoom.models.reading.regions import REGION_PX, Box, plan_regions, region_bytes
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 SHARD = (64, 640)
 FIELDS = [(700, 1300, 16), (2561, 90, 32), (1000, 2000, 8), (64, 641, 16), (300, 1500, 64)]

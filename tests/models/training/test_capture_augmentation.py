@@ -12,10 +12,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.spectral import LineSpec, Normalisation, SpectralBasis
-from models.training import capture_augmentation
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, SceneSpectra, rows_between
-from pipeline.geometry.camera import LineCamera, expose
+from spectralzoom.models.network.spectral import LineSpec, Normalisation, SpectralBasis
+from spectralzoom.models.training import capture_augmentation
+from spectralzoom.models.training.capture_augmentation import (
+    CaptureAugmentation,
+    ColumnNoise,
+    SceneSpectra,
+    rows_between,
+)
+from spectralzoom.pipeline.geometry.camera import LineCamera, expose
 
 BANDS = np.linspace(400.0, 1000.0, 60)
 MATRIX, _ = SpectralBasis(400.0, 1000.0, 12).matrix(BANDS)

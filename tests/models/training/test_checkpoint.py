@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.sizes import SegmenterConfig
-from models.training.examples import Example
-from models.training.train import TrainingSettings, run_identity, train
-from models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from pipeline.errors import WeightsError
+from spectralzoom.models.network.sizes import SegmenterConfig
+from spectralzoom.models.training.examples import Example
+from spectralzoom.models.training.train import TrainingSettings, run_identity, train
+from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
+from spectralzoom.pipeline.errors import WeightsError
 from tests.models.conftest import killed_after
 
 CONFIG = SegmenterConfig(classes=2, columns=2, patch=8, width=8, dim=16, layers=1, heads=2)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.sizes import PLANES
-from models.network.spectral import Normalisation, SpectralBasis
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
-from models.training.examples import CropSampler, Example, observe
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from spectralzoom.models.network.sizes import PLANES
+from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
+from spectralzoom.models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
+from spectralzoom.models.training.examples import CropSampler, Example, observe
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 
 CAMERA = LineCamera(bits=14)
 NM = np.linspace(450, 950, 6)

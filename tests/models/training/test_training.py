@@ -8,17 +8,25 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.segmenter import Segmenter
-from models.network.sizes import PLANES, SegmenterConfig
-from models.network.spectral import LineSpec, Normalisation
-from models.reading.inference import map_of_columns
-from models.training import train as training
-from models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
-from models.training.examples import CropSampler
-from models.training.objective import PHASES, Phase, batch_loss, class_weights, draw_patches, map_loss, pixel_losses
-from models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train
-from pipeline.errors import SceneError
-from pipeline.geometry.grid import SceneGrid
+from spectralzoom.models.network.segmenter import Segmenter
+from spectralzoom.models.network.sizes import PLANES, SegmenterConfig
+from spectralzoom.models.network.spectral import LineSpec, Normalisation
+from spectralzoom.models.reading.inference import map_of_columns
+from spectralzoom.models.training import train as training
+from spectralzoom.models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
+from spectralzoom.models.training.examples import CropSampler
+from spectralzoom.models.training.objective import (
+    PHASES,
+    Phase,
+    batch_loss,
+    class_weights,
+    draw_patches,
+    map_loss,
+    pixel_losses,
+)
+from spectralzoom.models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import block_example, make_weights, read_both
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, width=8, dim=16, layers=1, heads=2)

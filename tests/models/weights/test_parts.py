@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from models.evaluation.expected_scores import MapScores
-from models.network.sizes import TemporalSizes
-from models.network.temporal_reader import TemporalReader
-from models.weights import files
-from pipeline.errors import WeightsError
+from spectralzoom.models.evaluation.expected_scores import MapScores
+from spectralzoom.models.network.sizes import TemporalSizes
+from spectralzoom.models.network.temporal_reader import TemporalReader
+from spectralzoom.models.weights import files
+from spectralzoom.pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
 
 SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)

@@ -12,9 +12,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from models.weights.checksummed_files import SEAL, TENSORS, _seal, hash_of
-from models.weights.files import FORMAT, describe_weights, load_weights, save_weights
-from pipeline.errors import WeightsError
+from spectralzoom.models.weights.checksummed_files import SEAL, TENSORS, _seal, hash_of
+from spectralzoom.models.weights.files import FORMAT, describe_weights, load_weights, save_weights
+from spectralzoom.pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from pipeline.source import Line
+from spectralzoom.pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.source import Line
 from tests.pipeline.simulator.small_scenes import image_scene
 
 CAMERA = replace(LineCamera(), samples=64)

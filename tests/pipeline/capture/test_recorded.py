@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.recorded import RecordedSweep, nearest_line
-from pipeline.errors import NotRecordedError
-from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.source import References
+from spectralzoom.pipeline.capture.recorded import RecordedSweep, nearest_line
+from spectralzoom.pipeline.errors import NotRecordedError
+from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
+from spectralzoom.pipeline.source import References
 from tests.pipeline.capture.recordings import CAMERA, FULL, Counted, assert_same, record, recorded_source, simulated
 
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.capture.recorded import RecordedSweep
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Sweep
-from pipeline.rectify.region import mosaic_rows
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from pipeline.source import SweepLines
+from spectralzoom.pipeline.capture.recorded import RecordedSweep
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.rectify.region import mosaic_rows
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.source import SweepLines
 from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source
 from tests.pipeline.simulator.small_scenes import image_scene
 

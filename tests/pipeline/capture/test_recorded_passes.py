@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.capture.recorded_passes import RecordedPasses
-from pipeline.errors import NotRecordedError, SceneError
-from pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.errors import NotRecordedError, SceneError
+from spectralzoom.pipeline.geometry.scan import Sweep
 from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source, simulated
 
 COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -45.5, 23, step=4)

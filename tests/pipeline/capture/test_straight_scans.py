@@ -9,13 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.straight_scans import angles_to_positions, covered_field, fit_sweep, flat_camera
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
-from pipeline.geometry.scan import CostModel, Sweep, line_positions, points_of_scan, scan_positions, shifted_position
-from pipeline.planning.coverage import cheapest_full
+from spectralzoom.pipeline.capture.straight_scans import angles_to_positions, covered_field, fit_sweep, flat_camera
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
+from spectralzoom.pipeline.geometry.scan import (
+    CostModel,
+    Sweep,
+    line_positions,
+    points_of_scan,
+    scan_positions,
+    shifted_position,
+)
+from spectralzoom.pipeline.planning.coverage import cheapest_full
 
 CAMERA = LineCamera()
 

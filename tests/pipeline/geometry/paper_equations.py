@@ -11,9 +11,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry import mirror
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import points_of_scan
+from spectralzoom.pipeline.geometry import mirror
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import points_of_scan
 
 LineModel = Literal["L0", "L1", "L2", "L3", "L4"]
 LINE_MODELS: tuple[LineModel, ...] = get_args(LineModel)

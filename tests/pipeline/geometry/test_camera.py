@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera, digitise, expose, footprint, footprint_kernel
+from spectralzoom.pipeline.geometry.camera import LineCamera, digitise, expose, footprint, footprint_kernel
 
 CAMERA = LineCamera()
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ShapeError
-from pipeline.geometry.grid import SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.geometry.grid import SceneGrid, pad_by_reflection
 
 sizes = st.integers(1, 200)
 

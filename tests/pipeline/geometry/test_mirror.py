@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError
-from pipeline.geometry.mirror import (
+from spectralzoom.pipeline.errors import PoseError, SettingsError
+from spectralzoom.pipeline.geometry.mirror import (
     Axes,
     Mounting,
     camera_slope,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.geometry import mirror
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
+from spectralzoom.pipeline.geometry import mirror
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
 from tests.pipeline.geometry.paper_equations import (
     LINE_MODELS,
     line_points,

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import (
+from spectralzoom.pipeline.errors import PoseError, SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from spectralzoom.pipeline.geometry.scan import (
     CostModel,
     Sweep,
     exposing,

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import (
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground.field_places import (
     NoPlace,
     PlacedPicture,
     PosedField,
@@ -18,9 +18,9 @@ from pipeline.ground.field_places import (
     footprint_of,
     scale_of_view,
 )
-from pipeline.ground.georeference import pixel_rows_m2
-from pipeline.ground.map_grid import ground_grid
-from pipeline.ground.view import GroundView, RigPose, pixel_places
+from spectralzoom.pipeline.ground.georeference import pixel_rows_m2
+from spectralzoom.pipeline.ground.map_grid import ground_grid
+from spectralzoom.pipeline.ground.view import GroundView, RigPose, pixel_places
 from tests.pipeline.ground.test_view import view
 
 SHAPE = (600, 30)  # more rows than one block holds

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.geometry.grid import SceneGrid, patch_pixels
-from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, zoomed_out
+from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
+from spectralzoom.pipeline.ground.georeference import pixel_rows_m2, pixel_side_m, zoomed_out
 
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
 PLACES |= {6933: (8.0, 51.0), 3413: (0.0, 90.0)}  # stretched to equal areas; a corner at the pole

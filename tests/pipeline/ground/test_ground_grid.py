@@ -9,10 +9,10 @@ import pytest
 from odc.geo.geobox import GeoBox
 from pyproj import Proj
 
-from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground import map_grid
-from pipeline.ground.field_places import PosedField
-from pipeline.ground.view import pixel_places
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.ground import map_grid
+from spectralzoom.pipeline.ground.field_places import PosedField
+from spectralzoom.pipeline.ground.view import pixel_places
 from tests.pipeline.ground.test_view import view
 
 

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import CRS, Geod, Proj
 
-from pipeline.errors import PoseError
-from pipeline.ground.map_grid import MapFrame, default_epsg
-from pipeline.ground.view import GroundView, RigPose, pixel_places
-from pipeline.setting_fields import span_of
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.ground.map_grid import MapFrame, default_epsg
+from spectralzoom.pipeline.ground.view import GroundView, RigPose, pixel_places
+from spectralzoom.pipeline.setting_fields import span_of
 
 IFOV = 7.4e-3 / 70
 SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.geometry.grid import SceneGrid
-from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
-from pipeline.ground.map_grid import ground_grid
-from pipeline.ground.view import GroundView, RigPose
-from pipeline.ground.zones import figures_of_plot, on_field, patch_means, pixels_inside
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
+from spectralzoom.pipeline.ground.map_grid import ground_grid
+from spectralzoom.pipeline.ground.view import GroundView, RigPose
+from spectralzoom.pipeline.ground.zones import figures_of_plot, on_field, patch_means, pixels_inside
 
 SHAPE = (60, 80)
 corners = st.lists(st.tuples(st.floats(-20, 100), st.floats(-20, 80)), min_size=3, max_size=8)

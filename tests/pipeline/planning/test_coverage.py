@@ -11,12 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
-from pipeline.planning.coverage import cheapest_full, full_sweeps, on_scene, reach_px, uniform_sweeps, with_margin
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
+from spectralzoom.pipeline.planning.coverage import (
+    cheapest_full,
+    full_sweeps,
+    on_scene,
+    reach_px,
+    uniform_sweeps,
+    with_margin,
+)
 
 CAMERA = LineCamera()
 COST = CostModel()

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import full_sweeps, patches_shown
-from pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth, lines_between
-from pipeline.planning.uniform_scans import MIOU, ScanPerformance
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import CostModel
+from spectralzoom.pipeline.planning.coverage import full_sweeps, patches_shown
+from spectralzoom.pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth, lines_between
+from spectralzoom.pipeline.planning.uniform_scans import MIOU, ScanPerformance
 
 CAMERA = LineCamera(samples=320)
 COST = CostModel()

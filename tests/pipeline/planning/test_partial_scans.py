@@ -9,12 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel, exposing, scene_to_sweep
-from pipeline.planning.coverage import full_sweeps, lines_showing, patches_shown, sweeps_over, uniform_sweeps
-from pipeline.planning.partial_scans import (
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, CostModel, exposing, scene_to_sweep
+from spectralzoom.pipeline.planning.coverage import (
+    full_sweeps,
+    lines_showing,
+    patches_shown,
+    sweeps_over,
+    uniform_sweeps,
+)
+from spectralzoom.pipeline.planning.partial_scans import (
     PartialScan,
     PatchRows,
     RunTimes,

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import BudgetError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel
-from pipeline.planning.coverage import full_sweeps, on_scene, uniform_sweeps
-from pipeline.planning.uniform_scans import (
+from spectralzoom.pipeline.errors import BudgetError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import CostModel
+from spectralzoom.pipeline.planning.coverage import full_sweeps, on_scene, uniform_sweeps
+from spectralzoom.pipeline.planning.uniform_scans import (
     LOSS,
     MIOU,
     REFERENCE_LOSS,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.evaluation.metrics import stratified_fractions
-from pipeline.errors import SettingsError, WavelengthError
-from pipeline.products.indices import find_index, index_values, pick_bands, white_level
+from spectralzoom.models.evaluation.metrics import stratified_fractions
+from spectralzoom.pipeline.errors import SettingsError, WavelengthError
+from spectralzoom.pipeline.products.indices import find_index, index_values, pick_bands, white_level
 
 FINE_NM = np.arange(400.0, 1000.0, 5.0)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_position, scene_to_direction
-from pipeline.geometry.scan import Axis
-from pipeline.rectify.geolocation import path_geolocation
-from pipeline.rectify.scan_paths import ScanPath, line_centres
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_position, scene_to_direction
+from spectralzoom.pipeline.geometry.scan import Axis
+from spectralzoom.pipeline.rectify.geolocation import path_geolocation
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath, line_centres
 
 CAMERA = LineCamera()
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Axis, Sweep
-from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
-from pipeline.rectify.placed import PixelGrid
-from pipeline.rectify.resample import resample
-from pipeline.signal.calibrate import calibrate
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Axis, Sweep
+from spectralzoom.pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
+from spectralzoom.pipeline.rectify.placed import PixelGrid
+from spectralzoom.pipeline.rectify.resample import resample
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rectify.aiming import geolocation
 from tests.pipeline.simulator.small_scenes import effects_on, made_scene
 

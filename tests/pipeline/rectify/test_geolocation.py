@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
-from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.geolocation import path_geolocation
-from pipeline.rectify.placed import tie_table
-from pipeline.rectify.resample import resample
-from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
+from spectralzoom.pipeline.geometry.scan import points_of_scan
+from spectralzoom.pipeline.rectify.geolocation import path_geolocation
+from spectralzoom.pipeline.rectify.placed import tie_table
+from spectralzoom.pipeline.rectify.resample import resample
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from tests.pipeline.rectify.aiming import CAMERA, aim, geolocation
 
 GRID: dict[str, Any] = {"origin_px": (-20.0, 2250.0), "spacing_px": 1.0, "shape": (170, 700)}

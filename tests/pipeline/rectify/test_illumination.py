@@ -8,17 +8,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Sweep
-from pipeline.planning.coverage import full_sweeps
-from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import mosaic_tile
-from pipeline.rectify.registration.illumination import LightRatio, light_ratio, overlap_light, solve_lights
-from pipeline.rectify.registration.overlaps import Window
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, Sweep
+from spectralzoom.pipeline.planning.coverage import full_sweeps
+from spectralzoom.pipeline.rectify.placed import PixelGrid, place
+from spectralzoom.pipeline.rectify.region import mosaic_tile
+from spectralzoom.pipeline.rectify.registration.illumination import LightRatio, light_ratio, overlap_light, solve_lights
+from spectralzoom.pipeline.rectify.registration.overlaps import Window
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import effects_on
 
 WAVELENGTH = np.linspace(400, 1000, 31)

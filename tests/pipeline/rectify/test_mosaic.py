@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
-from pipeline.signal.lines import LineCache
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
+from spectralzoom.pipeline.signal.lines import LineCache
 
 LINES, SAMPLES, BANDS = 300, 100, 2
 

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Sweep, points_of_scan, sweep_to_scene
-from pipeline.once import Once
-from pipeline.planning.coverage import full_sweeps, uniform_sweeps
-from pipeline.rectify.registration.alignment import no_shifts
-from pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows
-from pipeline.rectify.registration.seams import Registration, place_images, register_sweeps
-from pipeline.signal.lines import broad_bands
-from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import SceneRadiance, raster_from_values
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, Sweep, points_of_scan, sweep_to_scene
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.planning.coverage import full_sweeps, uniform_sweeps
+from spectralzoom.pipeline.rectify.registration.alignment import no_shifts
+from spectralzoom.pipeline.rectify.registration.overlaps import BroadSweep, PlacedImage, overlap_windows
+from spectralzoom.pipeline.rectify.registration.seams import Registration, place_images, register_sweeps
+from spectralzoom.pipeline.signal.lines import broad_bands
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import SceneRadiance, raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import effects_on, seen_at
 
 CAMERA = LineCamera(samples=160)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.rectify.registration.alignment import SweepShift, WindowShift, pair_shift, solve_sweeps
+from spectralzoom.pipeline.rectify.registration.alignment import SweepShift, WindowShift, pair_shift, solve_sweeps
 from tests.pipeline.rectify.made_views import row_views, wave_views
 
 SIZE = (120, 150)

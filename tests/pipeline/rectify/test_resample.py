@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.rectify.kernels import Kernel, kernel_taps
-from pipeline.rectify.resample import BLOCK_PX, merge_lines, resample
+from spectralzoom.pipeline.rectify.kernels import Kernel, kernel_taps
+from spectralzoom.pipeline.rectify.resample import BLOCK_PX, merge_lines, resample
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError
-from pipeline.rectify.scan_paths import judge_stamps, line_centres, make_scan_paths
+from spectralzoom.pipeline.errors import PoseError
+from spectralzoom.pipeline.rectify.scan_paths import judge_stamps, line_centres, make_scan_paths
 from tests.pipeline.rectify.aiming import CAMERA, aim
 
 STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.planning.fine_pass import every_nth, lines_between
-from pipeline.rectify.placed import PixelGrid
-from pipeline.rectify.sweep_paths import capture_numbers, interlaced_paths, sweep_paths
-from pipeline.signal.components import Components
-from pipeline.source import References
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
+from spectralzoom.pipeline.planning.fine_pass import every_nth, lines_between
+from spectralzoom.pipeline.rectify.placed import PixelGrid
+from spectralzoom.pipeline.rectify.sweep_paths import capture_numbers, interlaced_paths, sweep_paths
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.source import References
 
 CAMERA = LineCamera()
 SCALE = 8  # steps of a stored score per pixel along the scan

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.rectify.kernels import kernel_taps
-from pipeline.rectify.mosaic import cut_runs
-from pipeline.rectify.placed import PixelGrid, PlacedSweep, ScanPathReach, place
-from pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
-from pipeline.signal.lines import LineCache
-from pipeline.source import References
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
+from spectralzoom.pipeline.rectify.kernels import kernel_taps
+from spectralzoom.pipeline.rectify.mosaic import cut_runs
+from spectralzoom.pipeline.rectify.placed import PixelGrid, PlacedSweep, ScanPathReach, place
+from spectralzoom.pipeline.rectify.region import cache_bytes, mosaic_tile, plan_tiles
+from spectralzoom.pipeline.signal.lines import LineCache
+from spectralzoom.pipeline.source import References
 
 CAMERA = LineCamera(samples=160)
 TURNED = Sweep("turned", "fine", "x", -4700.0, 2990.0, 200)  # lines lie at about 30 degrees to the grid's rows
@@ -112,7 +112,7 @@ def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch
     """The shortest possible windows give the same values as one window for the whole tile."""
     grid = PixelGrid(CORNER, 1, (40, 140))
     whole = in_tiles(two_turned(None), grid, grid.shape)
-    monkeypatch.setattr("pipeline.rectify.mosaic.RUN_ELEMENTS", 0)
+    monkeypatch.setattr("spectralzoom.pipeline.rectify.mosaic.RUN_ELEMENTS", 0)
     for one, other in zip(whole, in_tiles(two_turned(None), grid, grid.shape), strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 
-from pipeline.rig.fakes import FakeClock
-from pipeline.rig.transports import Clock
+from spectralzoom.pipeline.rig.fakes import FakeClock
+from spectralzoom.pipeline.rig.transports import Clock
 
 
 class Incoming:

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.camera.camera_files import Capture, Kept, KeptInMemory, Progress
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.drivers import RigDevices
-from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from pipeline.rig.rig_source import RigSource
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import raster_from_values
-from pipeline.simulator.simulated import SimulatedSource
-from pipeline.source import Line
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
+from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, KeptInMemory, Progress
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.drivers import RigDevices
+from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
+from spectralzoom.pipeline.rig.rig_source import RigSource
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import Line
 from tests.pipeline.simulator.small_scenes import effects_on
 
 CAMERA = LineCamera(samples=48)

@@ -12,8 +12,8 @@ from io import FileIO
 
 import pytest
 
-from pipeline.errors import SettingsError
-from pipeline.rig.transports import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, SerialTransport
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, SerialTransport
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are of POSIX systems")
 

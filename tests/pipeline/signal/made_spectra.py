@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.signal.components import Components
-from pipeline.signal.condense import ResidualLaw, ScoredLines, find_rare, score_lines
-from pipeline.signal.subspace import SignalStatistics
-from pipeline.source import References
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import ResidualLaw, ScoredLines, find_rare, score_lines
+from spectralzoom.pipeline.signal.subspace import SignalStatistics
+from spectralzoom.pipeline.source import References
 
 CAMERA = LineCamera(samples=64)
 DARK = 64  # DN

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError, RigError, ShapeError
-from pipeline.geometry.mirror import mirror_throughput
-from pipeline.signal.calibrate import calibrate, find_bad_elements, full_scale_notes
-from pipeline.source import References
+from spectralzoom.pipeline.errors import PoseError, RigError, ShapeError
+from spectralzoom.pipeline.geometry.mirror import mirror_throughput
+from spectralzoom.pipeline.signal.calibrate import calibrate, find_bad_elements, full_scale_notes
+from spectralzoom.pipeline.source import References
 
 
 def reflectance(raw: NDArray[np.uint16], references: References, position: object = None) -> NDArray[np.float32]:

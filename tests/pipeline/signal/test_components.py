@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.components import Components
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, poisson
 
-from pipeline.signal.components import Components
-from pipeline.signal.condense import (
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import (
     PARTIAL,
     RESIDUAL_STEP,
     UNUSABLE,
@@ -20,7 +20,7 @@ from pipeline.signal.condense import (
     score_lines,
     whole_steps,
 )
-from pipeline.signal.subspace import SignalStatistics, components_of_field, find_components
+from spectralzoom.pipeline.signal.subspace import SignalStatistics, components_of_field, find_components
 from tests.pipeline.signal.made_spectra import Field, field_of, marked, restored, scored, statistics_of
 
 SEEDS = st.integers(0, 2**32 - 1)

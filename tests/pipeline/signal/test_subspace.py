@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from scipy.stats import binom
 
-from pipeline.signal.subspace import (
+from spectralzoom.pipeline.signal.subspace import (
     SMALL_FIELD,
     SUMS,
     SignalStatistics,

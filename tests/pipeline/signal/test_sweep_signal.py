@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.signal.calibrate import calibrate
-from pipeline.signal.components import Components
-from pipeline.signal.condense import (
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import (
     RESIDUAL_STEP,
     UNUSABLE,
     CondensedSweep,
@@ -20,9 +20,9 @@ from pipeline.signal.condense import (
     differing_lines,
     whole_steps,
 )
-from pipeline.signal.lines import BLOCK_LINES
-from pipeline.signal.subspace import SignalStatistics, find_components
-from pipeline.source import Line
+from spectralzoom.pipeline.signal.lines import BLOCK_LINES
+from spectralzoom.pipeline.signal.subspace import SignalStatistics, find_components
+from spectralzoom.pipeline.source import Line
 from tests.pipeline.signal.made_spectra import CAMERA, MadeLines, field_of, raw_of
 
 SHAPE = (150, 40)

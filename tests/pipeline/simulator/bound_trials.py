@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import scipy
 
-from pipeline.simulator.effects.effect import OFF, Effect, Radiance
-from pipeline.simulator.effects.line import SLIT, SMEAR
-from pipeline.simulator.effects.probe import noise_electrons
-from pipeline.simulator.optics.scene_radiance import TABULATED
-from pipeline.simulator.render import EFFECTS, READOUT, expected_light
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.options import SAFETY, list_options
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect, Radiance
+from spectralzoom.pipeline.simulator.effects.line import SLIT, SMEAR
+from spectralzoom.pipeline.simulator.effects.probe import noise_electrons
+from spectralzoom.pipeline.simulator.optics.scene_radiance import TABULATED
+from spectralzoom.pipeline.simulator.render import EFFECTS, READOUT, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.selection.options import SAFETY, list_options
 from tests.pipeline.simulator.random_cases import Case
 from tests.pipeline.simulator.small_scenes import leave_slit_unmeasured
 

@@ -8,10 +8,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import OFF, Bound, Radiance, SweepBlock
-from pipeline.simulator.effects.probe import GainRange, Probe
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Bound, Radiance, SweepBlock
+from spectralzoom.pipeline.simulator.effects.probe import GainRange, Probe
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 SWEEP = Sweep("fine-0", "fine", "x", 0.0, -50.0, 100)
 RIG = Rig()

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.rig_model import Air, Rig, Sky
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.rig_model import Air, Rig, Sky
 
 Floats = NDArray[np.float64]
 WAVELENGTH = np.linspace(400.0, 1000.0, 61)

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import j1
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import position_to_normal
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE, keystone_shift
-from pipeline.simulator.effects.effect import Effect
-from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
-from pipeline.simulator.effects.probe import noise_electrons
-from pipeline.simulator.optics.rays import RayViews, exact_views
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import sweep_block
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import position_to_normal
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE, keystone_shift
+from spectralzoom.pipeline.simulator.effects.effect import Effect
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
+from spectralzoom.pipeline.simulator.effects.probe import noise_electrons
+from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Optics, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]

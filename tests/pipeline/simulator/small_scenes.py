@@ -12,13 +12,13 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.once import Once
-from pipeline.simulator.effects.counting import GAUSSIAN, SHOT
-from pipeline.simulator.effects.pointing import PointingErrors
-from pipeline.simulator.render import BY_NAME, EFFECTS, Choice
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
-from pipeline.simulator.selection import survey_probe
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.effects.counting import GAUSSIAN, SHOT
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.pipeline.simulator.render import BY_NAME, EFFECTS, Choice
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
+from spectralzoom.pipeline.simulator.selection import survey_probe
 
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:

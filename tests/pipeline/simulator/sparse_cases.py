@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from pipeline.geometry.scan import Sweep
-from pipeline.once import Once
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from tests.pipeline.simulator.random_cases import Case, random_rig
 
 Floats = NDArray[np.float64]

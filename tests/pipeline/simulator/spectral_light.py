@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.probe import Probe, Unit, steepest_difference
-from pipeline.simulator.rig_model import Optics, Rig
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.probe import Probe, Unit, steepest_difference
+from spectralzoom.pipeline.simulator.rig_model import Optics, Rig
 
 Floats = NDArray[np.float64]
 Radiance = NDArray[np.float32]

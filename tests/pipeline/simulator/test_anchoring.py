@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Sweep
-from pipeline.rectify.registration.overlaps import BroadSweep
-from pipeline.rectify.registration.seams import Anchor, anchor_sweep
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.scan import Axis, Sweep
+from spectralzoom.pipeline.rectify.registration.overlaps import BroadSweep
+from spectralzoom.pipeline.rectify.registration.seams import Anchor, anchor_sweep
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import CommonOffset, effects_on, image_scene, seen_at
 
 CAMERA = LineCamera(samples=96)

@@ -11,17 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.geometry.scan import Sweep
-from pipeline.once import Once
-from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
-from pipeline.simulator.optics.kernel_fit import Moments
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air, Optics, Rig
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
-from pipeline.simulator.simulated import sweep_block
+from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Moments
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Optics, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 SIZE = 96

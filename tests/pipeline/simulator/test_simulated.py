@@ -12,16 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep, line_positions
-from pipeline.signal.calibrate import calibrate
-from pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
-from pipeline.simulator.effects.spectrometer import PRNU, STRIPING
-from pipeline.simulator.rig_model import Detector, Rig, Sky
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block, sweep_starts
-from pipeline.source import Source
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, line_positions
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.simulator.effects.counting import SHOT, dark_electrons, dead_elements, hot_electrons
+from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, STRIPING
+from spectralzoom.pipeline.simulator.rig_model import Detector, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block, sweep_starts
+from spectralzoom.pipeline.source import Source
 from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 CAMERA = LineCamera()

@@ -17,14 +17,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
-from pipeline.geometry.scan import Sweep
-from storage.archive import manifests, staging
-from storage.archive.archive import Archive
-from storage.archive.keys import canonical_json, stage_key
-from storage.archive.manifests import check_files, read_table
-from storage.archive.staging import take_lock
-from storage.maintenance.verification import verify_everything
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.storage.archive import manifests, staging
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import canonical_json, stage_key
+from spectralzoom.storage.archive.manifests import check_files, read_table
+from spectralzoom.storage.archive.staging import take_lock
+from spectralzoom.storage.maintenance.verification import verify_everything
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -250,7 +250,9 @@ def test_releasing_a_lock_twice_keeps_the_next_holders_lock(tmp_path: Path) -> N
 
 def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files that a killed run of the same second and name left are not published with the next run."""
-    monkeypatch.setattr("storage.archive.archive.datetime", Mock(now=lambda zone: datetime(2026, 5, 1, tzinfo=UTC)))
+    monkeypatch.setattr(
+        "spectralzoom.storage.archive.archive.datetime", Mock(now=lambda zone: datetime(2026, 5, 1, tzinfo=UTC))
+    )
     left = tmp_path / "runs" / "20260501T000000-a.part"
     left.mkdir(parents=True)
     (left / "torn.bin").write_bytes(b"x")

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import ArchiveError
-from storage.archive import lineage
-from storage.archive.archive import Archive
-from storage.archive.keys import in_text
-from storage.archive.records import Run
-from storage.maintenance.verification import verify_everything
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.storage.archive import lineage
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import in_text
+from spectralzoom.storage.archive.records import Run
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.storage.small_archive import flip, rewrite, small_survey
 
 

@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import ArchiveError
-from storage.archive.archive import Archive
-from storage.archive.staging import PART_SUFFIX
-from storage.maintenance.garbage import clear_up
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.staging import PART_SUFFIX
+from spectralzoom.storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import problems, small_survey
 
 ROOT = Path(__file__).parents[3]
 KILL_EVERYWHERE = """
 import os, shutil, sys
 from pathlib import Path
-from storage.archive.archive import Archive
+from spectralzoom.storage.archive.archive import Archive
 from tests.faults.injection import end_at, logged_calls
 from tests.storage.small_archive import small_survey
 

@@ -12,12 +12,12 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.scan import Sweep
-from pipeline.source import Line, References
-from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.arrays.georeference import AngularGrid
-from storage.arrays.mosaics import Attention, open_mosaic, write_attention
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.source import Line, References
+from spectralzoom.storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.arrays.mosaics import Attention, open_mosaic, write_attention
 from tests.storage.plain_mosaic import plain_writer, write_values
 
 GRID = AngularGrid(1.057e-4, (100, 70))

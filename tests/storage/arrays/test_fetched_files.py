@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.rig.transports import NotKept
-from storage.arrays.spool import SUMS, FetchedFiles
+from spectralzoom.pipeline.rig.transports import NotKept
+from spectralzoom.storage.arrays.spool import SUMS, FetchedFiles
 from tests.storage.small_archive import flip
 
 
@@ -67,7 +67,7 @@ def test_a_full_disk_keeps_earlier_bytes(tmp_path: Path, name: str, monkeypatch:
             return write(file, bytes(data)[:2])
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("storage.arrays.spool.os.write", full)
+    monkeypatch.setattr("spectralzoom.storage.arrays.spool.os.write", full)
     with pytest.raises(NotKept, match=rf"cannot keep byte 5 of {name} .*the disk is full.*the 5 bytes before"):
         kept.append(name, b"torn")
     assert kept.read(name, 0, 99) == b"whole"

@@ -11,12 +11,12 @@ import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_position, scene_to_direction
-from pipeline.rectify.placed import TieTable, tie_table
-from pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from storage.arrays.geolocation import open_geolocation, path_digest, write_geolocation
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_position, scene_to_direction
+from spectralzoom.pipeline.rectify.placed import TieTable, tie_table
+from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
+from spectralzoom.storage.arrays.geolocation import open_geolocation, path_digest, write_geolocation
 
 CAMERA = LineCamera()
 

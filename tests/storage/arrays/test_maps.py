@@ -12,12 +12,18 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
-from pipeline.geometry.grid import UNLABELLED
-from storage.arrays import class_maps
-from storage.arrays.georeference import ON_THE_MAP, AngularGrid, load_geobox, map_attributes, map_coordinates
-from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
-from storage.arrays.layout import (
+from spectralzoom.pipeline.errors import IncompleteStoreError, PoseError, ShapeError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.arrays import class_maps
+from spectralzoom.storage.arrays.georeference import (
+    ON_THE_MAP,
+    AngularGrid,
+    load_geobox,
+    map_attributes,
+    map_coordinates,
+)
+from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
+from spectralzoom.storage.arrays.layout import (
     NO_CLASS,
     SHARD_COLUMNS,
     SHARD_ROWS,

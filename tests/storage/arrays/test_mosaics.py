@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from storage.arrays.georeference import AngularGrid
-from storage.arrays.mosaics import MosaicWriter, open_mosaic
+from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.arrays.mosaics import MosaicWriter, open_mosaic
 from tests.storage.plain_mosaic import plain_writer, write_values
 
 Stored = tuple[Path, NDArray[np.float32]]

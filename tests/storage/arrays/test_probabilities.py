@@ -10,9 +10,9 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.reading.prior_map import FAINTEST as FAINTEST_BELIEVED
-from pipeline.errors import IncompleteStoreError
-from storage.arrays import class_maps
+from spectralzoom.models.reading.prior_map import FAINTEST as FAINTEST_BELIEVED
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.storage.arrays import class_maps
 
 LEGEND = class_maps.ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
 SHAPE = (70, 50)

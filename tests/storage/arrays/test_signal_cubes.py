@@ -12,16 +12,16 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.mirror import mirror_throughput
-from pipeline.signal.calibrate import calibrate
-from pipeline.signal.components import Components
-from pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
-from pipeline.signal.subspace import SignalStatistics, find_components
-from storage.arrays import signal_cubes
-from storage.arrays.cubes import SweepHeader
-from storage.arrays.layout import LARGEST_SHORT, read_array
-from storage.readers.recordings import RESTORED, open_recording
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.pipeline.geometry.mirror import mirror_throughput
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.signal.condense import RESIDUAL_STEP, CondensedSweep, Condenser, ResidualLaw, differing_lines
+from spectralzoom.pipeline.signal.subspace import SignalStatistics, find_components
+from spectralzoom.storage.arrays import signal_cubes
+from spectralzoom.storage.arrays.cubes import SweepHeader
+from spectralzoom.storage.arrays.layout import LARGEST_SHORT, read_array
+from spectralzoom.storage.readers.recordings import RESTORED, open_recording
 from tests.pipeline.signal.made_spectra import CAMERA, DARK, GAIN, MadeLines, field_of, raw_of
 from tests.storage.small_archive import flip
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import RigError
-from pipeline.source import Line
-from storage.arrays.spool import Spool
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.source import Line
+from spectralzoom.storage.arrays.spool import Spool
 from tests.storage.small_archive import flip
 
 HEADER = {"sweep": "fine-0", "seed": 3, "start_px": -40.25}

@@ -17,11 +17,11 @@ import rasterio
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import ArchiveError
-from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import ClassNames
-from storage.arrays.georeference import AngularGrid
-from storage.export.image_files import CogImage, angular_geobox, write_cog
+from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.storage.arrays.class_maps import ClassNames
+from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.export.image_files import CogImage, angular_geobox, write_cog
 from tests.storage.export.stac_rules import is_cog
 
 LEGEND = ClassNames(("sugar beet", "soil & stones", "maïs"), np.array([[9, 200, 30], [120, 90, 60], [0, 0, 255]], "u1"))

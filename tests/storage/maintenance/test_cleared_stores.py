@@ -9,12 +9,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive import manifests
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.archive.records import read_store
-from storage.maintenance.garbage import clear_up
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
+from spectralzoom.storage.archive import manifests
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.archive.records import read_store
+from spectralzoom.storage.maintenance.garbage import clear_up
 from tests.storage.small_archive import problems, small_survey
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import SettingsError
-from storage.archive.archive import Archive
-from storage.maintenance.garbage import IN_USE, Clearance, Removal, clear_up, plan_clearance
-from storage.maintenance.verification import verify_everything
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.maintenance.garbage import IN_USE, Clearance, Removal, clear_up, plan_clearance
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.storage.small_archive import flip, grow_old, make_store, problems, small_survey
 
 
@@ -105,7 +105,7 @@ def test_gc_does_not_report_a_failed_removal(tmp_path: Path, archive: Archive, m
     """The disk refuses the removal; the next gc tries again."""
     (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
     with monkeypatch.context() as broken:
-        broken.setattr("storage.archive.archive.remove_tree", lambda path: None)
+        broken.setattr("spectralzoom.storage.archive.archive.remove_tree", lambda path: None)
         assert clear_up(archive).removals == ()
     assert [removal.uri for removal in clear_up(archive).removals] == ["stages/segment/aaaa.part"]
 

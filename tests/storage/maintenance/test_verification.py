@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import IncompleteStoreError
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
-from storage.maintenance.verification import verify_everything
+from spectralzoom.pipeline.errors import IncompleteStoreError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
+from spectralzoom.storage.maintenance.verification import verify_everything
 from tests.storage.small_archive import flip, small_survey
 
 

@@ -18,9 +18,9 @@ from unittest.mock import Mock
 import pytest
 from dask.distributed import LocalCluster
 
-from pipeline.errors import SettingsError, ShapeError, WorkerError
-from storage.parallel import pool as pool_module
-from storage.parallel.pool import WorkerPool, run_blocks
+from spectralzoom.pipeline.errors import SettingsError, ShapeError, WorkerError
+from spectralzoom.storage.parallel import pool as pool_module
+from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
 
 ROOT = Path(__file__).parents[3]
 # dask does not close its handshake with a worker that dies
@@ -218,9 +218,9 @@ def test_no_block_writes_after_an_error_is_raised(tmp_path: Path, processes: Wor
 GONE = """
 import subprocess, sys, time
 from contextlib import suppress
-from pipeline.errors import PipelineError, WorkerError
-from storage.parallel import pool as pool_module
-from storage.parallel.pool import WorkerPool, run_blocks
+from spectralzoom.pipeline.errors import PipelineError, WorkerError
+from spectralzoom.storage.parallel import pool as pool_module
+from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
 from tests.storage.parallel.test_block_work import nap
 
 def dask(*words):
@@ -275,7 +275,7 @@ INTERRUPTED = """
 import signal, sys, time
 from functools import partial
 from pathlib import Path
-from storage.parallel.pool import WorkerPool, run_blocks
+from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
 from tests.storage.parallel.test_block_work import touch_slowly
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.envi_headers import parse_envi_header
-from pipeline.errors import SceneError
-from storage.readers.envi_files import load_envi_header, open_envi_cube
-from storage.readers.open_cubes import open_cube
+from spectralzoom.pipeline.envi_headers import parse_envi_header
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.envi_files import load_envi_header, open_envi_cube
+from spectralzoom.storage.readers.open_cubes import open_cube
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
 AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}

@@ -17,10 +17,10 @@ import rioxarray  # noqa: F401 - registers the accessor that writes a place
 import xarray as xr
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, WavelengthError
-from storage.readers.cube_sources import read_by_chunks
-from storage.readers.open_cubes import open_cube
-from storage.readers.scene_files import load_scene_file
+from spectralzoom.pipeline.errors import SceneError, WavelengthError
+from spectralzoom.storage.readers.cube_sources import read_by_chunks
+from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.scene_files import load_scene_file
 from tests.storage.readers.test_raster_tags import write as write_bands
 
 RNG = np.random.default_rng(5)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from pipeline.rig.camera.frame_indices import times_of_lines
-from storage.readers.envi_files import load_frame_index
-from storage.readers.open_cubes import open_cube
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.rig.camera.frame_indices import times_of_lines
+from spectralzoom.storage.readers.envi_files import load_frame_index
+from spectralzoom.storage.readers.open_cubes import open_cube
 from tests.storage.readers.test_envi_cubes import write_envi
 
 DROPPED = "1 frames between the first and the last were dropped by the camera"

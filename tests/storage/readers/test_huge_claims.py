@@ -19,8 +19,8 @@ import scipy.io
 import tifffile
 from PIL import Image
 
-from pipeline.errors import SceneError
-from storage.readers.open_cubes import load_labels_array, open_cube
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.open_cubes import load_labels_array, open_cube
 
 FEW = 8 << 20  # bytes: what libraries take when they are first used
 

@@ -11,10 +11,10 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from flows.training.data import load_data_set
-from flows.training.init_command import draft_scene
-from pipeline.errors import SceneError
-from storage.readers.scene_files import load_scene_file, open_scene_file
+from spectralzoom.flows.training.data import load_data_set
+from spectralzoom.flows.training.init_command import draft_scene
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.scene_files import load_scene_file, open_scene_file
 from tests.storage.readers.test_raster_tags import write as write_bands
 
 WEST = 600_000.0

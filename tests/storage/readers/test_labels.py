@@ -11,8 +11,8 @@ import scipy.io
 import skimage
 from PIL import Image
 
-from pipeline.errors import SceneError
-from storage.readers.labels import DEFAULT_COLOURS, class_colours, load_labels
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.labels import DEFAULT_COLOURS, class_colours, load_labels
 
 COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 

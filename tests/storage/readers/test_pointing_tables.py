@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import SceneError
-from pipeline.geometry.mirror import REST_TANGENT, Mounting, direction_to_scene, position_to_direction
-from storage.readers.recorded_files import find_pointing, load_pointing_table
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.mirror import REST_TANGENT, Mounting, direction_to_scene, position_to_direction
+from spectralzoom.storage.readers.recorded_files import find_pointing, load_pointing_table
 
 MIRROR = "line,time,mirror_x,mirror_y\n0,0.05,0.1,0\n1,0.15,0.2,0\n2,0.25,0.3,0\n"
 

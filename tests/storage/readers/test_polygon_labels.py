@@ -12,10 +12,10 @@ import rasterio
 import shapely
 from affine import Affine
 
-from flows.training.data import load_data_set
-from flows.training.init_command import draft_scene, run_init
-from pipeline.errors import SceneError
-from storage.readers.scene_files import load_scene_file
+from spectralzoom.flows.training.data import load_data_set
+from spectralzoom.flows.training.init_command import draft_scene, run_init
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.scene_files import load_scene_file
 from tests.conftest import QUIET
 from tests.storage.readers.test_raster_tags import write
 

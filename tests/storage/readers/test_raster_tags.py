@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from PIL import Image
 from rasterio.control import GroundControlPoint
 
-from pipeline.setting_fields import numbers_of
-from storage.readers.image_files import bad_bands
-from storage.readers.scene_files import bands_text, load_scene_file
+from spectralzoom.pipeline.setting_fields import numbers_of
+from spectralzoom.storage.readers.image_files import bad_bands
+from spectralzoom.storage.readers.scene_files import bands_text, load_scene_file
 
 PLACE = Affine(0.5, 0, 400_000, 0, -0.5, 5_700_000)
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)

@@ -11,9 +11,9 @@ import pytest
 import rasterio
 from affine import Affine
 
-from pipeline.errors import SceneError
-from storage.readers.open_cubes import open_cube
-from storage.readers.scene_files import load_scene_file, open_scene_file
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.scene_files import load_scene_file, open_scene_file
 from tests.storage.readers.test_raster_tags import write
 
 REVERSIBLE = {"QUALITY": "100", "REVERSIBLE": "YES"}

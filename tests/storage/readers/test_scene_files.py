@@ -13,9 +13,9 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.errors import SceneError, WavelengthError
-from storage.readers.image_files import ALPHA_NOTE
-from storage.readers.scene_files import load_scene_file
+from spectralzoom.pipeline.errors import SceneError, WavelengthError
+from spectralzoom.storage.readers.image_files import ALPHA_NOTE
+from spectralzoom.storage.readers.scene_files import load_scene_file
 
 NM = [450.0, 550.0, 650.0, 800.0, 900.0]
 

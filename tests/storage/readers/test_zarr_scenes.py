@@ -14,12 +14,12 @@ import xarray as xr
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from pipeline.geometry.scan import Sweep
-from pipeline.source import Line, References
-from storage.arrays.cubes import RawCubeWriter, SweepHeader
-from storage.readers.open_cubes import open_cube
-from storage.readers.scene_files import load_scene_file
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.source import Line, References
+from spectralzoom.storage.arrays.cubes import RawCubeWriter, SweepHeader
+from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.scene_files import load_scene_file
 from tests.storage.readers.test_huge_claims import Trap
 
 NM = np.array([450.0, 550.0, 650.0, 800.0, 900.0])
@@ -186,6 +186,6 @@ def test_coordinates_with_huge_claims_are_refused(tmp_path: Path, cube: NDArray[
 def test_chunks_must_fit_into_memory(tmp_path: Path, cube: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks are read whole, so the memory for a few lines is compared with the machine's."""
     zarr.create_array(tmp_path / "a.zarr", data=cube, chunks=cube.shape)
-    monkeypatch.setattr("storage.readers.cube_sources.machine_bytes", lambda: cube.nbytes - 1)
+    monkeypatch.setattr("spectralzoom.storage.readers.cube_sources.machine_bytes", lambda: cube.nbytes - 1)
     with pytest.raises(SceneError, match="reading it takes about"):
         open_cube(tmp_path / "a.zarr")

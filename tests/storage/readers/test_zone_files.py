@@ -10,8 +10,8 @@ import geopandas
 import pytest
 import shapely
 
-from pipeline.errors import ZoneError
-from storage.readers.polygons import read_zones
+from spectralzoom.pipeline.errors import ZoneError
+from spectralzoom.storage.readers.polygons import read_zones
 
 SQUARE, OTHER = shapely.box(0, 0, 10, 10), shapely.box(20, 0, 25, 10)
 BOWTIE = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])

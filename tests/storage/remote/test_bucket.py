@@ -9,14 +9,14 @@ import pytest
 
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
-from flows.cli.main import main
-from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.maintenance.garbage import clear_up
-from storage.maintenance.verification import verify_everything
-from storage.remote.bucket import Copied, pull, push
-from storage.remote.objects import Objects, UnreachableError, answers_of, parse_place
+from spectralzoom.flows.cli.main import main
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.maintenance.garbage import clear_up
+from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.remote.bucket import Copied, pull, push
+from spectralzoom.storage.remote.objects import Objects, UnreachableError, answers_of, parse_place
 from tests.storage.small_archive import small_survey
 
 

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError
-from pipeline.geometry.grid import cuts
-from pipeline.simulator.scenes.farm.land import (
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.simulator.scenes.farm.land import (
     CROPS,
     ROWS_AT_ONCE,
     YEAR_DAYS,
@@ -31,8 +31,8 @@ from pipeline.simulator.scenes.farm.land import (
     sun_over_farm,
     visible_area,
 )
-from pipeline.simulator.scenes.farm.spectra import MATERIALS, MOISTURE_EXPONENT
-from pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.simulator.scenes.farm.spectra import MATERIALS, MOISTURE_EXPONENT
+from spectralzoom.pipeline.simulator.scenes.scratch import scratch
 
 _COLOURS = {
     "soil": (158, 119, 82),

@@ -29,10 +29,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import cuts
-from pipeline.once import Once
-from pipeline.simulator.scenes.farm.farm_plan import (
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import (
     CLASS_COLOURS,
     CLASSES,
     Canvas,
@@ -43,8 +43,8 @@ from pipeline.simulator.scenes.farm.farm_plan import (
     farm_plan,
     grass,
 )
-from pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
-from pipeline.simulator.scenes.farm.land import (
+from spectralzoom.pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
+from spectralzoom.pipeline.simulator.scenes.farm.land import (
     ROWS_AT_ONCE,
     Band,
     Points,
@@ -57,9 +57,13 @@ from pipeline.simulator.scenes.farm.land import (
     smooth_noise,
     stream,
 )
-from pipeline.simulator.scenes.farm.spectra import WHITE_REFERENCE_REFLECTANCE, band_centres, spectral_library
-from pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster
-from pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.simulator.scenes.farm.spectra import (
+    WHITE_REFERENCE_REFLECTANCE,
+    band_centres,
+    spectral_library,
+)
+from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.simulator.scenes.scratch import scratch
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW = "farm@2"

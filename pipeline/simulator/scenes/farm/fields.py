@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulator.scenes.farm.farm_plan import (
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import (
     TWINS,
     UNEVEN_DAYS,
     FieldPlan,
@@ -21,7 +21,7 @@ from pipeline.simulator.scenes.farm.farm_plan import (
     grass,
     moist_soil,
 )
-from pipeline.simulator.scenes.farm.land import (
+from spectralzoom.pipeline.simulator.scenes.farm.land import (
     YEAR_DAYS,
     Crop,
     Field,

@@ -22,9 +22,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import SceneError
-from pipeline.geometry.grid import cuts
-from pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.grid import cuts
+from spectralzoom.pipeline.simulator.scenes.scratch import scratch
 
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]

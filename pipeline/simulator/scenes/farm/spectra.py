@@ -22,9 +22,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import WavelengthError
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scenes.daylight import clear_sky
+from spectralzoom.pipeline.errors import WavelengthError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.scenes.daylight import clear_sky
 
 Spectrum = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from pipeline.rig.camera import camera_files
-from pipeline.rig.device_settings import FileServer
+from spectralzoom.pipeline.rig.camera import camera_files
+from spectralzoom.pipeline.rig.device_settings import FileServer
 
 
 @dataclass

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.errors import RigError, ShapeError
-from pipeline.rig.camera.camera_cubes import (
+from spectralzoom.pipeline.errors import RigError, ShapeError
+from spectralzoom.pipeline.rig.camera.camera_cubes import (
     as_references,
     cube_lines,
     mean_frame,

@@ -7,13 +7,13 @@ import socket
 import numpy as np
 import pytest
 
-from pipeline.errors import RigError
-from pipeline.rig.camera import camera_files
-from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FileServer
-from pipeline.rig.fakes import FakeClock
-from pipeline.rig.transports import DeviceGone, DeviceRefused, SocketTransport
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.rig.camera import camera_files
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files, log_in
+from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
+from spectralzoom.pipeline.rig.device_settings import FileServer
+from spectralzoom.pipeline.rig.fakes import FakeClock
+from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, SocketTransport
 from tests.pipeline.rig.camera.scripted_files import ScriptedFiles, served
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 

@@ -7,12 +7,12 @@ from contextlib import contextmanager
 
 import pytest
 
-from pipeline.errors import RigError, SettingsError
-from pipeline.rig.camera import headwall_camera
-from pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
-from pipeline.rig.device_settings import FileServer, check_times
-from pipeline.rig.fakes import FakeClock
-from pipeline.rig.transports import DeviceRefused, StateUnknown
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.rig.camera import headwall_camera
+from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
+from spectralzoom.pipeline.rig.device_settings import FileServer, check_times
+from spectralzoom.pipeline.rig.fakes import FakeClock
+from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture_paths import CaptureRecord, LinePositions
-from pipeline.rig.capture_runner import JOURNAL, CaptureJournal
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.capture_paths import CaptureRecord, LinePositions
+from spectralzoom.pipeline.rig.capture_runner import JOURNAL, CaptureJournal
 from tests.faults.growing_files import flip_journal
 from tests.pipeline.rig.small_rig import COARSE, FINE
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.scan import Sweep
-from pipeline.rig import capture_paths
-from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.camera.frame_indices import LineTimes
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.rig import capture_paths
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
+from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import RigError
-from pipeline.geometry.scan import Sweep
-from pipeline.rig.capture_paths import FrameTimes, LinePositions, positions_by_time
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.rig.capture_paths import FrameTimes, LinePositions, positions_by_time
 
 LINES = 400
 PERIOD_MS = 10.0

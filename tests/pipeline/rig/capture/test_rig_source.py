@@ -8,15 +8,15 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from pipeline.errors import RigError, SettingsError
-from pipeline.geometry.mirror import Mounting, wire_positions
-from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.capture_runner import CaptureJournal
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from pipeline.rig.transports import DeviceRefused
-from pipeline.source import Line
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.geometry.mirror import Mounting, wire_positions
+from spectralzoom.pipeline.geometry.scan import Sweep, line_positions, sweep_positions
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.capture_runner import CaptureJournal
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
+from spectralzoom.pipeline.rig.transports import DeviceRefused
+from spectralzoom.pipeline.source import Line
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE, SmallRig, assert_simulated, simulated_lines, small_source
 
 

@@ -8,11 +8,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from pipeline.errors import RigError
-from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, KeptInMemory
-from pipeline.rig.capture_runner import JOURNAL
-from pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
-from pipeline.source import Line
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.rig.camera.camera_files import NOT_LOGGED_IN, KeptInMemory
+from spectralzoom.pipeline.rig.capture_runner import JOURNAL
+from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
+from spectralzoom.pipeline.source import Line
 from tests.pipeline.rig.small_rig import FINE, SmallRig, assert_simulated
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.mirror_controller import MirrorController
-from pipeline.rig.pro_mode import Frame, float_cell
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController
+from spectralzoom.pipeline.rig.pro_mode import Frame, float_cell
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
-from pipeline.rig import mirror_controller
-from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.mirror_controller import MirrorController, open_mirror
-from pipeline.rig.transports import DeadlinePassed, DeviceGone, StateUnknown
+from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError, ShapeError
+from spectralzoom.pipeline.rig import mirror_controller
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController, open_mirror
+from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceGone, StateUnknown
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport, scripted

@@ -6,10 +6,10 @@ from contextlib import nullcontext
 
 import pytest
 
-from pipeline.errors import RigError, SettingsError
-from pipeline.rig.mirror_controller import ProLink, ask_line, read_done, read_text
-from pipeline.rig.pro_mode import cell_int
-from pipeline.rig.transports import DeadlinePassed, DeviceRefused, Wire
+from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.rig.mirror_controller import ProLink, ask_line, read_done, read_text
+from spectralzoom.pipeline.rig.pro_mode import cell_int
+from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceRefused, Wire
 from tests.pipeline.rig.mirror.mirror_bytes import (
     CONNECT,
     ENTER,

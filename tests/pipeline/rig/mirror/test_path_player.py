@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, RigError, ShapeError
-from pipeline.geometry.mirror import wire_positions
-from pipeline.rig.fakes import FakeClock
-from pipeline.rig.mirror_controller import ProLink, frames_to_check, upload
-from pipeline.rig.pro_mode import Command, Frame, FrameReader, encode
-from pipeline.rig.transports import DeadlinePassed, Wire
+from spectralzoom.pipeline.errors import PoseError, RigError, ShapeError
+from spectralzoom.pipeline.geometry.mirror import wire_positions
+from spectralzoom.pipeline.rig.fakes import FakeClock
+from spectralzoom.pipeline.rig.mirror_controller import ProLink, frames_to_check, upload
+from spectralzoom.pipeline.rig.pro_mode import Command, Frame, FrameReader, encode
+from spectralzoom.pipeline.rig.transports import DeadlinePassed, Wire
 
 
 @given(st.floats(0, 1), st.floats(-7, 7))

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ShapeError
-from pipeline.rig import pro_mode as pro
+from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.pipeline.rig import pro_mode as pro
 from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 nasty = st.binary(max_size=50) | st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)

@@ -6,10 +6,10 @@ import logging
 
 import pytest
 
-from pipeline.errors import RigError
-from pipeline.rig import transports
-from pipeline.rig.fakes import FakeClock
-from pipeline.rig.transports import DeadlinePassed, DeviceGone, Kind, StateUnknown, Wire
+from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.rig import transports
+from spectralzoom.pipeline.rig.fakes import FakeClock
+from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceGone, Kind, StateUnknown, Wire
 from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 

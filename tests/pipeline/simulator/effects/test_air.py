@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from pipeline.geometry.mirror import scene_to_direction
-from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.simulator.effects.air import PARALLAX, TURBULENCE, WIND, closeness, sway_px, turbulence_px
-from pipeline.simulator.effects.effect import SweepBlock, survey_stream
-from pipeline.simulator.rig_model import Air, Rig
+from spectralzoom.pipeline.geometry.mirror import scene_to_direction
+from spectralzoom.pipeline.geometry.scan import Sweep, sweep_to_scene
+from spectralzoom.pipeline.simulator.effects.air import PARALLAX, TURBULENCE, WIND, closeness, sway_px, turbulence_px
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock, survey_stream
+from spectralzoom.pipeline.simulator.rig_model import Air, Rig
 from tests.pipeline.simulator.made_up_effects import steep_probe
 
 

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, defocus_px, keystone_shift
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import SLIT
-from pipeline.simulator.optics.kernel_fit import disc_contrast
-from pipeline.simulator.optics.rays import pupil_contrast
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air, Optics, Rig
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, defocus_px, keystone_shift
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import SLIT
+from spectralzoom.pipeline.simulator.optics.kernel_fit import disc_contrast
+from spectralzoom.pipeline.simulator.optics.rays import pupil_contrast
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Optics, Rig
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import made_scene
 

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.effects import counting
-from pipeline.simulator.effects.probe import Probe, Unit
-from pipeline.simulator.readout import read_out
-from pipeline.simulator.rig_model import Detector, Rig
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.effects import counting
+from spectralzoom.pipeline.simulator.effects.probe import Probe, Unit
+from spectralzoom.pipeline.simulator.readout import read_out
+from spectralzoom.pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of
 
 TOLERANCE = 0.1 / 1.2  # 0.1 sigma with the decision's factor of safety

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.special import j0, j1
 
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import SLIT
-from pipeline.simulator.optics.kernel_fit import Moments, fold
-from pipeline.simulator.optics.rays import pupil_contrast
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Optics, Rig
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import SLIT
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Moments, fold
+from spectralzoom.pipeline.simulator.optics.rays import pupil_contrast
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Optics, Rig
 from tests.pipeline.simulator.made_up_effects import SWEEP, steep_probe
 from tests.pipeline.simulator.pupil_reference import autocorrelation, distances, random_tile
 from tests.pipeline.simulator.small_scenes import made_scene

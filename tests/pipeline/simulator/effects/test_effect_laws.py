@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import pipeline.simulator.effects as package
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator import render as registry
-from pipeline.simulator.effects.effect import OFF, Bound, Effect
-from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.readout import read_out
-from pipeline.simulator.render import AIMS, BY_NAME, EFFECTS, FOOTPRINT, RAYS, expected_light
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import decide, list_effects
-from pipeline.simulator.selection.survey_probe import probe_scene
-from pipeline.simulator.simulated import sweep_block
+import spectralzoom.pipeline.simulator.effects as package
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator import render as registry
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Bound, Effect
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT
+from spectralzoom.pipeline.simulator.effects.probe import Probe
+from spectralzoom.pipeline.simulator.readout import read_out
+from spectralzoom.pipeline.simulator.render import AIMS, BY_NAME, EFFECTS, FOOTPRINT, RAYS, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.selection.choice import decide, list_effects
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.made_up_effects import even_probe
 from tests.pipeline.simulator.random_cases import random_case

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.coverage import full_sweeps
-from pipeline.simulator.effects.air import (
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.planning.coverage import full_sweeps
+from spectralzoom.pipeline.simulator.effects.air import (
     ABSORPTION,
     AIR_MASS_M,
     PATH_RADIANCE,
@@ -21,8 +21,8 @@ from pipeline.simulator.effects.air import (
     rayleigh_per_m,
     transmission,
 )
-from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
-from pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.simulator.rig_model import Air, Optics, Rig, Sky
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.outdoors import BANDS, WAVELENGTH, block_of, rig_with, white_e
 from tests.pipeline.simulator.small_scenes import image_scene, leave_slit_unmeasured
 

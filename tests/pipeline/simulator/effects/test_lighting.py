@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.simulator.effects.lighting import BRDF, CLOUD, EDGE_FRACTION, HOT_SPOT_RAD, shadow
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.effects.lighting import BRDF, CLOUD, EDGE_FRACTION, HOT_SPOT_RAD, shadow
+from spectralzoom.pipeline.simulator.rig_model import Rig
 from tests.pipeline.simulator.outdoors import SWEEP, block_of, rig_with
 
 

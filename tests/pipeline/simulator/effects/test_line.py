@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera, footprint_kernel
-from pipeline.geometry.mirror import position_to_direction
-from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, smeared_positions
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.geometry.camera import LineCamera, footprint_kernel
+from spectralzoom.pipeline.geometry.mirror import position_to_direction
+from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, smeared_positions
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.geometry.paper_equations import line_rotation
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.random_cases import random_case

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.pointing import LAG, beside_plan, responses, transient
-from pipeline.simulator.rig_model import MirrorMotion, Rig
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.pointing import LAG, beside_plan, responses, transient
+from spectralzoom.pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.made_up_effects import steep_probe
 
 SWEEP = Sweep("swath", "fine", "x", 0.0, -100.0, 200)

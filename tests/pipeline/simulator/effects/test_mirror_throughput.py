@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.mirror import mirror_throughput
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.lighting import POLARISATION, VIGNETTING, fresnel, reflectance
-from pipeline.simulator.rig_model import MirrorMotion, Rig
+from spectralzoom.pipeline.geometry.mirror import mirror_throughput
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.lighting import POLARISATION, VIGNETTING, fresnel, reflectance
+from spectralzoom.pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.simulator.spectral_light import probe_of, rig_with
 
 NM = np.linspace(400.0, 1000.0, 61)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.simulator.compiled_loops import draw_pairs, read_merged
-from pipeline.simulator.effects import counting
+from spectralzoom.pipeline.simulator.compiled_loops import draw_pairs, read_merged
+from spectralzoom.pipeline.simulator.effects import counting
 
 DRAWS = 200_000
 DARK_DN = 1000.0

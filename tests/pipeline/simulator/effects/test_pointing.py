@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect, wire_positions
-from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, sweep_to_scene
-from pipeline.simulator.effects.air import PARALLAX, WIND
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.pointing import (
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect, wire_positions
+from spectralzoom.pipeline.geometry.scan import Sweep, line_positions, points_of_scan, sweep_to_scene
+from spectralzoom.pipeline.simulator.effects.air import PARALLAX, WIND
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT
+from spectralzoom.pipeline.simulator.effects.pointing import (
     HYSTERESIS,
     JITTER,
     LAG,
@@ -26,10 +26,10 @@ from pipeline.simulator.effects.pointing import (
     pointing_field,
     tilt_to_scene,
 )
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
 SWEEP = Sweep("swath", "fine", "x", 0.0, -500.0, 1001)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.probe import (
+from spectralzoom.pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.probe import (
     GainRange,
     difference_rates,
     fixed_variance,
@@ -16,9 +16,9 @@ from pipeline.simulator.effects.probe import (
     rising_runs,
     steepest_difference,
 )
-from pipeline.simulator.optics.rays import pupil_contrast
-from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.selection.options import error_growth, light_after
+from spectralzoom.pipeline.simulator.optics.rays import pupil_contrast
+from spectralzoom.pipeline.simulator.rig_model import Optics, Rig
+from spectralzoom.pipeline.simulator.selection.options import error_growth, light_after
 from tests.pipeline.simulator.made_up_effects import RIG, even_probe
 
 NM = np.linspace(400.0, 1000.0, 25)

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.counting import (
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
     QUANTISATION,
@@ -23,9 +23,9 @@ from pipeline.simulator.effects.counting import (
     dead_elements,
     hot_electrons,
 )
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.readout import dark_frame, read_out
-from pipeline.simulator.rig_model import Detector, Rig
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.readout import dark_frame, read_out
+from spectralzoom.pipeline.simulator.rig_model import Detector, Rig
 
 SWEEP = Sweep("fine", "fine", "x", swath_px=0.0, start_px=-32.0, lines=64)
 BANDS = 20

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pipeline.simulator.effects import spectrometer
-from pipeline.simulator.rig_model import Detector, Rig
+from spectralzoom.pipeline.simulator.effects import spectrometer
+from spectralzoom.pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import SAMPLES, block_of, probe_of, random_light, rig_with, units, worst
 
 VARIANCE_OF_6 = 36 / (8 * np.log(2))

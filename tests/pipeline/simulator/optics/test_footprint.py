@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import quad
 
-from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.optics.kernel_fit import Moments, box_weight, disc_contrast, disc_points, fold
-from pipeline.simulator.optics.rays import REST_NORMAL, extreme_normals, middle_normal, spread_of_rays, spread_of_waves
-from pipeline.simulator.optics.scene_radiance import kernels_of
-from pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.geometry.mirror import direction_to_normal, scene_to_direction
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Moments, box_weight, disc_contrast, disc_points, fold
+from spectralzoom.pipeline.simulator.optics.rays import (
+    REST_NORMAL,
+    extreme_normals,
+    middle_normal,
+    spread_of_rays,
+    spread_of_waves,
+)
+from spectralzoom.pipeline.simulator.optics.scene_radiance import kernels_of
+from spectralzoom.pipeline.simulator.rig_model import Rig
 
 NONE = np.zeros(1)
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
-from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.optics.scene_radiance import SceneSampler, _Mixing
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
+from spectralzoom.pipeline.simulator.optics.rays import RayViews
+from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler, _Mixing
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.small_scenes import made_scene
 
 ROOT = Path(__file__).parents[4]

@@ -11,18 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.mirror import position_to_normal
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.compiled_loops import read_weights
-from pipeline.simulator.effects.blurs import ABERRATION, KEYSTONE
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.optics.kernel_fit import TapTable, blurred_weight, box_weight
-from pipeline.simulator.optics.rays import exact_views, middle_normal
-from pipeline.simulator.render import expected_light
-from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.mirror import position_to_normal
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.compiled_loops import read_weights
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT
+from spectralzoom.pipeline.simulator.optics.kernel_fit import TapTable, blurred_weight, box_weight
+from spectralzoom.pipeline.simulator.optics.rays import exact_views, middle_normal
+from spectralzoom.pipeline.simulator.render import expected_light
+from spectralzoom.pipeline.simulator.rig_model import Optics, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from tests.pipeline.simulator.small_scenes import image_scene, seen_at
 
 CAMERA = LineCamera()

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.simulator.scenes.farm.farm_plan import FieldPlan, farm_plan
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.farm.land import Parcel, clip_polygon, divide_land, parcel_pixels, polygon_area, stream
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import FieldPlan, farm_plan
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.farm.land import (
+    Parcel,
+    clip_polygon,
+    divide_land,
+    parcel_pixels,
+    polygon_area,
+    stream,
+)
 
 
 def test_parcels_cover_the_land_once() -> None:

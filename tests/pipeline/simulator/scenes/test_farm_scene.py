@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, WavelengthError
-from pipeline.geometry.camera import LineCamera
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES, farm_plan
-from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
-from pipeline.simulator.scenes.farm.spectra import MATERIALS
-from pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.errors import SceneError, WavelengthError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES, farm_plan
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
+from spectralzoom.pipeline.simulator.scenes.farm.spectra import MATERIALS
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 SIZE, LONG, WIDE = (420, 520), (400, 1000), (720, 1000)
 

@@ -7,10 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera, digitise
-from pipeline.simulator.scenes.farm.farm_scene import crown_shadows
-from pipeline.simulator.scenes.farm.land import CROPS, LATITUDE_DEG, Sun, land_on, stage_fractions, sun_over_farm
-from pipeline.simulator.scenes.farm.spectra import FWHM_NM, MATERIALS, band_centres, band_response, spectral_library
+from spectralzoom.pipeline.geometry.camera import LineCamera, digitise
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import crown_shadows
+from spectralzoom.pipeline.simulator.scenes.farm.land import (
+    CROPS,
+    LATITUDE_DEG,
+    Sun,
+    land_on,
+    stage_fractions,
+    sun_over_farm,
+)
+from spectralzoom.pipeline.simulator.scenes.farm.spectra import (
+    FWHM_NM,
+    MATERIALS,
+    band_centres,
+    band_response,
+    spectral_library,
+)
 
 
 @given(st.sampled_from(sorted(CROPS)), st.floats(-50, 350))

@@ -11,17 +11,17 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from pipeline.errors import SceneError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.once import Once
-from pipeline.simulator.rig_model import Sky
-from pipeline.simulator.scenes import scratch as scratch_module
-from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
-from pipeline.simulator.scenes.farm import farm_plan, land
-from pipeline.simulator.scenes.farm import farm_scene as farm_scene_module
-from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
-from pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.errors import SceneError, ShapeError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.rig_model import Sky
+from spectralzoom.pipeline.simulator.scenes import scratch as scratch_module
+from spectralzoom.pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
+from spectralzoom.pipeline.simulator.scenes.farm import farm_plan, land
+from spectralzoom.pipeline.simulator.scenes.farm import farm_scene as farm_scene_module
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
+from spectralzoom.pipeline.simulator.scenes.scratch import scratch
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from pipeline.errors import SceneError
-from pipeline.simulator.scenes.built_in import SCOUTED, built_in_scene, patches_of, scouting_plan, scouting_scene
-from pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.simulator.scenes.built_in import (
+    SCOUTED,
+    built_in_scene,
+    patches_of,
+    scouting_plan,
+    scouting_scene,
+)
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES
 from tests.pipeline.simulator.scenes.test_farm_scene import labels_of
 
 SIZE = (320, 400)

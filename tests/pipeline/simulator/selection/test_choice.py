@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import SettingsError
-from pipeline.simulator.effects.counting import READ_NOISE
-from pipeline.simulator.effects.lighting import CLOUD
-from pipeline.simulator.rig_model import Rig, Sky
-from pipeline.simulator.selection.choice import Decision, decide, list_effects, named_effects, sum_up
-from pipeline.simulator.selection.options import SAFETY, list_options
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.simulator.effects.counting import READ_NOISE
+from spectralzoom.pipeline.simulator.effects.lighting import CLOUD
+from spectralzoom.pipeline.simulator.rig_model import Rig, Sky
+from spectralzoom.pipeline.simulator.selection.choice import Decision, decide, list_effects, named_effects, sum_up
+from spectralzoom.pipeline.simulator.selection.options import SAFETY, list_options
 from tests.pipeline.simulator.made_up_effects import RIG, Brightening, MadeUp, Shift, even_probe
 
 PROBE = even_probe()

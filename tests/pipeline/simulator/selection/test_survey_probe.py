@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import SettingsError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT
-from pipeline.simulator.effects.probe import Probe, noise_electrons
-from pipeline.simulator.render import EFFECTS, expected_light
-from pipeline.simulator.rig_model import Detector, Rig
-from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.options import SAFETY, list_options
-from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT
+from spectralzoom.pipeline.simulator.effects.probe import Probe, noise_electrons
+from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Detector, Rig
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.selection.options import SAFETY, list_options
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
 from tests.pipeline.simulator.small_scenes import image_scene, leave_slit_unmeasured, made_scene
 
 RIG = Rig(camera=LineCamera(samples=96))

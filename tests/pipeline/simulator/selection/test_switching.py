@@ -9,16 +9,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.once import Once
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.probe import Probe, noise_electrons
-from pipeline.simulator.render import EFFECTS, expected_light
-from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
-from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.once import Once
+from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
+from spectralzoom.pipeline.simulator.effects.probe import Probe, noise_electrons
+from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import ROUNDING, misplaced_fraction
 from tests.pipeline.simulator.small_scenes import looking_at_less
 

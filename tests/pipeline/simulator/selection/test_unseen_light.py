@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
-from pipeline.simulator.rig_model import Optics, Rig
-from pipeline.simulator.selection import extrema
-from pipeline.simulator.selection.extrema import find_extrema
-from pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.simulator.rig_model import Optics, Rig
+from spectralzoom.pipeline.simulator.selection import extrema
+from spectralzoom.pipeline.simulator.selection.extrema import find_extrema
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import OTHERS, trials
 from tests.pipeline.simulator.random_cases import Case
 from tests.pipeline.simulator.small_scenes import image_scene, leave_slit_unmeasured
