@@ -1,4 +1,4 @@
-"""Define the survey as a Prefect flow: from raw sweeps to a class map and its receipt.
+"""The survey as a Prefect flow: from raw sweeps to a class map and its receipt.
 
     from spectralzoom.flows.settings.parameters import SurveySettings
     from spectralzoom.flows.survey import survey
@@ -7,26 +7,40 @@
         survey(SurveySettings(scene="farm", seconds=25))                          # once, now
         survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})   # every day at six
 
-Every step is a task that takes and returns addresses of stores, not arrays. Existing stores are not computed again, so
-that a stopped survey resumes. `survey.fn` runs the same steps without a server.
+Each stage is a task that takes and returns addresses of stores, not arrays. Existing stores are not computed again, so
+that a stopped survey resumes. `survey.fn` runs the same stages without a server.
 
 No ``from __future__ import annotations`` here: Prefect reads the signatures.
 """
 
+from dataclasses import replace
+from datetime import UTC, datetime
+
 from prefect import flow
 
-from spectralzoom.flows.publish.publishing import clear_raw, publish
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import SurveyPlan, plan_survey
+from spectralzoom.flows.products import Pass, Products
+from spectralzoom.flows.publish.publishing import RunRef, clear_first_mosaic, clear_raw, publish
 from spectralzoom.flows.settings.parameters import SurveySettings
-from spectralzoom.flows.tasks.captures import captured_signal, first_mosaic, plan_capture
-from spectralzoom.flows.tasks.open_survey import OpenSurvey, RunRef
-from spectralzoom.flows.tasks.stages.accuracy import evaluate
-from spectralzoom.flows.tasks.stages.attention import score
-from spectralzoom.flows.tasks.stages.condense import condense_raster
-from spectralzoom.flows.tasks.stages.effects import choose_effects
-from spectralzoom.flows.tasks.stages.maps import ground, segment
-from spectralzoom.flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
+from spectralzoom.flows.settings.survey_settings import RIG
+from spectralzoom.flows.settings.values import KEEP_RAW
+from spectralzoom.flows.stage import Stores
+from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse, capture_fine
+from spectralzoom.flows.stages.condense import condense_coarse, condense_fine, condense_raster
+from spectralzoom.flows.stages.effects import choose_effects
+from spectralzoom.flows.stages.evaluate import evaluate
+from spectralzoom.flows.stages.ground import ground
+from spectralzoom.flows.stages.locate import locate
+from spectralzoom.flows.stages.rectify import rectify, rectify_fine
+from spectralzoom.flows.stages.register import register_coarse, register_fine
+from spectralzoom.flows.stages.score import load_plan, score
+from spectralzoom.flows.stages.segment import segment
+from spectralzoom.flows.tasks.observer import current_observer, tidy_up
+from spectralzoom.flows.tasks.visit import settings_of_visit
 from spectralzoom.pipeline.errors import SurveyStopped
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.pipeline.planning.fine_pass import FinePlan
+from spectralzoom.storage.store import Archive, Ref
 
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
@@ -47,44 +61,188 @@ def survey(settings: SurveySettings) -> RunRef:
     ------
     PipelineError : what is wrong, what is allowed, and what to do.
     """
-    opened = plan_capture(settings)
-    with opened.at_work():
+    started = datetime.now(UTC)
+    observer = current_observer()
+    field = open_field(settings_of_visit(settings))
+    plan = plan_survey(replace(field, source=field.source.saying(observer.say)))
+    archive = Archive.open(plan.settings.out)
+    archive.reclaim()  # remove incomplete stores of killed runs
+    for note in plan.notes:
+        observer.note(note)
+    stores = Stores(archive, name=field.name, watch=observer.watch, log=observer.log, finish=tidy_up)
+    with archive.in_use(), plan.settings.pool.open(), field.source.to_oneself(observer.note):
         try:
-            draw_class_map(opened)
-            if opened.is_judged:
-                evaluate(opened, *opened.products.judged)
+            products = run_stages(stores, plan)
         except SurveyStopped as stopped:
-            return RunRef(stopped.uri, opened.run.archive.root / stopped.uri, stopped=stopped)
-        return clear_raw(opened, publish(opened))
+            return RunRef(stopped.uri, archive.root / stopped.uri, stopped=stopped)
+        clear_first_mosaic(archive, plan, products)
+        run = publish(stores, plan, products, started=started, note=observer.note)
+        return clear_raw(stores, plan, products, run, note=observer.note)
 
 
-def draw_class_map(opened: OpenSurvey) -> None:
-    """Run the stages from the first pass to the class map, and store their products in it."""
-    if opened.is_map:  # no capture
-        mosaic = condense_raster(opened)
-        opened.stop_after(mosaic, "capture", "mosaic")
-        class_map = segment(opened, mosaic, score(opened, mosaic))
+def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
+    """Run all stages of a survey, and return their stores. Raises SurveyStopped: the settings stop it before its map.
+
+    In a dry run, a store that is missing leaves open whether there is a second pass: then both are run.
+    """
+    field, settings = plan.field, plan.settings
+    effects, first, second = None, None, None
+    if field.raster is not None:  # no capture
+        mosaic = condense_raster(
+            stores,
+            scene=field.scene,
+            frame=field.frame,
+            signal=settings.signal,
+            raster=field.raster,
+            memory=settings.memory,
+        )
+        _stop_after(stores, plan, mosaic, "capture", "mosaic")
     else:
-        mosaic, class_map = _draw_captured(opened)
-    if opened.on_the_ground:
-        ground(opened, class_map, mosaic)
+        if field.source.simulates:
+            effects = choose_effects(
+                stores,
+                scene=field.scene,
+                rig=settings.simulated_rig,
+                sweeps=plan.typical,
+                cost=settings.cost,
+                asked=settings.effects,
+                tol=settings.tol,
+            )
+        first = _first_pass(stores, plan, effects)
+        mosaic = first.mosaic
+    attention = score(
+        stores,
+        mosaic,
+        gains=plan.gains,
+        second_pass=plan.second_pass,
+        scan_record=plan.scan_record,
+        scanned=plan.scanned,
+        budget=plan.budget,
+        least_gain=plan.least_gain,
+    )
+    if first is not None and not plan.passes.plain:
+        request = load_plan(attention) if stores.has(attention) else None
+        if request is None or request.sweeps:
+            second = _second_pass(stores, plan, effects, first, attention, request)
+            mosaic = second.mosaic
+        _stop_after(stores, plan, mosaic, "capture", "mosaic")
+    class_map = segment(
+        stores,
+        mosaic,
+        attention,
+        *(() if field.prior is None else field.prior.stores),
+        gains=plan.gains,
+        prior=field.prior,
+        reader=field.reader,
+        part=plan.part,
+        least_gain=plan.least_gain,
+    )
+    products = Products(
+        mosaic=mosaic, attention=attention, class_map=class_map, effects=effects, first=first, second=second
+    )
+    if field.ground_grid is not None:
+        products = replace(products, ground=ground(stores, class_map, mosaic, ground_grid=field.ground_grid))
+    if plan.is_judged:
+        accuracy = evaluate(
+            stores,
+            mosaic,
+            class_map,
+            None if first is None else first.seams,
+            gains=plan.gains,
+            labels=field.labels,
+            along=plan.passes.along,
+            pointing=field.simulated.pointing,
+            controls=plan.controls,
+        )
+        products = replace(products, accuracy=accuracy)
+    return products
 
 
-def _draw_captured(opened: OpenSurvey) -> tuple[StageRef, StageRef]:
-    """Capture the field in one or two passes, and segment it; return mosaic and class map."""
-    effects = choose_effects(opened)
-    signal = captured_signal(opened, "coarse", effects)
-    if opened.run.plan.plain:
-        opened.stop_after(signal, "capture")
-    seams = register_coarse(opened, signal) if opened.registers else None
-    mosaic = first_mosaic(opened, signal, locate(opened, signal, seams), seams)
-    if opened.run.plan.plain:  # no network has to choose a second pass
-        opened.stop_after(mosaic, "mosaic")
-    request = score(opened, mosaic)
-    if opened.goes_back(request):  # second pass
-        signal = captured_signal(opened, "fine", request, effects)
-        opened.stop_after(signal, "capture")
-        seams = register_fine(opened, signal, mosaic) if opened.registers else None
-        mosaic = rectify_fine(opened, signal, seams)
-    opened.stop_after(mosaic, "capture", "mosaic")
-    return mosaic, segment(opened, mosaic, request)
+def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
+    """Capture the first pass, or the uniform scan, and rectify it."""
+    field, settings = plan.field, plan.settings
+    raw = capture_coarse(
+        stores,
+        effects,
+        request=SweepRequest.of(plan.passes.coarse, field.camera, settings.cost),
+        light=field.light_key,
+        camera=field.camera,
+        bands=field.bands,
+        source=field.source,
+        pool=settings.pool,
+    )
+    _keep(stores, plan, raw)
+    signal = condense_coarse(stores, raw, camera=field.camera, signal=settings.signal)
+    if plan.passes.plain:
+        _stop_after(stores, plan, signal, "capture")
+    seams = None
+    if plan.registers:
+        wavelength_nm = field.scene.wavelength_nm
+        seams = register_coarse(
+            stores, signal, camera=field.camera, prior_px=settings.pointing_px, wavelength_nm=wavelength_nm
+        )
+    places = locate(stores, signal, seams, camera=field.camera, grid=field.grid)
+    mosaic = rectify(
+        stores,
+        signal,
+        places,
+        seams,
+        frame=field.frame,
+        camera=field.camera,
+        kernel=settings.resampling,
+        memory=settings.memory,
+        pool=settings.pool,
+    )
+    if plan.passes.plain:  # no network has to choose a second pass
+        _stop_after(stores, plan, mosaic, "mosaic")
+    return Pass(raw, signal, mosaic, seams, places)
+
+
+def _second_pass(
+    stores: Stores, plan: SurveyPlan, effects: Ref | None, first: Pass, attention: Ref, request: FinePlan | None
+) -> Pass:
+    """Capture the requested lines, and rectify both passes."""
+    field, settings = plan.field, plan.settings
+    sweeps = [] if request is None else request.sweeps
+    raw = capture_fine(
+        stores,
+        attention,
+        effects,
+        request=SweepRequest.of(sweeps, field.camera, settings.cost, after_s=plan.passes.coarse_s),
+        light=field.light_key,
+        camera=field.camera,
+        bands=field.bands,
+        source=field.source,
+        pool=settings.pool,
+    )
+    _keep(stores, plan, raw)
+    signal = condense_fine(stores, raw, first.raw, camera=field.camera, signal=settings.signal)
+    _stop_after(stores, plan, signal, "capture")
+    seams = None
+    if plan.registers:
+        prior_px = settings.pointing_px
+        seams = register_fine(stores, signal, first.mosaic, camera=field.camera, prior_px=prior_px, grid=field.grid)
+    mosaic = rectify_fine(
+        stores,
+        signal,
+        seams,
+        frame=field.frame,
+        camera=field.camera,
+        light=field.light,
+        kernel=settings.resampling,
+        memory=settings.memory,
+        pool=settings.pool,
+    )
+    return Pass(raw, signal, mosaic, seams)
+
+
+def _keep(stores: Stores, plan: SurveyPlan, raw: Ref) -> None:
+    """Make raw lines again that an earlier run cleared and this one keeps; those of a rig cannot be had again."""
+    if plan.settings.keep == KEEP_RAW and plan.settings.source != RIG:
+        stores.restore(raw)
+
+
+def _stop_after(stores: Stores, plan: SurveyPlan, ref: Ref, *steps: str) -> None:
+    """Raise SurveyStopped if one of ``steps``, whose last store is ``ref``, is ``until`` of the settings."""
+    if plan.settings.until in steps:
+        raise SurveyStopped(str(plan.settings.until), ref.uri, stores.archive.name)

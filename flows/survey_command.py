@@ -11,11 +11,14 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.publish.publishing import RunRef
 from spectralzoom.flows.publish.receipt_table import print_summary
 from spectralzoom.flows.publish.run_folder import Published, load_receipt
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import Settings
-from spectralzoom.flows.tasks.captures import opened_first
+from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.local_server import (
     ServerUnavailable,
     check_answers,
@@ -23,8 +26,7 @@ from spectralzoom.flows.tasks.local_server import (
     quiet_environment,
     wait_until_recorded,
 )
-from spectralzoom.flows.tasks.open_survey import TITLES, RunRef
-from spectralzoom.flows.tasks.prefect_tasks import Observer, inside_flow, observed_by
+from spectralzoom.flows.tasks.observer import Observer, observed_by
 from spectralzoom.flows.terminal.progress import StageProgress
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
 from spectralzoom.storage.archive.archive import Archive
@@ -40,12 +42,12 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
     give_back_freed_memory()  # of a survey before
     use_one_thread()
     keep_freed_memory()
-    with StageProgress(console, TITLES) as progress:
+    with StageProgress(console) as progress:
 
         def note(text: str) -> None:
             console.print(f"[dim]note: {escape(text)}[/]", soft_wrap=True)
 
-        with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
+        with observed_by(Observer(progress.watch, note, progress.say)):
             run = _survey(settings, console)
     if run.stopped is not None:
         raise run.stopped
@@ -64,6 +66,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
     asked = SurveySettings.of(settings)
     if settings.engine != "plain" and not inside_flow():
+        plan_survey(open_field(settings, planning=True))  # errors of the settings before a server starts
         try:
             with _prefect_server(settings.out):
                 state = survey(asked, return_state=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import gc
 import os
 import platform
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -24,10 +23,10 @@ from rich.console import Console
 from rich.markup import escape
 from scipy.ndimage import gaussian_filter
 
+from spectralzoom.flows.field import Field, open_field
 from spectralzoom.flows.settings.flags import AsJson, OutFile
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import RASTER, Settings, SignalChoice
-from spectralzoom.flows.tasks.run import SurveyRun, open_run
 from spectralzoom.flows.tasks.scene import check_labels
 from spectralzoom.flows.terminal.figures import format_bytes
 from spectralzoom.flows.terminal.processes import writing
@@ -75,7 +74,6 @@ from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from spectralzoom.pipeline.source import SweepLines
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.archive.whole_files import to_json
 from spectralzoom.storage.arrays.layout import packed_size
 
@@ -372,23 +370,23 @@ class PlannedPass:
     seconds: float | None = None  # of the camera
 
 
-def reading_of(run: SurveyRun, passes: Mapping[Setting, PlannedPass]) -> tuple[Run, Judge]:
+def reading_of(field: Field, passes: Mapping[Setting, PlannedPass]) -> tuple[Run, Judge]:
     """Segment a field with labels by several plans; the overview is read anew, whose time counts.
 
     The error is 1 - mIoU of the map; bytes and seconds are those of the scan.
     """
-    labels = run.labels
+    labels = field.labels.read()
     assert labels is not None
-    for note in check_labels(run.scene, run.described):
+    for note in check_labels(field.scene, field.described):
         show_text(f"note: {note}")
 
     def read(plan: Setting) -> DrawnMap:
         one = passes[plan]
         coarse = replace(one.coarse, overview=None)
-        return segment(run.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
+        return segment(field.weights, coarse, coarse.patches(one.patch_index), one.patch_index)
 
     def judge(plan: Setting, drawn: DrawnMap) -> Figures:
-        miou = mean_iou(confusion(labels, drawn.classes, run.weights.config.classes))
+        miou = mean_iou(confusion(labels, drawn.classes, field.weights.config.classes))
         return Figures(1 - miou, passes[plan].bytes, passes[plan].seconds)
 
     return read, judge
@@ -407,58 +405,58 @@ def coarse_of_sweeps(
     return read_coarse_prediction(weights, read_coarse_pass(weights, blocks, wavelength_nm, grid, capture=capture))
 
 
-def open_field(seed: int, scene: str | None, weights: Path | None, source: str) -> SurveyRun:
+def open_labelled(seed: int, scene: str | None, weights: Path | None, source: str) -> Field:
     """Open a field as a survey by its defaults does, or a farm without a ``scene``; nothing is written.
 
-    Raises SceneError: it has no labels; else as `flows.tasks.run.open_run`.
+    Raises SceneError: it has no labels; else as `flows.field.open_field`.
     """
     farm = {"scene": "farm", "size": "{1}x{0}".format(*FARM_SHAPE)}
     asked = {**(farm if scene is None else {"scene": scene}), "source": source, "seed": seed, "weights": weights}
     settings = load_settings(None, {name: str(one) for name, one in asked.items() if one is not None})
-    with tempfile.TemporaryDirectory(prefix="spectralzoom-tradeoff-") as empty:
-        run = open_run(settings, planning=True, archive=Archive(Path(empty), writes=False))
-    if run.labels is None or (run.labels == UNLABELLED).all():
+    field = open_field(settings, planning=True)
+    labels = field.labels.read()
+    if labels is None or (labels == UNLABELLED).all():
         raise SceneError(f"{scene} has no labels by which a map could be judged; lay a label file beside it")
-    return run
+    return field
 
 
 def plan_scans(seed: int, scene: str | None = None, weights: Path | None = None) -> tuple[Run, Judge]:
     """Scan a farm or another scene by every uniform scan."""
-    run = open_field(seed, scene, weights, "sim")
-    grid = SceneGrid(*run.scene.shape, run.described.config.patch)
-    along, _, _ = cheapest_full(grid, run.camera, run.settings.cost)
-    bands = run.scene.wavelength_nm
+    field = open_labelled(seed, scene, weights, "sim")
+    grid = SceneGrid(*field.scene.shape, field.described.config.patch)
+    along, _, _ = cheapest_full(grid, field.camera, field.settings.cost)
+    bands = field.scene.wavelength_nm
     passes: dict[Setting, PlannedPass] = {}
     for name, (step, exposure_ms) in SCANS.items():
-        sweeps = uniform_sweeps(grid, run.camera, along, step=step, exposure_ms=exposure_ms)
+        sweeps = uniform_sweeps(grid, field.camera, along, step=step, exposure_ms=exposure_ms)
         scan = LineSpec(exposure_ms / DEFAULT_EXPOSURE_MS, step)
-        seen = [SimulatedSweep(run.simulated, sweep) for sweep in sweeps]
-        coarse = coarse_of_sweeps(seen, run.camera, bands, grid, run.weights, scan)
-        size, seconds = raw_bytes(sweeps, run.camera, len(bands)), run.settings.cost.seconds(sweeps, run.camera)
+        seen = [SimulatedSweep(field.simulated, sweep) for sweep in sweeps]
+        coarse = coarse_of_sweeps(seen, field.camera, bands, grid, field.weights, scan)
+        size, seconds = raw_bytes(sweeps, field.camera, len(bands)), field.settings.cost.seconds(sweeps, field.camera)
         passes[name] = PlannedPass(coarse, grid.every_patch(), size, seconds)
-    return reading_of(run, passes)
+    return reading_of(field, passes)
 
 
 def plan_fractions(seed: int, scene: str | None = None, weights: Path | None = None) -> tuple[Run, Judge]:
     """Scan a farm by every line, or take a raster as it is; choose every fraction of its patches by expected gain."""
-    run = open_field(seed, scene, weights, "sim" if scene is None else RASTER)
-    grid, raster, wavelength_nm = run.grid, run.raster, run.scene.wavelength_nm
+    field = open_labelled(seed, scene, weights, "sim" if scene is None else RASTER)
+    grid, raster, wavelength_nm = field.grid, field.raster, field.scene.wavelength_nm
     keep_freed_memory()  # as surveys do
     if raster is not None:
-        parts = cuts(grid.height, raster.rows_at_once(run.settings.memory))
+        parts = cuts(grid.height, raster.rows_at_once(field.settings.memory))
         blocks = (raster.rows(part.start, part.stop) for part in parts)
-        coarse = read_coarse_prediction(run.weights, read_coarse_pass(run.weights, blocks, wavelength_nm, grid))
+        coarse = read_coarse_prediction(field.weights, read_coarse_pass(field.weights, blocks, wavelength_nm, grid))
     else:
-        _, full, _ = cheapest_full(grid, run.camera, run.settings.cost)
-        seen = [SimulatedSweep(run.simulated, sweep) for sweep in full]
-        coarse = coarse_of_sweeps(seen, run.camera, wavelength_nm, grid, run.weights)
+        _, full, _ = cheapest_full(grid, field.camera, field.settings.cost)
+        seen = [SimulatedSweep(field.simulated, sweep) for sweep in full]
+        coarse = coarse_of_sweeps(seen, field.camera, wavelength_nm, grid, field.weights)
     scores = score_patches(POLICY, coarse)
     passes: dict[Setting, PlannedPass] = {}
     for fraction in FRACTIONS:
         chosen = frame_patches(scores, fraction) if fraction < 1 else grid.every_patch()
         pixels = grid.height * grid.width // TOKEN_PX**2 + len(chosen) * grid.patch**2
         passes[fraction] = PlannedPass(coarse, chosen, pixels * len(wavelength_nm) * BYTES_PER_SAMPLE)
-    return reading_of(run, passes)
+    return reading_of(field, passes)
 
 
 SURVEY = Tradeoff(

@@ -19,7 +19,7 @@ from spectralzoom.flows.publish.receipt import Receipt, check_receipt
 from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import RIG
-from spectralzoom.flows.tasks.stages.maps import colours_of
+from spectralzoom.flows.stages.ground import colours_of
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out

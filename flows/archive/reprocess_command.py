@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
@@ -17,15 +16,15 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
 from spectralzoom.flows.settings.load import load_settings, of_this_version, parse_settings
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
+from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.open_survey import STAGES, versions
 from spectralzoom.flows.tasks.recorded_field import open_recorded
 from spectralzoom.flows.tasks.scene import open_map, open_scene
 from spectralzoom.flows.tasks.scores import score_of
-from spectralzoom.flows.tasks.survey_model import weights_path
 from spectralzoom.flows.terminal.figures import counted, format_points, format_seconds
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
@@ -132,13 +131,18 @@ def _settings_of(
     ``renewed`` has the newest generation of each run that may be another's prior map.
     """
     here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
-    settings = replace(asked_again(run, archive, weights), **here)
+    settings = asked_again(run, archive, weights)
     prior = settings.prior
     while (newer := renewed.get(prior, prior)) != prior:
         prior = newer
-    if prior == settings.prior and is_current(catalogue, run, settings):
+    settings = replace(settings, prior=prior, **here)
+    shown = _is_there(run, settings)
+    rows = dry_run(settings)[1].rows if shown else {}
+    if shown and run.problem is None and all(row.state == "cached" for row in rows.values()):
         return None
-    return replace(from_raw_cubes(catalogue, run, replace(settings, prior=prior)), **here)
+    captures = [row for name, row in rows.items() if name in (capture_coarse.name, capture_fine.name)]
+    again = settings.source in (RIG, RECORDED) and any(row.state != "cached" for row in captures)
+    return replace(from_raw_cubes(catalogue, run, settings), **here) if again or not shown else settings
 
 
 def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
@@ -200,22 +204,17 @@ def newest_runs(catalogue: Catalogue) -> list[Run]:
 def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
     """Return settings that survey a run's own raw cubes as a recording, where its source cannot be read again.
 
-    That is the case if the stage of captures has another version, or if the files of a recording or scene are gone or
-    changed. The settings stay as they are otherwise. Raises SettingsError, BudgetError: as `asked_again`; SceneError:
-    the raw cubes are gone too.
+    That is the case if captures are made otherwise by now, or if the files of a recording or scene are gone or changed.
+    Raises SettingsError, BudgetError: as `asked_again`; SceneError: the raw cubes are gone too.
     """
     raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
     stores = [catalogue.stores.get(uri) for uri in raw]
-    is_there = _is_there(run, settings)
     if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
-        if is_there:
+        if settings.source == RIG:
             return settings
         raise SceneError(
             f"what {run.uri} showed is gone or shows something else by now; restore its scene or recording"
         )
-    is_old = settings.source in (RIG, RECORDED) and bool(stale_stores(catalogue, raw, None))
-    if not is_old and is_there:
-        return settings
     asked = {"sweeps": f"{settings.out}/{run.uri}", "out": settings.out, "engine": settings.engine}
     kept = {name: getattr(settings, name) for name in OF_THE_SURVEY}
     return load_settings(None, {name: value for name, value in {**asked, **kept}.items() if value is not None})
@@ -251,26 +250,3 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
     known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE)
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
-
-
-def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
-    """Return the stores that a survey would make again: missing, damaged, of another version or of other weights."""
-    now = versions()
-    by_weights = {one.product.name for one in STAGES.values() if one.product.by_weights}
-    found = {uri: catalogue.stores.get(uri) for uri in uris}
-    return {
-        uri
-        for uri, store in found.items()
-        if store is None
-        or store.problem is not None
-        or store.version != str(now.get(store.ref.stage))
-        or (store.ref.stage in by_weights and store.params.get("weights", weights) != weights)
-    }
-
-
-def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
-    """Return whether a run is whole and its survey would find all of its stores, by versions and weights alone."""
-    weights = None
-    with suppress(OSError, PipelineError):  # they cannot be read
-        weights = describe_weights(weights_path(settings)).key
-    return run.problem is None and not stale_stores(catalogue, set(run.names), weights)

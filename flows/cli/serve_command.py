@@ -25,12 +25,13 @@ from prefect.states import Cancelled, Crashed
 from pydantic import ValidationError
 
 from spectralzoom.flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey import survey
 from spectralzoom.flows.tasks.local_server import check_answers, local_server, quiet_environment
-from spectralzoom.flows.tasks.open_survey import RIG_LIMIT
-from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.tasks.rig_field import RIG_LIMIT
 from spectralzoom.flows.tasks.survey_model import weights_path
 from spectralzoom.flows.terminal.processes import DONE, terminable
 from spectralzoom.flows.terminal.progress import show_text
@@ -114,7 +115,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> dict[Path, Set
             )
         settings = replace(settings, name=name, out=str(Path(settings.out).absolute()))
         try:
-            open_run(settings, planning=True)
+            plan_survey(open_field(settings, planning=True))
         except NoSceneYet as error:
             describe_weights(weights_path(settings))  # raises where they are invalid
             show_text(f"{name}: {error}; each due run looks for it again")

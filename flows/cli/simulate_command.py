@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,26 +10,27 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.field import light_key, make_source
+from spectralzoom.flows.frame import Bands
 from spectralzoom.flows.publish.receipt_table import print_effects
 from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.stage import Stores
+from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse
+from spectralzoom.flows.stages.effects import choose_effects, load_manifest
 from spectralzoom.flows.tasks.capture_plan import PassLayout
-from spectralzoom.flows.tasks.run import CaptureRun, make_source
+from spectralzoom.flows.tasks.observer import tidy_up
 from spectralzoom.flows.tasks.scene import SimulatedField, farm_refusal, open_scene
-from spectralzoom.flows.tasks.stage import Stage, Wanted
-from spectralzoom.flows.tasks.stages.capture import capture_coarse
-from spectralzoom.flows.tasks.stages.effects import choose_effects, load_manifest
 from spectralzoom.flows.terminal.figures import counted, format_bytes, format_seconds
 from spectralzoom.flows.terminal.progress import StageProgress, print_json, stderr
 from spectralzoom.models.network.machine import keep_freed_memory
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.storage.store import Archive, Ref
 
-TITLES = {"effects": "choice of effects", "capture": "scan"}
 PATCH = 16  # of the shipped weights, so that scans are those of their surveys
 
 
@@ -64,35 +63,29 @@ def simulate(
     values = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
     keep_freed_memory()
     with stderr.status("opening the scene"):
-        run, sweeps, notes = open_simulation(load_settings(settings, values), coarse=coarse)
-        run = replace(run, planned=tuple(sweeps))  # only these sweeps have to be bounded and checked
-        run.archive.reclaim()  # parts that a killed scan left
+        asked = load_settings(settings, values)
+        field, notes = open_simulation(asked)
+        _, coarse_pass, full = PassLayout.of(asked, SceneGrid(*field.shape, PATCH)).sweeps()
+        sweeps = coarse_pass if coarse else full
+        archive = Archive.open(asked.out)
+        archive.reclaim()  # parts that a killed scan left
     for note in notes:
         stderr.print(f"[dim]note: {escape(note)}[/]")
-    with run.archive.in_use(), StageProgress(stderr, TITLES) as progress:
-
-        def watching(name: str) -> CaptureRun:
-            progress.show(name, 0.0)
-            return replace(run, report=lambda done: progress.show(name, done))
-
-        def made(name: str, stage: Stage, wanted: Wanted) -> tuple[StageRef, bool]:
-            ref, built = stage.produce(run.archive, wanted)
-            progress.show(name, 1.0, "" if built else "cached", ended=True)
-            return ref, built
-
-        effects, _ = made("effects", choose_effects, choose_effects.wants(watching("effects")))
-        began = time.process_time()
-        wanted = run.recorder.wanted(sweeps, [effects], watching("capture").report)
-        raw, built = made("capture", capture_coarse, wanted)
-        record = _record(run, sweeps, effects, raw, time.process_time() - began if built else None)
+    with archive.in_use(), StageProgress(stderr) as progress:
+        stores = Stores(archive, watch=progress.watch, finish=tidy_up)
+        effects, raw = scan(stores, asked, field, sweeps)
+    record = _record(stores, asked, field, sweeps, effects, raw)
     _print(record, stderr)
     if as_json:
         print_json(record)
     return 0
 
 
-def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:
-    """Open scene and archive; return the run, its sweeps, and assumptions on the scene. Simulates nothing."""
+def open_simulation(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
+    """Open the scene of a simulation; return it with notes on assumptions. Simulates nothing.
+
+    Raises SettingsError, SceneError: it cannot be simulated.
+    """
     if settings.source != "sim":
         raise SettingsError(f"source = {settings.source!r} cannot be simulated; leave it out")
     if (refused := farm_refusal(settings)) is not None:
@@ -103,35 +96,51 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
             f"{settings.scene} has {scene.filled_px} pixels without a finite value, and a simulation needs one "
             "everywhere; fill or crop it, or choose other --bands"
         )
-    _, coarse_pass, full = PassLayout.of(settings, SceneGrid(*scene.shape, PATCH)).sweeps()
-    simulated = make_source(scene, settings)
-    run = CaptureRun(
-        settings=settings,
-        archive=Archive.open(settings.out),
-        source=SimulatedField(simulated),
-        simulated=simulated,
+    return scene, notes
+
+
+def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequence[Sweep]) -> tuple[Ref, Ref]:
+    """Choose the effects for these sweeps alone, and capture them; return both stores."""
+    source = SimulatedField(make_source(scene, settings))
+    effects = choose_effects(
+        stores,
         scene=scene,
-        planned=(*coarse_pass, *full),
+        rig=settings.simulated_rig,
+        sweeps=sweeps,
+        cost=settings.cost,
+        asked=settings.effects,
+        tol=settings.tol,
     )
-    return run, coarse_pass if coarse else full, notes
+    raw = capture_coarse(
+        stores,
+        effects,
+        request=SweepRequest.of(sweeps, settings.camera, settings.cost),
+        light=light_key(settings, scene, source, settings.name or Path(scene.name).stem),
+        camera=settings.camera,
+        bands=Bands(scene.wavelength_nm, scene.fwhm_nm),
+        source=source,
+        pool=settings.pool,
+    )
+    return effects, raw
 
 
 def _record(
-    run: CaptureRun, sweeps: Sequence[Sweep], effects: StageRef, raw: StageRef, cpu_s: float | None
+    stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequence[Sweep], effects: Ref, raw: Ref
 ) -> dict[str, Any]:
     manifest = load_manifest(effects)
+    row = stores.rows[capture_coarse.name]
     return {
-        "scene": run.scene.key,
-        "seed": run.settings.seed,
-        "archive": run.archive.name,
+        "scene": scene.key,
+        "seed": settings.seed,
+        "archive": stores.archive.name,
         "store": raw.uri,
         "cubes": [f"{raw.uri}/{path.name}" for path in sorted(raw.path.glob("*.zarr"))],
-        "cached": cpu_s is None,
+        "cached": row.state == "cached",
         "sweeps": len(sweeps),
         "lines": (lines := sum(sweep.lines for sweep in sweeps)),
-        "px_bands": lines * run.camera.samples * len(run.scene.wavelength_nm),
-        "cpu_s": cpu_s,
-        "bytes_stored": run.archive.stored_bytes(raw),
+        "px_bands": lines * settings.camera.samples * len(scene.wavelength_nm),
+        "cpu_s": row.cpu_s,
+        "bytes_stored": stores.archive.stored_bytes(raw),
         "effects_store": effects.uri,
         "effects": manifest["effects"],
         "effects_total": manifest["total"],

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.publish.receipt_table import FOREIGN
 from spectralzoom.flows.settings.values import EXTENT_WHOLE
-from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.flows.stages.segment import SPECTRA
 from spectralzoom.flows.tasks.scores import MOST_ERROR
-from spectralzoom.flows.tasks.stages.maps import SPECTRA
 from spectralzoom.flows.terminal.figures import format_points
 from spectralzoom.models.evaluation.expected_scores import expected_counts
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
@@ -23,35 +23,34 @@ from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace
 from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
 from spectralzoom.pipeline.ground.zones import figures_of_plot
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import read_table
 from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
 from spectralzoom.storage.arrays.ground_maps import GroundMap
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
+from spectralzoom.storage.store import Ref, read_table
 
 PLOTS_FILE = "plots.csv"
 STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
 
 
-def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
+def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
     """Return figures of the field and of the captures, for JSON; None for unknown ones.
 
     Without a planned fine pass, ``fine``, its seconds are those that the budget leaves. Hectares are those within the
     zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
-    scale = run.zones.place.scale(run.camera.ifov_rad)
-    fine_s = run.plan.fine_s if fine is None else fine.seconds
-    seconds = run.plan.coarse_s + fine_s
+    scale = plan.field.zones.place.scale(plan.field.camera.ifov_rad)
+    fine_s = plan.passes.fine_s if fine is None else fine.seconds
+    seconds = plan.passes.coarse_s + fine_s
     kept = scale
-    if run.zones.kept is not None and scale.area_m2 is not None:
-        kept = replace(scale, area_m2=_ground_m2(run, run.zones.kept))  # the area within the zones
+    if plan.field.zones.kept is not None and scale.area_m2 is not None:
+        kept = replace(scale, area_m2=_ground_m2(plan, plan.field.zones.kept))  # the area within the zones
     footprint = scale.footprint
-    captured = run.raster is None
-    camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
+    captured = plan.field.raster is None
+    camera_s = {"coarse": plan.passes.coarse_s, "fine": fine_s, "all": seconds, "full_scan": plan.passes.full_s}
     lines = {
-        "coarse": sum(sweep.lines for sweep in run.plan.coarse),
+        "coarse": sum(sweep.lines for sweep in plan.passes.coarse),
         "fine": None if fine is None else fine.lines,
-        "full_scan": sum(sweep.lines for sweep in run.plan.full),
+        "full_scan": sum(sweep.lines for sweep in plan.passes.full),
     }
     return {
         "size_px": [scale.shape[1], scale.shape[0]],
@@ -62,21 +61,21 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
         "hectares": kept.hectares,
-        "kept_fraction": None if run.zones.kept is None else float(run.zones.kept.mean()),
+        "kept_fraction": None if plan.field.zones.kept is None else float(plan.field.zones.kept.mean()),
         "camera_s": camera_s if captured else None,
-        "fine_planned": fine is not None or run.plan.plain,
+        "fine_planned": fine is not None or plan.passes.plain,
         "lines": lines if captured else None,
-        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not run.part else None,
+        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not plan.part else None,
     }
 
 
-def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
+def find_areas(plan: SurveyPlan, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
     """Return ``areas``: pixels of each class, and hectares where the size of a pixel is known.
 
     With a pose, hectares are those of the map on the ground.
     """
     pixels = class_counts(drawn.classes, len(drawn.names)).tolist()
-    m2 = None if posed is not None else areas_by_number(run.zones.place, drawn.classes, len(drawn.names))
+    m2 = None if posed is not None else areas_by_number(plan.field.zones.place, drawn.classes, len(drawn.names))
     hectares = {} if m2 is None else dict(zip(drawn.names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
     if posed is not None:
         hectares = {name: area["ha"] for name, area in posed.areas.items()}
@@ -84,14 +83,14 @@ def find_areas(run: SurveyRun, posed: GroundMap | None, drawn: ClassMap) -> dict
 
 
 def find_ground(
-    run: SurveyRun,
+    plan: SurveyPlan,
     posed: GroundMap | None,
     found: ClassMap,
     probabilities: ProbabilityStore,
     prior: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """Return ``ground``: grid, and changes against the prior map. Empty without a georeference."""
-    geobox = run.scene.geobox if posed is None else posed.geobox
+    geobox = plan.field.scene.geobox if posed is None else posed.geobox
     if geobox is None:
         return {}
     figures: dict[str, Any] = {
@@ -102,7 +101,7 @@ def find_ground(
     if (old_class := probabilities.old_class()) is not None:
         changes = [] if prior is None else prior["changes"]
         beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
-        figures |= {"changes_ha": changed_hectares(run.zones.place, old_class, found, beyond)}
+        figures |= {"changes_ha": changed_hectares(plan.field.zones.place, old_class, found, beyond)}
     return {"ground": figures}
 
 
@@ -126,27 +125,27 @@ def changed_hectares(
     return [[float(areas[pair]) / M2_PER_HECTARE, names[pair // count], names[pair % count]] for pair in largest]
 
 
-def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
+def find_zones(plan: SurveyPlan, drawn: ClassMap) -> dict[str, Any]:
     """Return ``zones``, the size of the mapped part, and ``plots``, a row each; empty without either."""
     found: dict[str, Any] = {}
-    if run.zones.kept is not None:
-        kept = run.zones.kept
+    if plan.field.zones.kept is not None:
+        kept = plan.field.zones.kept
         found["zones"] = {
             "kept_px": int(np.count_nonzero(kept)),
             "field_px": kept.size,
-            "kept_m2": _ground_m2(run, kept),
+            "kept_m2": _ground_m2(plan, kept),
         }
-    if run.zones.plots is not None:
+    if plan.field.zones.plots is not None:
         found["plots"] = [
-            asdict(figures_of_plot(name, shape, run.zones.place, drawn.classes, drawn.confidence, drawn.names))
-            for name, shape in run.zones.plots.items()
+            asdict(figures_of_plot(name, shape, plan.field.zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in plan.field.zones.plots.items()
         ]
     return found
 
 
-def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
+def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
     rows, columns = (slice(0, size) for size in kept.shape)
-    areas = run.zones.place.pixel_areas_m2(rows, columns)
+    areas = plan.field.zones.place.pixel_areas_m2(rows, columns)
     return None if areas is None else float(np.nansum(areas[kept]))
 
 
@@ -163,47 +162,47 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
+def find_map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
     """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
     found: dict[str, Any] = {}
     unclassed = drawn.classes == UNLABELLED
     spectra = read_table(ref.path / SPECTRA)
     if fraction := spectra["unlike_patches"] / max(spectra["captured_patches"], 1):
         found["unlike"] = {"fraction": fraction}
-    if run.zones.left_out is not None:
-        unclassed &= ~run.zones.left_out
+    if plan.field.zones.left_out is not None:
+        unclassed &= ~plan.field.zones.left_out
     pixels = {
-        "scene_without_a_value": run.scene.filled_px,
+        "scene_without_a_value": plan.field.scene.filled_px,
         "px_no_reading": spectra["out_of_range_px"],
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):
         found["pixels"] = pixels
-    expected = None if fraction > FOREIGN else _expected(run, ref)
+    expected = None if fraction > FOREIGN else _expected(plan, ref)
     return found if expected is None else found | {"expected": expected}
 
 
-def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
+def _expected(plan: SurveyPlan, ref: Ref) -> dict[str, Any] | None:
     """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
     They were compared for maps of uniform scans segmented in full without a prior map. Pixels without a class do not
     count. A score with too large an error is not predicted.
     """
     if (
-        run.map_scores is None
-        or run.raster is not None
-        or not run.plan.plain
-        or run.settings.extent != EXTENT_WHOLE
-        or run.settings.macs is not None
-        or run.prior is not None
+        plan.field.map_scores is None
+        or plan.field.raster is not None
+        or not plan.passes.plain
+        or plan.settings.extent != EXTENT_WHOLE
+        or plan.settings.macs is not None
+        or plan.field.prior is not None
     ):
         return None
-    names = run.described.class_names
+    names = plan.field.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")
     high = SHARD_ROWS * int(np.clip(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1, 4))
     strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
-    exposure_ms = (run.settings.scan_exposure_ms or run.camera.exposure_ms) * run.scene.light_fraction
-    score = run.map_scores.expected(expected_counts(strips, len(names)), run.step, exposure_ms)
+    exposure_ms = (plan.settings.scan_exposure_ms or plan.field.camera.exposure_ms) * plan.field.scene.light_fraction
+    score = plan.field.map_scores.expected(expected_counts(strips, len(names)), plan.step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
     if score.error > MOST_ERROR:

@@ -4,82 +4,94 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
 
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.products import Products
 from spectralzoom.flows.publish.receipt_table import finding_rows, headline
 from spectralzoom.flows.publish.report import render_markdown
 from spectralzoom.flows.publish.run_folder import Published, publish_run
 from spectralzoom.flows.settings.values import KEEP_SIGNAL
-from spectralzoom.flows.tasks.open_survey import OpenSurvey, RunRef
-from spectralzoom.flows.tasks.prefect_tasks import as_task, inside_flow
-from spectralzoom.flows.tasks.stages.attention import load_plan
-from spectralzoom.flows.tasks.stages.capture import capture_coarse, capture_fine
-from spectralzoom.flows.tasks.stages.condense import raw_differs
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.flows.stage import Stores, inside_flow, task_in_flow
+from spectralzoom.flows.stages.condense import raw_differs
+from spectralzoom.flows.stages.score import load_plan
+from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.store import Archive, Ref
 
-PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
 WIDTH_PX = 800  # of the picture in the text
+Note = Callable[[str], None]
 
 
-def publish(survey: OpenSurvey) -> RunRef:
+@dataclass(frozen=True)
+class RunRef:
+    """Address of a published run."""
+
+    uri: str  # relative to the archive
+    folder: Path
+    stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
+
+    @property
+    def name(self) -> str:
+        """Return the name of the run's folder."""
+        return self.folder.name
+
+
+def publish(stores: Stores, plan: SurveyPlan, products: Products, *, started: datetime, note: Note) -> RunRef:
     """Publish the run of a class map, with its accuracy where it was evaluated; in a flow as a task."""
-    return as_task(_publish, "publish")(survey, *survey.products.values())
+
+    def work(*_: Ref) -> RunRef:
+        published = publish_run(stores, plan, products, started)
+        fine = load_plan(products.attention)
+        if not (plan.passes.plain or fine.sweeps):
+            note(f"no second pass: {fine.reason}")
+        _show_artifact(plan.field.name, stores.archive.name, published)
+        return RunRef(f"runs/{published.folder.name}", published.folder)
+
+    return task_in_flow("publish", stores.name, work, *products.stores())
 
 
-def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
-    _clear_first_mosaic(survey)
-    plan = load_plan(survey.products["score"])
-    published = publish_run(survey, plan)
-    if not (survey.run.plan.plain or plan.sweeps):
-        survey.observer.note(f"no second pass: {plan.reason}")
-    _show_artifact(survey, published)
-    return RunRef(f"runs/{published.folder.name}", published.folder)
-
-
-def clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
+def clear_raw(stores: Stores, plan: SurveyPlan, products: Products, run: RunRef, *, note: Note) -> RunRef:
     """Compare and clear the raw lines that the settings do not keep; in a flow as a task."""
-    if survey.run.settings.keep != KEEP_SIGNAL or not survey.products.there(*PASSES):
+    raws = [one.raw for one in products.passes]
+
+    def work(*_: Ref) -> RunRef:
+        archive = stores.archive
+        if all(map(stores.has, raws)):
+            catalogue = Catalogue.read(archive.root)
+            named = (one for raw in raws for one in catalogue.named_by(raw.uri))
+            others = [one for one in named if one.settings.get("keep") != KEEP_SIGNAL]
+            kept = f"{others[0].uri} keeps them" if others else None
+            why = kept or raw_differs(raws, products.passes[0].signal, plan.field.camera)
+            if why is not None and all(map(stores.has, raws)):
+                note(f"raw lines stay: {why}")
+            for raw in raws if why is None else ():
+                archive.clear(raw, wait=False)
         return run
-    return as_task(_clear_raw, "clear_raw")(survey, run)
+
+    return task_in_flow("clear_raw", stores.name, work, *raws) if raws and plan.settings.keep == KEEP_SIGNAL else run
 
 
-def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
-    archive = survey.run.archive
-    passes = survey.products.there(*PASSES)
-    if not survey.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
-        return run  # cleared before
-    catalogue = Catalogue.read(archive.root)
-    others = [one for raw in passes for one in catalogue.named_by(raw.uri) if one.settings.get("keep") != KEEP_SIGNAL]
-    kept = f"{others[0].uri} keeps them" if others else None
-    why = kept or raw_differs(passes, survey.products.signals[0], survey.run.camera)
-    if any(archive.find(raw.stage, raw.key) is None for raw in passes):
-        return run  # cleared meanwhile, by another survey
-    if why is not None:
-        survey.observer.note(f"raw lines stay: {why}")
-        return run
-    for raw in passes:
-        archive.clear(raw, wait=False)
-    return run
-
-
-def _clear_first_mosaic(survey: OpenSurvey) -> None:
+def clear_first_mosaic(archive: Archive, plan: SurveyPlan, products: Products) -> None:
     """Clear the mosaic of the first pass, whose lines are in that of both passes."""
-    archive = survey.run.archive
-    first = survey.products.get("rectify")
-    if first is None or "rectify_fine" not in survey.products or survey.registers:  # fine sweeps are registered on it
+    if products.first is None or products.second is None or plan.registers:  # fine sweeps are registered on it
         return
+    first = products.first.mosaic
     if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
         archive.clear(first, wait=False)
 
 
-def _show_artifact(survey: OpenSurvey, published: Published) -> None:
+def _show_artifact(name: str, archive: str, published: Published) -> None:
     """Create the artifact of a run in the present flow: score, picture, findings, and where its files are."""
     if not inside_flow():
         return
-    letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in survey.run.name.lower())
+    letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in name.lower())
     key = "".join(letters).strip("-")
-    where = f"{survey.run.archive.name}/runs/{published.folder.name}"
+    where = f"{archive}/runs/{published.folder.name}"
     with suppress(Exception):  # without a server the archive has everything
         text = render_markdown(
             "survey.md",

@@ -14,7 +14,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from spectralzoom.flows.settings.survey_settings import RASTER
 from spectralzoom.pipeline.errors import ShapeError
-from spectralzoom.storage.archive.records import StageRecord
 from spectralzoom.storage.archive.whole_files import to_json
 
 Receipt = dict[str, Any]
@@ -98,6 +97,19 @@ class Accuracy(Score):
     all: Score | None = None
 
 
+class StageRow(_Part):
+    """One stage; figures of a store that was found are null."""
+
+    name: str
+    key: str
+    state: Literal["ran", "cached"]
+    wall_s: float | None = None
+    cpu_s: float | None = None
+    peak_rss_bytes: int | None = None
+    bytes_in: int | None = None
+    bytes_out: int | None = None
+
+
 class ReceiptFields(_Part):
     """All fields of a receipt; those from ``field`` to ``pixels`` are findings, each present only if it applies."""
 
@@ -109,7 +121,7 @@ class ReceiptFields(_Part):
     finished: str
     versions: dict[str, str]
     settings: Facts
-    stages: list[StageRecord]
+    stages: list[StageRow]
     savings: Savings
     data_bytes: DataBytes
     accuracy: Accuracy | None = None

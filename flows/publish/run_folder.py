@@ -9,6 +9,7 @@ import platform
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.products import Products
 from spectralzoom.flows.publish.field_map import field_map
 from spectralzoom.flows.publish.findings import (
     PLOTS_FILE,
@@ -32,29 +35,29 @@ from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt, ch
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
+from spectralzoom.flows.stage import Row, Stores
+from spectralzoom.flows.stages.condense import SIGNAL_RECORD
+from spectralzoom.flows.stages.effects import load_manifest
+from spectralzoom.flows.stages.evaluate import load_accuracy
+from spectralzoom.flows.stages.ground import STORE
+from spectralzoom.flows.stages.register import load_registration
+from spectralzoom.flows.stages.score import READING, load_plan, read_in_full
 from spectralzoom.flows.tasks.capture_plan import as_figures
-from spectralzoom.flows.tasks.open_survey import STAGES, OpenSurvey, Products
 from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
-from spectralzoom.flows.tasks.run import SurveyRun, now
 from spectralzoom.flows.tasks.scene import seen_in_training
-from spectralzoom.flows.tasks.stages.accuracy import load_accuracy
-from spectralzoom.flows.tasks.stages.attention import READING, load_plan, read_in_full
-from spectralzoom.flows.tasks.stages.effects import load_manifest
-from spectralzoom.flows.tasks.stages.maps import STORE
-from spectralzoom.flows.tasks.stages.placement import SIGNAL_RECORD, load_registration
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import CURE, read_table
+from spectralzoom.storage.archive.manifests import CURE
 from spectralzoom.storage.archive.records import RECEIPT, read_run
-from spectralzoom.storage.archive.whole_files import to_json
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
+from spectralzoom.storage.store import Ref, read_table, to_json
 
 REPORT = "report.html"
+COSTS_OF_STAGE = ("wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 
@@ -74,16 +77,17 @@ def load_receipt(folder: Path) -> Receipt:
     return check_receipt(found.receipt)
 
 
-def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
+def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: datetime) -> Published:
     """Publish the products of a survey as a run folder with receipt.json, quicklook.png and report.html."""
-    run, products = survey.run, survey.products
-    rests_on = run.archive.manifest_hashes(products.values())
-    shown = quicklook_data(run, products, plan)
+    archive = stores.archive
+    fine = load_plan(products.attention)
+    rests_on = archive.manifest_hashes(products.stores())
+    shown = quicklook_data(plan, products, fine)
     quicklook = draw_quicklook(shown)
-    with run.archive.new_run(run.name) as draft:
-        receipt = make_receipt(survey, plan, f"runs/{draft.id}", count_bytes(survey, plan, rests_on))
-        field = field_map(shown, run.prior)
-        page = render_report(receipt, quicklook, field=field)
+    with archive.new_run(plan.field.name) as draft:
+        data_bytes = count_bytes(stores, plan, products, fine, rests_on)
+        receipt = make_receipt(stores, plan, products, f"runs/{draft.id}", data_bytes, started)
+        page = render_report(receipt, quicklook, field=field_map(shown, plan.field.prior))
         draft.write_file("quicklook.png", quicklook)
         if "plots" in receipt:
             draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
@@ -93,84 +97,104 @@ def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
     return Published(receipt, draft.published)
 
 
-def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str, data_bytes: Facts) -> Receipt:
+def make_receipt(
+    stores: Stores, plan: SurveyPlan, products: Products, folder: str, data_bytes: Facts, started: datetime
+) -> Receipt:
     """Return the receipt of a run whose folder has the address ``folder``."""
-    products = survey.products
     read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # a plan assumes `SMOOTH` of them
-    run = replace(survey.run, costs=replace(survey.run.costs, bands=read))
-    accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
-    effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}
-    stores = {key: place for name, ref in products.items() for key, place in STAGES[name].addresses(ref).items()}
-    if (products["segment"].path / READING).exists():  # patches were chosen in the segmentation
-        stores["attention"] = f"{products['segment'].uri}/{READING}"
-    files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
-    versions = {"python": platform.python_version()}
-    for name in LIBRARIES:
-        with suppress(PackageNotFoundError):  # run from a source tree that is not installed
-            versions[name] = version(name)
+    plan = replace(plan, costs=replace(plan.costs, bands=read))
+    field = plan.field
+    fine = load_plan(products.attention)
+    effects = {} if products.effects is None else load_manifest(products.effects)
+    places = products.addresses()
+    if (products.class_map.path / READING).exists():  # patches were chosen in the segmentation
+        places["attention"] = f"{products.class_map.uri}/{READING}"
+    files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if field.zones.plots is not None else []))
     scans = {
-        "taken": run.scans.chosen,
-        "best_in_time": run.scans.best_in_time(run.plan.coarse_s + plan.seconds),
-        "reference": run.scans.reference,
+        "taken": plan.scans.chosen,
+        "best_in_time": plan.scans.best_in_time(plan.passes.coarse_s + fine.seconds),
+        "reference": plan.scans.reference,
     }  # where there is a table
     return build_receipt(
-        survey=run.name,
-        source=run.source.name,
-        scene=run.scene.key,
-        seed=run.settings.seed,
-        started=survey.started,
-        finished=now(),
-        versions=versions,
-        settings=asked_settings(run),
-        stages=[asdict(one) for one in survey.records.values()],
-        savings=_savings(run, plan, read_in_full(products["score"], products["segment"])),
+        survey=field.name,
+        source=field.source.name,
+        scene=field.scene.key,
+        seed=plan.settings.seed,
+        started=in_seconds(started),
+        finished=in_seconds(datetime.now(UTC)),
+        versions=versions(),
+        settings=asked_settings(plan),
+        stages=[_stage_row(row) for row in stores.rows.values()],
+        savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)),
         data_bytes=data_bytes,
-        accuracy=accuracy,
-        training_scene=seen_in_training(run.scene, run.described),
+        accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
+        training_scene=seen_in_training(field.scene, field.described),
         effects=effects.get("effects"),
         effects_total=effects.get("total"),
-        products={**stores, **{name: f"{folder}/{name}" for name in files}},
+        products={**places, **{name: f"{folder}/{name}" for name in files}},
         scans={name: as_figures(scan) for name, scan in scans.items() if scan is not None},
-        **find_out(run, products),
+        **find_out(plan, products),
     )
 
 
-def asked_settings(run: SurveyRun) -> dict[str, object]:
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the libraries that results depend on."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):  # run from a source tree that is not installed
+            found[name] = version(name)
+    return found
+
+
+def in_seconds(moment: datetime) -> str:
+    """Return a time in ISO 8601, UTC, to the second."""
+    return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _stage_row(row: Row) -> dict[str, Any]:
+    costs = (row.wall_s, row.cpu_s, row.peak_rss_bytes, row.bytes_in, row.bytes_out)
+    return {"name": row.name, "key": row.ref.key, "state": row.state, **dict(zip(COSTS_OF_STAGE, costs, strict=True))}
+
+
+def asked_settings(plan: SurveyPlan) -> dict[str, object]:
     """Return the settings with absolute paths, and the notes on assumptions."""
-    return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
+    return {**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)}
 
 
-def _savings(run: SurveyRun, plan: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
+def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
-    did = run.work_done(read)
+    did = plan.work_done(read)
     of_model = {
-        "patches": SavingEntry(len(read), len(run.kept_patches)).as_dict(),
-        "multiply_adds": {**SavingEntry(did.total, run.costs.of_map(run.kept_patches).total).as_dict(), **asdict(did)},
+        "patches": SavingEntry(len(read), len(plan.field.kept_patches)).as_dict(),
+        "multiply_adds": {
+            **SavingEntry(did.total, plan.costs.of_map(plan.field.kept_patches).total).as_dict(),
+            **asdict(did),
+        },
     }
-    if run.raster is not None:
+    if plan.field.raster is not None:
         return of_model
-    entries = capture_savings([*run.plan.coarse, *plan.sweeps], run.plan.full, run.camera, run.grid)
-    capture = SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s).as_dict()
-    if (uniform := run.scans.reference) is not None:  # the cheapest scan with nearly the best score
+    entries = capture_savings([*plan.passes.coarse, *fine.sweeps], plan.passes.full, plan.field.camera, plan.field.grid)
+    capture = SavingEntry(plan.passes.coarse_s + fine.seconds, plan.passes.full_s).as_dict()
+    if (uniform := plan.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.summary}
     return {**{name: entry.as_dict() for name, entry in entries.items()}, "capture_s": capture, **of_model}
 
 
-def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> QuicklookData:
+def quicklook_data(plan: SurveyPlan, products: Products, fine: FinePlan) -> QuicklookData:
     """Return the data of the quicklook, with three bands."""
-    bands, caption = choose_bands(run.scene.wavelength_nm)
-    found = load_class_map(products["segment"].path / "class_map.zarr")
+    bands, caption = choose_bands(plan.field.scene.wavelength_nm)
+    found = load_class_map(products.class_map.path / "class_map.zarr")
     thin = thinned(found.classes)
     chosen, choice = None, ""
-    if not run.plan.plain or run.chooses:
-        patches = plan.patch_index if not run.plan.plain else read_in_full(products["score"], products["segment"])
-        what = "Read by the full network" if run.plan.plain else "Captured again"
-        chosen = pixels_of_patches(run.grid, patches)[thin]
-        choice = f"{what}: {len(patches)} patches by {run.settings.policy}"
+    if not plan.passes.plain or plan.chooses:
+        patches = fine.patch_index if not plan.passes.plain else read_in_full(products.attention, products.class_map)
+        what = "Read by the full network" if plan.passes.plain else "Captured again"
+        chosen = pixels_of_patches(plan.field.grid, patches)[thin]
+        choice = f"{what}: {len(patches)} patches by {plan.settings.policy}"
     return QuicklookData(
-        survey=run.name,
-        seed=run.settings.seed,
-        about=plan.reason,
+        survey=plan.field.name,
+        seed=plan.settings.seed,
+        about=fine.reason,
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
         class_map=found.classes,
@@ -179,8 +203,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan) -> Quickl
         confidence=np.ascontiguousarray(found.confidence[thin]),
         chosen=chosen,
         choice=choice,
-        truth=run.labels,
-        was=ProbabilityStore(products["segment"].path / "class_probabilities.zarr").old_class(),
+        truth=plan.field.labels.read(),
+        was=ProbabilityStore(products.class_map.path / "class_probabilities.zarr").old_class(),
     )
 
 
@@ -191,43 +215,45 @@ def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.intp]) -> NDArray
     return patches.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)[: grid.height, : grid.width]
 
 
-def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
+def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
     """Return the findings of a run by their names in the receipt."""
-    plan = load_plan(products["score"])
-    figures: dict[str, Any] = {"kind": plan.kind, "reason": plan.reason, "lines": plan.lines, "seconds": plan.seconds}
-    found: dict[str, Any] = {"field": field_figures(run, plan), "plan": figures}
-    prior = None if run.prior is None else dict(read_table(products["segment"].path / PRIOR_FIGURES))
-    if run.recorded is not None:
+    fine = load_plan(products.attention)
+    figures: dict[str, Any] = {"kind": fine.kind, "reason": fine.reason, "lines": fine.lines, "seconds": fine.seconds}
+    found: dict[str, Any] = {"field": field_figures(plan, fine), "plan": figures}
+    prior = None
+    if plan.field.prior is not None:
+        prior = {"run": plan.field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
+    if plan.field.recorded is not None:
         found["recording"] = {
-            "sweeps": str(run.settings.sweeps),
-            "lines_read": run.recorded.lines_served([*run.plan.coarse, *plan.sweeps]),
-            "lines_recorded": sum(int(one.valid_line.sum()) for one in run.recorded.source.sweeps),
-            "passes_s": run.plan.coarse_s + plan.seconds,
-            "full_scan_s": run.settings.cost.seconds(run.plan.full, run.camera),
+            "sweeps": str(plan.settings.sweeps),
+            "lines_read": plan.field.recorded.lines_served([*plan.passes.coarse, *fine.sweeps]),
+            "lines_recorded": sum(int(one.valid_line.sum()) for one in plan.field.recorded.source.sweeps),
+            "passes_s": plan.passes.coarse_s + fine.seconds,
+            "full_scan_s": plan.settings.cost.seconds(plan.passes.full, plan.field.camera),
         }
-    if run.chooses and (run.plan.plain or run.least_gain is not None):
-        found["kept"] = run.reading_figures(read_in_full(products["score"], products["segment"]))
+    if plan.chooses and (plan.passes.plain or plan.least_gain is not None):
+        found["kept"] = plan.reading_figures(read_in_full(products.attention, products.class_map))
     if prior is not None:
         found["prior_map"] = prior
-    if run.settings.extent != EXTENT_WHOLE:
+    if plan.settings.extent != EXTENT_WHOLE:
         found["extent"] = {
-            "lines": run.settings.extent,
-            "patches_touched": len(plan.patch_index) / max(len(run.kept_patches), 1),
+            "lines": plan.settings.extent,
+            "patches_touched": len(fine.patch_index) / max(len(plan.field.kept_patches), 1),
             "uses_prior_map": prior is not None,
-            **({} if run.extent is None else asdict(run.extent)),
+            **({} if plan.extent is None else asdict(plan.extent)),
         }
-    passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
-    pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
+    passes = {"coarse": products.first, "fine": products.second}
+    pointing = {name: _pointing(one.seams) for name, one in passes.items() if one is not None and one.seams is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = _partly_seen(run, products.mosaic, plan)
+        pointing["fine"]["partly_seen"] = _partly_seen(plan, products.mosaic, fine)
     if pointing:
-        found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
-    drawn = load_class_map(products["segment"].path / "class_map.zarr")
-    posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
-    probabilities = ProbabilityStore(products["segment"].path / "class_probabilities.zarr")
-    found |= find_areas(run, posed, drawn) | find_ground(run, posed, drawn, probabilities, prior)
-    found |= find_zones(run, drawn) | find_map(run, products["segment"], drawn)
-    if run.raster is not None:
+        found["pointing"] = {"prior_px": plan.settings.pointing_px, **pointing}
+    drawn = load_class_map(products.class_map.path / "class_map.zarr")
+    posed = None if products.ground is None else load_ground_map(products.ground.path / STORE)
+    probabilities = ProbabilityStore(products.class_map.path / "class_probabilities.zarr")
+    found |= find_areas(plan, posed, drawn) | find_ground(plan, posed, drawn, probabilities, prior)
+    found |= find_zones(plan, drawn) | find_map(plan, products.class_map, drawn)
+    if plan.field.raster is not None:
         return found
     record = products.mosaic.path / SIGNAL_RECORD
     saturated = read_table(record).get("saturated") if record.is_file() else None  # archives of before 2026-11-27
@@ -239,16 +265,16 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     return found
 
 
-def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
+def _partly_seen(plan: SurveyPlan, mosaic: Ref, fine: FinePlan) -> int:
     """Count the chosen patches that the fine pass did not capture completely."""
     kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
     if kinds is None:
         return 0
-    coarse = np.array([step >= run.plan.coarse[0].step for _, step, _ in kinds[0]])[kinds[1]]
-    return int(np.count_nonzero(patch_pixels(run.grid, coarse)[plan.patch_index].any(axis=(1, 2))))
+    coarse = np.array([step >= plan.passes.coarse[0].step for _, step, _ in kinds[0]])[kinds[1]]
+    return int(np.count_nonzero(patch_pixels(plan.field.grid, coarse)[fine.patch_index].any(axis=(1, 2))))
 
 
-def _pointing(ref: StageRef) -> dict[str, Any]:
+def _pointing(ref: Ref) -> dict[str, Any]:
     """Return the pointing corrections of a pass; residuals only where there are more windows than unknowns."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
@@ -262,24 +288,24 @@ def _pointing(ref: StageRef) -> dict[str, Any]:
     }
 
 
-def count_bytes(survey: OpenSurvey, plan: FinePlan, rests_on: Iterable[str]) -> Facts:
+def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: FinePlan, rests_on: Iterable[str]) -> Facts:
     """Return the bytes that a survey captured, wrote and keeps, and those of the reference.
 
     ``rests_on`` are its stores and their inputs. Raw lines that the setting ``keep`` drops do not count as kept, nor do
     the stores of the visit of its prior map.
     """
-    run, archive = survey.run, survey.run.archive
-    bands = len(run.scene.wavelength_nm)
-    captured, reference = 0, int(np.prod(run.scene.shape)) * bands * BYTES_PER_SAMPLE
-    if run.raster is None:
-        captured = raw_bytes([*run.plan.coarse, *plan.sweeps], run.camera, bands)
-        reference = raw_bytes(run.plan.full, run.camera, bands)
-    others = set() if run.prior is None else set(archive.manifest_hashes(run.prior.stores))
-    if run.settings.keep == KEEP_SIGNAL:
-        others |= {ref.uri for ref in survey.products.there("capture_coarse", "capture_fine")}
+    field, archive = plan.field, stores.archive
+    bands = len(field.scene.wavelength_nm)
+    captured, reference = 0, int(np.prod(field.scene.shape)) * bands * BYTES_PER_SAMPLE
+    if field.raster is None:
+        captured = raw_bytes([*plan.passes.coarse, *fine.sweeps], field.camera, bands)
+        reference = raw_bytes(plan.passes.full, field.camera, bands)
+    others = set() if field.prior is None else set(archive.manifest_hashes(field.prior.stores))
+    if plan.settings.keep == KEEP_SIGNAL:
+        others |= {one.raw.uri for one in products.passes}
     return {
         "captured": captured,
-        "written": survey.bytes_written,
+        "written": stores.bytes_written,
         "kept": sum(archive.sizes(uri for uri in rests_on if uri not in others).values()),
         "reference": reference,
     }

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, replace
-from datetime import UTC, datetime
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from spectralzoom.flows.settings.documents import about, toml_value
 from spectralzoom.flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
-from spectralzoom.flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
+from spectralzoom.flows.settings.survey_settings import AUTO, Settings
 from spectralzoom.pipeline.errors import PipelineError, SettingsError
 
 OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
@@ -101,18 +100,3 @@ class SurveySettings(BaseModel):
         """Return the field's name, or its scene's."""
         requested = self.settings()
         return requested.name or Path(requested.scene).stem
-
-
-def at_due_time(settings: Settings, due: datetime) -> Settings:
-    """Return the settings of a scheduled visit: it has the due time as its name and starts from the newest prior map.
-
-    The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
-    """
-    requested = replace(
-        settings,
-        visit=settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
-        prior="latest" if settings.prior == "auto" else settings.prior,
-    )
-    if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:
-        return replace(requested, day=due.astimezone().timetuple().tm_yday)
-    return requested

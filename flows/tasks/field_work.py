@@ -16,7 +16,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memory
 from spectralzoom.models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
 from spectralzoom.models.policies.placement import classes_by
@@ -29,9 +28,9 @@ from spectralzoom.models.reading.inference import (
     read_coarse_prediction,
     save_overview,
 )
-from spectralzoom.models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes, plan_regions
+from spectralzoom.models.reading.regions import HALO_PX, REGION_PX, Region, most_bytes
 from spectralzoom.models.weights.checksummed_files import SEAL
-from spectralzoom.models.weights.files import Weights, describe_weights, load_reader, load_weights
+from spectralzoom.models.weights.files import Description, Weights, describe_weights, load_reader, load_weights
 from spectralzoom.pipeline.errors import WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.rectify.region import free_tiles
@@ -55,11 +54,22 @@ class WeightsFile:
 
     path: Path
     seal: str
+    weights: str  # their key
     device: str = PROCESSOR  # of the network
+
+    @staticmethod
+    def of(path: Path, described: Description, device: str) -> WeightsFile:
+        """Return the weights in a file with this record."""
+        return WeightsFile(path, described.about[SEAL], described.key, device)
+
+    @property
+    def key(self) -> dict[str, str]:
+        """Return what results depend on."""
+        return {"weights": self.weights, "device": self.device}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel with the content of the file, which other machines may lack."""
-        return _weights_there, (self.seal, self.device, self.path.read_bytes())
+        return _weights_there, (self.seal, self.weights, self.device, self.path.read_bytes())
 
     def _check(self) -> None:
         if describe_weights(self.path).about[SEAL] != self.seal:
@@ -83,12 +93,12 @@ def _folder_of_weights() -> TemporaryDirectory[str]:
     return TemporaryDirectory(prefix="spectralzoom-weights-")
 
 
-def _weights_there(seal: str, device: str, content: bytes) -> WeightsFile:
+def _weights_there(seal: str, weights: str, device: str, content: bytes) -> WeightsFile:
     """Return weights to a worker, in a temporary file: a file of the same path may be another one there."""
     path = Path(_folder_of_weights().name) / f"{seal}.safetensors"
     if not path.is_file():
         path.write_bytes(content)
-    return WeightsFile(path, seal, device)
+    return WeightsFile(path, seal, weights, device)
 
 
 @dataclass(frozen=True)
@@ -191,11 +201,6 @@ def seen_patches(
     return numbers, coarse.patches(numbers)
 
 
-def region_params(grid: SceneGrid) -> dict[str, Any]:
-    """Return the parameters of the division into regions; empty for a single region."""
-    return {} if len(plan_regions(grid, SHARD)) == 1 else {"regions": {"most_px": REGION_PX, "halo_px": HALO_PX}}
-
-
 @dataclass(frozen=True)
 class FieldWork:
     """Computation of the model over one field: weights, regions, worker pool and memory."""
@@ -204,6 +209,12 @@ class FieldWork:
     regions: Sequence[Region]
     pool: WorkerPool
     memory: int  # of this process and its workers [bytes]
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return what results depend on: weights, and the division into regions where there are several."""
+        several = len(self.regions) > 1
+        return {"weights": self.weights, "regions": [REGION_PX, HALO_PX] if several else None}
 
     def score(self, policy: str, mosaic: StageRef, capture: LineSpec, report: Report) -> NDArray[np.float64]:
         """Return the scores of all patches of the padded grid, (patch_y, patch_x).

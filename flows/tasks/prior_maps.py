@@ -47,6 +47,11 @@ class Prior:
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
 
     @property
+    def key(self) -> dict[str, object]:
+        """Return what a map depends on besides `stores`."""
+        return {"days": self.days, "day_of_year": self.day_of_year, "classes": self.classes}
+
+    @property
     def stores(self) -> list[StageRef]:
         """Return the stores of earlier runs that a visit reads."""
         return [self.probabilities, self.mosaic]

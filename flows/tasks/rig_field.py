@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from spectralzoom.flows.settings.survey_settings import RIG, Settings
+from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.scene import FieldSource
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT
@@ -32,6 +33,47 @@ from spectralzoom.storage.archive.keys import array_digest
 from spectralzoom.storage.arrays.spool import FetchedFiles
 
 FETCHED = "camera"  # folder within a capture's spool
+RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
+LEASE_S = 60  # until a lost process frees that limit
+TRY_S = 10  # between two tries to get it
+
+
+class RigHold:
+    """The rig of this machine, which a survey locks at its first capture until it ends."""
+
+    def __init__(self, port: str | None) -> None:
+        self.port = port  # None: nothing to lock
+        self._held: ExitStack | None = None
+        self._taken = False
+        self._note: Callable[[str], None] = lambda text: None
+
+    @contextmanager
+    def released(self, note: Callable[[str], None]) -> Iterator[None]:
+        """Release the rig when the block ends, if it was taken."""
+        self._note = note
+        with ExitStack() as self._held:
+            yield
+        self._held, self._taken = None, False
+
+    def take(self) -> None:
+        """Lock the rig, unless this survey has it. Raises RigError: another survey uses the rig.
+
+        Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
+        is one.
+        """
+        if self._held is None or self._taken or self.port is None:
+            return
+        while inside_flow():  # signals are handled between tries
+            from prefect.concurrency.sync import concurrency
+
+            try:
+                limit = concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
+                self._held.enter_context(limit)
+                break
+            except TimeoutError:
+                self._note(f"waits for the rig: another survey has it, or was killed less than {LEASE_S} s ago")
+        self._held.enter_context(rig_to_oneself(self.port))
+        self._taken = True
 
 
 @dataclass(frozen=True)
@@ -39,6 +81,7 @@ class RigField(FieldSource):
     """Rig of the settings; files of its camera are kept beside the lines."""
 
     rig: RigSource
+    hold: RigHold
     name = RIG
 
     def key(self, field: str) -> dict[str, Any]:
@@ -49,11 +92,29 @@ class RigField(FieldSource):
             {} if rig.mounting == STRAIGHT else {"mounting": asdict(rig.mounting)}
         )
 
+    def check(self, sweeps: Sequence[Sweep]) -> None:
+        """Check that camera and mirror allow the sweeps.
+
+        Raises SettingsError: the camera does not allow an exposure or frame time; PoseError: the field exceeds the
+        mirror's range.
+        """
+        camera, mounting = self.rig.camera, self.rig.rig.mounting
+        for exposed in {exposing(camera, sweep) for sweep in sweeps} | {camera}:
+            check_times(exposed.exposure_ms, exposed.frame_ms, camera.max_rate_hz)
+        for sweep in sweeps if mounting != STRAIGHT else ():
+            mounting.to_device(sweep_positions(sweep, camera))
+
     def saying(self, say: Callable[[str], None]) -> RigField:
         return replace(self, rig=self.rig.saying(say))
 
     @contextmanager
+    def to_oneself(self, note: Callable[[str], None]) -> Iterator[None]:
+        with self.hold.released(note):
+            yield
+
+    @contextmanager
     def opened(self, spool: Path) -> Iterator[Source]:
+        self.hold.take()
         source = self.rig.keeping(FetchedFiles(spool / FETCHED))
         with source.session():
             yield source
@@ -69,22 +130,16 @@ class SimulatedRigField(RigField):
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
         seen = replace(self.simulated, chosen=chosen, clock=clock)
-        return RigField(self.rig.opening(lambda: open_devices(self.settings, seen=seen)))
+        return RigField(self.rig.opening(lambda: open_devices(self.settings, seen=seen)), self.hold)
 
 
-def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep], simulated: SimulatedSource) -> RigField:
+def rig_field(scene: RasterScene, settings: Settings, simulated: SimulatedSource) -> RigField:
     """Return the rig, not connected. A fake camera sees what ``simulated`` does, and its white reference.
 
-    Raises SettingsError: the camera does not allow the exposure or frame time, or a driver cannot be imported;
-    PoseError: the field exceeds the mirror's range.
+    Raises SettingsError: a driver cannot be imported.
     """
     drivers.import_factory(settings.rig, "mirror_driver")
     drivers.import_factory(settings.rig, "camera_driver")
-    for exposed in {exposing(settings.camera, sweep) for sweep in planned} | {settings.camera}:
-        check_times(exposed.exposure_ms, exposed.frame_ms, settings.camera.max_rate_hz)
-    if settings.rig.mounting != STRAIGHT:
-        for sweep in planned:
-            settings.rig.mounting.to_device(sweep_positions(sweep, settings.camera))
     fake = settings.rig.camera_driver == FAKE
     white = float(scene.white_reference.mean()) if fake else settings.rig.white_reference
     rig = RigSource(
@@ -96,7 +151,8 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep], 
         rig=replace(settings.rig, white_reference=round(white, 6)),
         vector_pairs=settings.cost.vector_pairs,
     )
-    return SimulatedRigField(rig, settings, simulated) if fake else RigField(rig)
+    hold = RigHold(settings.rig.port if settings.on_hardware else None)
+    return SimulatedRigField(rig, hold, settings, simulated) if fake else RigField(rig, hold)
 
 
 @contextmanager

@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import re
 import zlib
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +20,7 @@ from spectralzoom.models.weights.files import Description
 from spectralzoom.pipeline.errors import NoSceneYet, SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.effects.effect import Effect
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_scene
@@ -306,9 +307,17 @@ class FieldSource:
         """Return parameters of its light besides scene, camera, seed, sweeps and effects."""
         return {}
 
+    def check(self, sweeps: Sequence[Sweep]) -> None:
+        """Check that the source can capture these sweeps (SettingsError, PoseError: it cannot)."""
+
     def saying(self, say: Callable[[str], None]) -> FieldSource:
         """Return the source with a callback for its state before the first line."""
         return self
+
+    @contextmanager
+    def to_oneself(self, note: Callable[[str], None]) -> Iterator[None]:
+        """Keep others from the source while the block runs, once it is opened; ``note`` says what it waits for."""
+        yield
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
         """Return the source with chosen effects, and the start of each sweep by name [s]."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import odc.geo.geobox as odc_geobox
@@ -106,6 +106,12 @@ class GroundGrid:
     scene_shape: tuple[int, int]  # (y, x) [px]
     geobox: GeoBox
     least_sink: float  # rays that sink less meet the ground too far away to be mapped
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return the parameters that the grid was made of."""
+        view = self.frame.view
+        return {"pose": view.pose, "ifov_rad": view.ifov_rad, "scene_shape": self.scene_shape}
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Any, Literal
 
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -145,6 +145,14 @@ class Rig:
                 raise SettingsError(f"{place}.{name} {fault}")
         if self.sky.started is not None and self.sky.started.tzinfo is None:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return the rig as tables, without the light, which is in the key of the scene."""
+        parts = asdict(self)
+        sky = {name: value for name, value in parts["sky"].items() if name not in OF_THE_SCENE}
+        started = None if self.sky.started is None else self.sky.started.isoformat()
+        return {**parts, "sky": {**sky, "started": started}}
 
     def taking(self, sweep: Sweep) -> Rig:
         """Return the rig as it takes the lines of a sweep: with the sweep's exposure, if it has one of its own."""

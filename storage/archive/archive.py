@@ -115,6 +115,10 @@ class Archive:
                 )
         return self.root / address
 
+    def key(self, stage: str, version: int | str, params: Mapping[str, Any], inputs: Sequence[StageRef]) -> str:
+        """Return the key of a store."""
+        return stage_key(stage, version, params, [one.key for one in inputs])
+
     def find(self, stage: str, key: str) -> StageRef | None:
         """Return the published store; None where there is none or its files were cleared away.
 
@@ -175,13 +179,14 @@ class Archive:
         *,
         version: int | str,
         params: Mapping[str, Any],
-        inputs: Sequence[str] = (),
+        inputs: Sequence[str | StageRef] = (),
     ) -> tuple[StageRef, bool]:
         """Return the store with this key, and whether ``build`` wrote it now or it existed."""
-        key = stage_key(stage, version, params, inputs)
+        keys = [one if isinstance(one, str) else one.key for one in inputs]
+        key = stage_key(stage, version, params, keys)
         if (found := self.find(stage, key)) is not None:
             return found, False
-        with self.publish(stage, key, version=version, params=params, inputs=inputs) as staged:
+        with self.publish(stage, key, version=version, params=params, inputs=keys) as staged:
             if not staged.done:
                 build(staged.path)
         return staged.ref, not staged.done

@@ -71,6 +71,8 @@ def plain(value: object) -> Any:
             "shape": list(value.shape),
             "sha256": hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest(),
         }
+    if hasattr(value, "key") and not isinstance(value, type):
+        return plain(value.key)
     if is_dataclass(value) and not isinstance(value, type):
         return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from spectralzoom.storage.archive.keys import StageRef, in_text
 from spectralzoom.storage.archive.manifests import as_table, is_cleared, listed_bytes, try_manifest
@@ -35,21 +35,6 @@ def moment_of(text: object) -> datetime | None:
             found = datetime.fromisoformat(some)
             return found.replace(tzinfo=found.tzinfo or UTC) if found.year in YEARS else None
     return None
-
-
-@dataclass(frozen=True)
-class StageRecord:
-    """One stage of a run; figures of a stage that was read from the archive are None."""
-
-    name: str
-    key: str
-    state: Literal["ran", "cached"]
-    wall_s: float | None = None
-    cpu_s: float | None = None
-    peak_rss_bytes: int | None = None
-    bytes_in: int | None = None
-    bytes_out: int | None = None
-    manifest_sha256: str | None = None  # of the store that the stage left
 
 
 @dataclass(frozen=True)

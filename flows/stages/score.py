@@ -1,18 +1,18 @@
-"""Define the stage that scores patches and plans the second pass."""
+"""Score the patches of a field, and plan the second pass."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.tasks.field_work import FieldWork, region_params
+from spectralzoom.flows.frame import FieldFrame
+from spectralzoom.flows.stage import Output, Report, stage
+from spectralzoom.flows.tasks.field_work import FieldWork
 from spectralzoom.flows.tasks.patch_budget import PatchBudget
-from spectralzoom.flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
 from spectralzoom.flows.tasks.zones import SurveyZones
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.policies import SEEING_POLICIES, Scores, score_patches
@@ -23,12 +23,12 @@ from spectralzoom.pipeline.geometry.scan import Sweep, exposing
 from spectralzoom.pipeline.planning.coverage import patches_shown
 from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
 from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance, format_scan
-from spectralzoom.storage.archive.keys import StageRef, array_digest
-from spectralzoom.storage.archive.manifests import read_table, write_table
 from spectralzoom.storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
+from spectralzoom.storage.store import Ref, read_table, write_table
 
-READING = "attention.zarr"  # beside a class map whose drawing chose the patches
-ATTENTION = Product("score", version=20, files=("attention.zarr", "plan.json"), by_weights=True)
+SCORES = "attention.zarr"
+READING = SCORES  # also beside a class map, whose drawing chose the patches
+MADE_BY = ("models/network", "models/reading", "models/policies", "pipeline/planning")
 
 
 @dataclass(frozen=True)
@@ -46,17 +46,18 @@ class PatchGains:
     @property
     def key(self) -> dict[str, Any]:
         """Return the parameters of the gains."""
-        grid = self.frame.grid
+        sees = self.policy in SEEING_POLICIES
         return {
-            "grid": asdict(grid),
+            "frame": self.frame,
+            "zones": self.zones,
+            "work": self.work,
             "policy": self.policy,
             "seed": self.seed if self.policy == "random" else None,
-            "mask": None if self.mask is None else array_digest(self.mask),
-            **(region_params(grid) | {"capture": list(self.capture)} if self.policy in SEEING_POLICIES else {}),
-            **self.zones.key,
+            "mask": self.mask,
+            "capture": list(self.capture) if sees else None,
         }
 
-    def by_policy(self, mosaic: StageRef, report: Report) -> Scores:
+    def by_policy(self, mosaic: Ref, report: Report) -> Scores:
         """Return the (patch,) expected gain by the policy."""
         if self.policy in SEEING_POLICIES:
             return self.within_zones(self.work.score(self.policy, mosaic, self.capture, report).ravel())
@@ -79,9 +80,10 @@ class PatchGains:
         return patch_index if fractions is None else patch_index[fractions[patch_index] > 0]
 
 
-@stage("score", "patch scores", ATTENTION)
+@stage("patch scores", version=21, made_by=MADE_BY)
 def score(
-    mosaic: StageRef,
+    out: Output,
+    mosaic: Ref,
     *,
     gains: PatchGains,
     second_pass: SecondPass | None,
@@ -89,55 +91,46 @@ def score(
     scanned: FinePlan,
     budget: PatchBudget | None,
     least_gain: float | None,
-    model_key: dict[str, Any],
-    report: Report,
-) -> Wanted:
+) -> None:
     """Score every patch by the coarse mosaic, and plan the sweeps with the highest total score in the time left.
 
     Without a second pass, ``scanned`` is the plan, and ``budget`` limits its patches.
     """
-
-    def planned() -> tuple[Scores, FinePlan]:
-        """Return the scores, and the plan of the second pass."""
-        if second_pass is None and budget is None:
-            return np.zeros(int(np.prod(gains.frame.grid.patch_shape))), scanned
-        if second_pass is not None and scan_record is not None:
-            return gain_by_record(gains, mosaic, second_pass, scan_record, lambda done: report(0.5 * done))
-        scores = gains.by_policy(mosaic, lambda done: report(0.5 * done))
+    components = len(open_mosaic(mosaic.path / "mosaic.zarr").components)
+    if second_pass is None and budget is None:
+        scores, found = np.zeros(int(np.prod(gains.frame.grid.patch_shape))), scanned
+    elif second_pass is not None and scan_record is not None:
+        scores, found = gain_by_record(gains, mosaic, second_pass, scan_record, lambda done: out.report(0.5 * done))
+    else:
+        scores = gains.by_policy(mosaic, lambda done: out.report(0.5 * done))
         if second_pass is not None:
-            return scores, second_pass.plan(scores)
-        assert budget is not None
-        components = len(open_mosaic(mosaic.path / "mosaic.zarr").components)
-        chosen = replace(budget, costs=replace(budget.costs, bands=components)).choose(scores)
-        reason = f"{scanned.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
-        gain = float(np.where(np.isfinite(scores), scores, 0.0)[chosen].sum())
-        return scores, replace(scanned, patch_index=np.sort(chosen), reason=reason, expected_gain=gain)
+            found = second_pass.plan(scores)
+        else:
+            assert budget is not None
+            found = within_budget(scanned, scores, replace(budget, costs=replace(budget.costs, bands=components)))
+    found = replace(found, patch_index=gains.kept(found.patch_index))
+    read = found.patch_index
+    if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
+        read = gains.kept(gains.frame.grid.every_patch())  # the segmentation chooses among them
+    # raises an error before the second pass where the map will not fit the memory
+    gains.work.pool_for(read, components)
+    rank = np.full(scores.shape, -1, np.int32)
+    rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
+    shape = gains.frame.grid.patch_shape
+    write_attention(out.path / SCORES, Attention(scores.reshape(shape), rank.reshape(shape), gains.policy))
+    write_table(out.path / "plan.json", asdict(found) | {"patch_index": found.patch_index.tolist()})
 
-    def build(path: Path) -> None:
-        """Write score and rank of every patch, and the plan."""
-        scores, found = planned()
-        found = replace(found, patch_index=gains.kept(found.patch_index))
-        read = found.patch_index
-        if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
-            read = gains.kept(gains.frame.grid.every_patch())  # the segmentation chooses among them
-        # raises an error before the second pass where the map will not fit the memory
-        gains.work.pool_for(read, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
-        rank = np.full(scores.shape, -1, np.int32)
-        rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
-        shape = gains.frame.grid.patch_shape
-        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), gains.policy))
-        write_table(path / "plan.json", asdict(found) | {"patch_index": found.patch_index.tolist()})
 
-    params = {**model_key, **gains.key}
-    if second_pass is not None:
-        params |= second_pass.key | {"by_record": scan_record is not None, "least_gain": least_gain}
-    if budget is not None:
-        params["macs"] = budget.macs
-    return Wanted(build, params, [mosaic], shown=second_pass is not None or budget is not None)
+def within_budget(scanned: FinePlan, scores: Scores, budget: PatchBudget) -> FinePlan:
+    """Return the plan of a uniform scan whose patches a budget of multiply-adds limits."""
+    chosen = budget.choose(scores)
+    reason = f"{scanned.reason}; the full network reads {len(chosen)} of {len(budget.patch_index)} patches"
+    gain = float(np.where(np.isfinite(scores), scores, 0.0)[chosen].sum())
+    return replace(scanned, patch_index=np.sort(chosen), reason=reason, expected_gain=gain)
 
 
 def gain_by_record(
-    gains: PatchGains, mosaic: StageRef, second_pass: SecondPass, record: ScanPerformance, report: Report
+    gains: PatchGains, mosaic: Ref, second_pass: SecondPass, record: ScanPerformance, report: Report
 ) -> tuple[Scores, FinePlan]:
     """Return the expected wrong pixels of the first pass, and the second pass of the highest expected gain."""
     errors = gains.work.expected_errors(mosaic, gains.capture, report)
@@ -161,13 +154,13 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
     return FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {scan}")
 
 
-def load_plan(attention: StageRef) -> FinePlan:
+def load_plan(attention: Ref) -> FinePlan:
     """Read the plan of the second pass: sweeps, and the patches that they cover."""
     plan = read_table(attention.path / "plan.json")
     return FinePlan([Sweep(**one) for one in plan.pop("sweeps")], np.array(plan.pop("patch_index"), np.intp), **plan)
 
 
-def read_in_full(attention: StageRef, class_map: StageRef) -> NDArray[np.intp]:
+def read_in_full(attention: Ref, class_map: Ref) -> NDArray[np.intp]:
     """Return the patches (patch,) that the full network read, chosen before or during segmentation."""
     store = class_map.path / READING
-    return chosen_patches(store if store.exists() else attention.path / "attention.zarr")
+    return chosen_patches(store if store.exists() else attention.path / SCORES)

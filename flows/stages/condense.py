@@ -1,20 +1,20 @@
-"""Define the stages that compress lines, or a raster, into components of spectra that exceed the noise."""
+"""Compress lines, or a raster, into components of spectra that exceed the noise."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.settings.survey_settings import RASTER, SignalChoice
-from spectralzoom.flows.tasks.stage import FieldFrame, Product, Report, Wanted, stage
-from spectralzoom.flows.tasks.stages.capture import RIG_RECORD
-from spectralzoom.flows.tasks.stages.placement import MOSAIC, SIGNAL_RECORD
+from spectralzoom.flows.frame import FieldFrame
+from spectralzoom.flows.settings.survey_settings import SignalChoice
+from spectralzoom.flows.stage import Output, Report, Unkeyed, stage
+from spectralzoom.flows.stages.capture import RIG_RECORD
 from spectralzoom.pipeline.errors import IncompleteStoreError, SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.readings import MOST_VALUE, readings_alone
@@ -37,73 +37,77 @@ from spectralzoom.pipeline.signal.subspace import (
     with_shared,
 )
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import check_files, read_table, write_table
 from spectralzoom.storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import MosaicWriter
 from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from spectralzoom.storage.arrays.spool import line_values
 from spectralzoom.storage.readers.scene_files import RasterPixels
+from spectralzoom.storage.store import Ref, check_files, read_table, write_table
 
-SIGNAL = Product("condense", version=5)
-SIGNAL_FINE = Product("condense_fine", version=6)
+MADE_BY = ("pipeline/signal", "storage/arrays/signal_cubes.py", "storage/arrays/mosaics.py")
+SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic
 SHARED_FRACTION = 2e-3  # of rare spectra, from which on a component takes less space than residuals
 MOST_COMPARED = 65_536  # rare spectra, in which shared directions are searched for
 MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
-def condense(*passes: StageRef, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
-    """Compress the sweeps of all passes with common components."""
+@stage("signal", version=6, product="condense", made_by=MADE_BY)
+def condense_coarse(out: Output, raw: Ref, *, camera: LineCamera, signal: SignalChoice) -> None:
+    """Compress the sweeps of the first pass, or of the uniform scan."""
+    condense(out, [raw], camera, signal)
 
-    def build(path: Path) -> None:
-        """Compute the components, and write the scores of every sweep; again if rare spectra share components."""
-        captured = [(open_raw_cubes(raw.path), read_statistics(raw.path)) for raw in passes]
-        cubes = [cube for of_pass, _ in captured for cube in of_pass]
-        found = reduce(SignalStatistics.merged, (statistics for _, statistics in captured))
-        if cubes and not found.count:
-            raise SceneError(
-                "no spectrum of the sweeps is valid: their samples are saturated or dead, or their lines were lost; "
-                "capture with a shorter exposure, or look at the dark and white frames. The raw lines stay"
-            )
-        components = components_of(found, cubes, signal)
-        law = ResidualLaw.learned(found.spectra, components)
-        condenser = Condenser(components, law, camera, signal.rare_spectra, signal.step)
 
-        def written(condenser: Condenser) -> list[CondensedSweep]:
-            """Write every sweep with the noise model of its own pass, since exposures differ."""
-            of_passes = []
-            for of_pass, statistics in captured:
-                spectra = statistics.spectra
-                law = condenser.law if len(passes) == 1 else ResidualLaw.learned(spectra, condenser.components)
-                of_passes += [(cube, replace(condenser, law=law)) for cube in of_pass]
-            return _write_sweeps(path, of_passes, found, report)
+@stage("signal of all passes", version=7, made_by=MADE_BY)
+def condense_fine(out: Output, raw: Ref, first: Ref, *, camera: LineCamera, signal: SignalChoice) -> None:
+    """Compress the sweeps of both passes, ``raw`` of the second one, with common components."""
+    condense(out, [raw, first], camera, signal)
 
+
+def condense(out: Output, passes: Sequence[Ref], camera: LineCamera, signal: SignalChoice) -> None:
+    """Compute the components, and write the scores of every sweep; again if rare spectra share components.
+
+    Raises SceneError: no spectrum is valid.
+    """
+    captured = [(open_raw_cubes(raw.path), read_statistics(raw.path)) for raw in passes]
+    cubes = [cube for of_pass, _ in captured for cube in of_pass]
+    found = reduce(SignalStatistics.merged, (statistics for _, statistics in captured))
+    if cubes and not found.count:
+        raise SceneError(
+            "no spectrum of the sweeps is valid: their samples are saturated or dead, or their lines were lost; "
+            "capture with a shorter exposure, or look at the dark and white frames. The raw lines stay"
+        )
+    components = components_of(found, cubes, signal)
+    law = ResidualLaw.learned(found.spectra, components)
+    condenser = Condenser(components, law, camera, signal.rare_spectra, signal.step)
+
+    def written(condenser: Condenser) -> list[CondensedSweep]:
+        """Write every sweep with the noise model of its own pass, since exposures differ."""
+        of_passes = []
+        for of_pass, statistics in captured:
+            spectra = statistics.spectra
+            law = condenser.law if len(passes) == 1 else ResidualLaw.learned(spectra, condenser.components)
+            of_passes += [(cube, replace(condenser, law=law)) for cube in of_pass]
+        return _write_sweeps(out.path, of_passes, found, out.report)
+
+    done = written(condenser)
+    better = with_shared_directions(condenser, done, found, signal.false_alarm)
+    if better is not None:
+        condenser = better
         done = written(condenser)
-        better = with_shared_directions(condenser, done, found, signal.false_alarm)
-        if better is not None:
-            condenser = better
-            done = written(condenser)
-        every = sum(int(cube.valid_line.sum()) * cube.shape[1] for cube in cubes)
-        record = {
-            "components": len(condenser.components),
-            "bands": condenser.components.bands,
-            "step": condenser.step,
-            "spectra": sum(one.known for one in done),
-            "rare": sum(len(one.rare) for one in done),
-            "saturated": sum(one.saturated for one in done) / max(every, 1),
-        }
-        write_table(path / SIGNAL_RECORD, record)
-        rig_record = passes[0].path / RIG_RECORD
-        if rig_record.is_file():  # the raw lines may be deleted
-            shutil.copyfile(rig_record, path / RIG_RECORD)
-
-    key = {"camera": {"bits": camera.bits}, **asdict(signal)}  # scores depend on the saturation of the camera
-    return Wanted(build, key, list(passes))
-
-
-condense_coarse = stage("condense_coarse", "signal", SIGNAL, named="signal_coarse")(condense)
-condense_fine = stage("condense_fine", "signal of all passes", SIGNAL_FINE, named="signal_fine")(condense)
+    every = sum(int(cube.valid_line.sum()) * cube.shape[1] for cube in cubes)
+    record = {
+        "components": len(condenser.components),
+        "bands": condenser.components.bands,
+        "step": condenser.step,
+        "spectra": sum(one.known for one in done),
+        "rare": sum(len(one.rare) for one in done),
+        "saturated": sum(one.saturated for one in done) / max(every, 1),
+    }
+    write_table(out.path / SIGNAL_RECORD, record)
+    rig_record = passes[0].path / RIG_RECORD
+    if rig_record.is_file():  # the raw lines may be deleted
+        shutil.copyfile(rig_record, out.path / RIG_RECORD)
 
 
 def with_shared_directions(
@@ -159,7 +163,7 @@ def _write_sweeps(
     return done
 
 
-def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
+def raw_differs(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str | None:
     """Return why raw lines must be kept, or None if they can be deleted: every line is compared with its scores.
 
     ``passes`` are the captures in the order of their compression. Before, every byte of the store is verified.
@@ -171,7 +175,7 @@ def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera
         return f"{error}"
 
 
-def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
+def _lines_differ(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str | None:
     record = read_table(signal.path / SIGNAL_RECORD)
     if record["rare"] > MOST_RARE * max(record["spectra"], 1):
         fraction = 100 * record["rare"] / record["spectra"]
@@ -190,11 +194,17 @@ def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCame
     return None
 
 
-@stage("condense_raster", "signal of the raster", MOSAIC, inputs=0)
+@stage("signal of the raster", version=8, product="rectify", made_by=MADE_BY)
 def condense_raster(
-    *, raster: RasterPixels, frame: FieldFrame, signal: SignalChoice, scene: RasterScene, memory: int, report: Report
-) -> Wanted:
-    """Compress the pixels of a raster into its mosaic."""
+    out: Output,
+    *,
+    scene: RasterScene,
+    frame: FieldFrame,
+    signal: SignalChoice,
+    raster: Unkeyed[RasterPixels],
+    memory: Unkeyed[int],
+) -> None:
+    """Compress the pixels of a raster into its mosaic. They are read twice: for components, and for scores."""
 
     def blocks() -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.bool_]]]:
         """Yield blocks of rows: first row, values, validity."""
@@ -204,36 +214,29 @@ def condense_raster(
             valid = np.isfinite(values)
             yield first, values, valid.all(axis=2) if valid.all() else valid
 
-    def build(path: Path) -> None:
-        """Read the raster twice: for components, and for scores."""
-        found = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width)
-        whole = True
-        for first, values, valid in blocks():
-            found.add(values, valid)
-            whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)
-            report(0.5 * first / frame.grid.height)
-        if raster.bands <= FEW_BANDS and found.count:
-            components = bands_alone(found, 1.0 if whole else None)
-        else:
-            components = components_of_field(
-                found, frame.wavelength_nm, false_alarm=signal.false_alarm, least=signal.least
-            )
-        origin = np.zeros(raster.bands) if found.origin is None else found.origin
-        writer = MosaicWriter(
-            path / "mosaic.zarr",
-            (frame.grid.height, frame.grid.width),
-            components,
-            frame.wavelength_nm,
-            step=signal.step,
-            largest=components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean))),
-            fwhm_nm=frame.fwhm_nm,
-            grid=frame.angular_grid(),
-        )
-        for first, values, valid in blocks():
-            scored = score_lines(values, valid, components)
-            writer.write_rows(first, scored.scores, scored.quality != UNUSABLE)
-            report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
-        writer.blank(frame.missing)
-
-    params = {"source": RASTER, "scene": scene.key, "grid": asdict(frame.grid), **asdict(signal), **frame.key}
-    return Wanted(build, params | {"bands": raster.bands})
+    found = SignalStatistics(raster.bands, frame.grid.height * frame.grid.width)
+    whole = True
+    for first, values, valid in blocks():
+        found.add(values, valid)
+        whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)
+        out.report(0.5 * first / frame.grid.height)
+    if raster.bands <= FEW_BANDS and found.count:
+        components = bands_alone(found, 1.0 if whole else None)
+    else:
+        components = components_of_field(found, frame.wavelength_nm, false_alarm=signal.false_alarm, least=signal.least)
+    origin = np.zeros(raster.bands) if found.origin is None else found.origin
+    writer = MosaicWriter(
+        out.path / "mosaic.zarr",
+        (frame.grid.height, frame.grid.width),
+        components,
+        frame.wavelength_nm,
+        step=signal.step,
+        largest=components.largest(found.largest + np.abs(origin - np.nan_to_num(components.mean))),
+        fwhm_nm=frame.fwhm_nm,
+        grid=frame.angular_grid(),
+    )
+    for first, values, valid in blocks():
+        scored = score_lines(values, valid, components)
+        writer.write_rows(first, scored.scores, scored.quality != UNUSABLE)
+        out.report(0.5 + 0.5 * (first + len(values)) / frame.grid.height)
+    writer.blank(frame.missing)

@@ -1,0 +1,60 @@
+"""What all images of a survey share: pixels, bands, georeference, nodata; and the labels that judge its map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.ground.georeference import georeference_record
+from spectralzoom.pipeline.once import Once
+from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.store import array_digest
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Bands of a camera, (band,) each."""
+
+    wavelength_nm: NDArray[np.float64]
+    fwhm_nm: NDArray[np.float64] | None
+
+
+@dataclass(frozen=True)
+class FieldFrame:
+    """Frame of the images of a survey: pixels, bands, georeference and nodata."""
+
+    grid: SceneGrid
+    ifov_rad: float
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None
+    missing: NDArray[np.bool_] | None  # (y, x) nodata; None: no pixel
+    geobox: GeoBox | None  # of the fine grid; None: no georeference
+
+    @cached_property
+    def key(self) -> dict[str, Any]:
+        """Return the parameters of images besides their inputs."""
+        bands = {"wavelength_nm": self.wavelength_nm, "fwhm_nm": self.fwhm_nm}
+        return {"grid": self.grid, "missing": self.missing, **bands, **georeference_record(self.geobox)}
+
+    def angular_grid(self) -> AngularGrid:
+        """Return the grid of the scene's pixels."""
+        return AngularGrid(self.ifov_rad, (self.grid.height, self.grid.width), geobox=self.geobox)
+
+
+@dataclass(frozen=True)
+class FieldLabels:
+    """Labels of a field in the classes of the weights, without pixels of their training; drawn when first used."""
+
+    read: Once[NDArray[np.uint8] | None]  # (y, x)
+
+    @property
+    def key(self) -> str | None:
+        """Return a hash of the labels."""
+        found = self.read()
+        return None if found is None else array_digest(found)

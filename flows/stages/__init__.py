@@ -1,0 +1,1 @@
+"""The stages of a survey: functions that write one store each."""

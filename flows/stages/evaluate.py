@@ -1,0 +1,104 @@
+"""Evaluate a map by labels; with controls also maps of the small and of the full network alone.
+
+It does not count as cost of the survey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spectralzoom.flows.frame import FieldLabels
+from spectralzoom.flows.stage import Output, stage
+from spectralzoom.flows.stages.register import load_registration
+from spectralzoom.flows.stages.score import PatchGains
+from spectralzoom.models.evaluation.metrics import (
+    agreement,
+    average_accuracy,
+    confusion,
+    false_pixels,
+    iou_per_class,
+    kappa,
+)
+from spectralzoom.models.policies.placement import mixed
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.geometry.scan import Axis
+from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
+from spectralzoom.storage.arrays.class_maps import load_class_map
+from spectralzoom.storage.store import Ref, read_table, to_json
+
+RECORD = "accuracy.json"
+
+
+@stage("accuracy", version=19, made_by=("models/evaluation", "models/network", "models/reading"))
+def evaluate(
+    out: Output,
+    mosaic: Ref,
+    class_map: Ref,
+    seams: Ref | None,
+    *,
+    gains: PatchGains,
+    labels: FieldLabels,
+    along: Axis,
+    pointing: PointingErrors | None,
+    controls: bool,
+) -> None:
+    """Evaluate the map by the labels, and with controls readings by the overview and by the full network.
+
+    ``seams`` is the registration of the first pass, whose reference has the error that ``pointing`` simulates.
+    """
+    truth = labels.read()
+    assert truth is not None
+    truth = moved_labels(truth, map_offset(pointing, seams), along)
+    drawn = load_class_map(class_map.path / "class_map.zarr")
+    names = gains.work.weights.load().class_names
+    judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), truth)  # only pixels with a class
+    counts = confusion(judged, drawn.classes, len(names))
+    result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
+    if controls:
+        overview, full = gains.work.readings(mosaic, gains.capture, out.report)
+        fractions, grid = gains.zones.fractions, gains.frame.grid
+        kept = np.ones(len(grid.every_patch()), np.bool_) if fractions is None else fractions > 0
+        for name, reading in {"none": overview, "all": mixed(overview, full, kept, grid)}.items():
+            result[name] = map_figures(names, confusion(judged, reading, len(names)))
+    (out.path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
+
+
+def map_offset(pointing: PointingErrors | None, seams: Ref | None) -> NDArray[np.float64]:
+    """Return the offset of the map from the scene, (along, scan) px: the pointing error of the reference sweep.
+
+    Registration corrects relative errors only. The simulator knows the absolute one.
+    """
+    if pointing is None or seams is None:
+        return np.zeros(2)
+    return pointing.offset(load_registration(seams)["reference"])
+
+
+def moved_labels(labels: NDArray[np.uint8], off: NDArray[np.float64], along: Axis) -> NDArray[np.uint8]:
+    """Return labels shifted to the map, to the nearest pixel; pixels beyond them are unlabelled."""
+    down, across = np.rint(off[::-1] if along == "x" else off).astype(int)
+    rows, columns = (np.arange(size) + by for size, by in zip(labels.shape, (down, across), strict=True))
+    inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
+    moved = labels[np.clip(rows, 0, labels.shape[0] - 1)[:, None], np.clip(columns, 0, labels.shape[1] - 1)]
+    return np.where(inside, moved, np.uint8(UNLABELLED))
+
+
+def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, Any]:
+    """Return the figures of a map from its confusion matrix."""
+    false = zip(names, false_pixels(counts).tolist(), strict=True)
+    return {
+        **agreement(counts),
+        "average_accuracy": average_accuracy(counts),
+        "kappa": kappa(counts),
+        "pixels": int(counts.sum()),
+        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
+        "false_classes": {name: pixels for name, pixels in false if pixels},
+    }
+
+
+def load_accuracy(evaluated: Ref) -> dict[str, Any]:
+    """Read the figures of an evaluation."""
+    return read_table(evaluated.path / RECORD)

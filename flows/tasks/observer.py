@@ -1,0 +1,63 @@
+"""Report what a survey does to the terminal and to Prefect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from spectralzoom.flows.stage import inside_flow
+from spectralzoom.models.network.machine import give_back_freed_memory
+from spectralzoom.storage.arrays.layout import consolidate_stores
+
+
+def tidy_up(folder: Path) -> None:
+    """Consolidate the metadata of a store that was built, and give the memory of its making back."""
+    consolidate_stores(folder)
+    give_back_freed_memory()
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Callbacks that report what a survey does."""
+
+    watch: Callable[[str, str, float], None] = lambda stage, state, done: None  # progress of a stage, 0..1
+    note: Callable[[str], None] = lambda text: None  # assumptions and warnings
+    say: Callable[[str], None] = lambda text: None  # state of a device before its first line
+    log: Callable[[str], None] = lambda text: None  # one line for each finished stage
+
+
+_terminal: ContextVar[Observer | None] = ContextVar("observer", default=None)
+
+
+@contextmanager
+def observed_by(observer: Observer) -> Iterator[None]:
+    """Report the surveys of the block to ``observer`` as well as to Prefect."""
+    before = _terminal.set(observer)
+    try:
+        yield
+    finally:
+        _terminal.reset(before)
+
+
+def current_observer() -> Observer:
+    """Return the observer of a survey that is opened now."""
+    terminal = _terminal.get() or Observer()
+    if not inside_flow():
+        return terminal
+
+    def note(text: str) -> None:
+        terminal.note(text)
+        log_to_run(text)
+
+    return replace(terminal, note=note, log=log_to_run)
+
+
+def log_to_run(text: str) -> None:
+    """Write a line into the log of the Prefect run; errors of the server are ignored."""
+    with suppress(Exception):
+        from prefect import get_run_logger
+
+        get_run_logger().info(text)

@@ -1,0 +1,46 @@
+"""The visit of a survey: when a run of a deployment was due."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from spectralzoom.flows.stage import inside_flow
+from spectralzoom.flows.tasks.scene import scene_of_visit
+
+
+def settings_of_visit(parameters: SurveySettings) -> Settings:
+    """Return the settings of a run; a run of a deployment is a visit of its due time. Raises SettingsError."""
+    due = due_time()
+    settings = parameters.settings()
+    return settings if due is None else scene_of_visit(at_due_time(settings, due), due.astimezone())
+
+
+def due_time() -> datetime | None:
+    """Return the due time of a run of a deployment; None for other runs."""
+    if not inside_flow():
+        return None
+    from prefect.context import FlowRunContext
+
+    context = FlowRunContext.get()
+    flow_run = None if context is None else context.flow_run
+    if flow_run is None or flow_run.deployment_id is None or flow_run.expected_start_time is None:
+        return None
+    return datetime.fromisoformat(flow_run.expected_start_time.isoformat()).replace(microsecond=0)
+
+
+def at_due_time(settings: Settings, due: datetime) -> Settings:
+    """Return the settings of a scheduled visit: it has the due time as its name and starts from the newest prior map.
+
+    The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
+    """
+    requested = replace(
+        settings,
+        visit=settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
+        prior="latest" if settings.prior == "auto" else settings.prior,
+    )
+    if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:
+        return replace(requested, day=due.astimezone().timetuple().tm_yday)
+    return requested
