@@ -5,7 +5,21 @@ from __future__ import annotations
 from importlib import metadata
 
 from spectralzoom.flows.settings.documents import settings_table
-from spectralzoom.flows.tasks.open_survey import STAGES
+from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
+from spectralzoom.flows.stages.condense import condense_coarse, condense_fine, condense_raster
+from spectralzoom.flows.stages.effects import choose_effects
+from spectralzoom.flows.stages.evaluate import evaluate
+from spectralzoom.flows.stages.ground import ground
+from spectralzoom.flows.stages.locate import locate
+from spectralzoom.flows.stages.rectify import rectify, rectify_fine
+from spectralzoom.flows.stages.register import register_coarse, register_fine
+from spectralzoom.flows.stages.score import score
+from spectralzoom.flows.stages.segment import segment
+
+STAGES = (
+    *(choose_effects, capture_coarse, condense_coarse, register_coarse, locate, rectify, condense_raster, score),
+    *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
+)
 
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")
@@ -31,5 +45,5 @@ napoleon_custom_sections = ["Raises", "Returns"]  # in words: napoleon wants eac
 nitpick_ignore_regex = [("py:.*", ".*")]
 
 head = "| stage | on terminals | stored as, version |\n|---|---|---|\n"  # rows are in the order of a survey
-rows = [f"| `{n}` | {s.title} | `stages/{s.product.name}`, {s.product.version} |\n" for n, s in STAGES.items()]
+rows = [f"| `{one.name}` | {one.title} | `stages/{one.product}`, {one.version} |\n" for one in STAGES]
 myst_substitutions = {"settings": settings_table(), "stages": head + "".join(rows)}

@@ -23,7 +23,7 @@ import pytest
 
 from spectralzoom.flows.publish import run_folder
 from spectralzoom.flows.publish.quicklook import QuicklookData
-from spectralzoom.flows.tasks.stages import effects as effect_choice
+from spectralzoom.flows.stages import effects as effect_choice
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import uniform_sweeps

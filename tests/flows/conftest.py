@@ -18,8 +18,8 @@ import pytest
 from PIL import Image
 
 from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.stage import Stage
 from spectralzoom.flows.tasks.local_server import QUIET, local_server
-from spectralzoom.flows.tasks.open_survey import STAGES
 from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.maintenance.verification import verify_everything
@@ -152,16 +152,23 @@ def python(code: str, *words: object, **environment: str) -> subprocess.Complete
     return subprocess.run(command, env=known, capture_output=True, text=True, check=False)
 
 
-def act_instead(patch: pytest.MonkeyPatch, name: str, wants: Callable[..., Any]) -> None:
-    """Replace the function by which a stage requests its store."""
-    patch.setitem(STAGES, name, replace(STAGES[name], wants=wants))
+def stages() -> dict[str, Stage[Any]]:
+    """Return the stages of a survey by name."""
+    from spectralzoom.flows import survey
+
+    return {name: one for name, one in vars(survey).items() if isinstance(one, Stage)}
+
+
+def act_instead(patch: pytest.MonkeyPatch, name: str, act: Callable[..., Any]) -> None:
+    """Call ``act`` in place of a stage of the survey."""
+    patch.setattr(f"spectralzoom.flows.survey.{name}", act)
 
 
 def be_version(patch: pytest.MonkeyPatch, product: str, version: int) -> None:
     """Make all stages of a product write another version of it."""
-    for name, stage in list(STAGES.items()):
-        if stage.product.name == product:
-            patch.setitem(STAGES, name, replace(stage, product=replace(stage.product, version=version)))
+    for name, stage in stages().items():
+        if stage.product == product:
+            patch.setattr(f"spectralzoom.flows.survey.{name}", replace(stage, version=version))
 
 
 @pytest.fixture
