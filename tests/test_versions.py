@@ -10,6 +10,7 @@ import ast
 import hashlib
 import inspect
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 KNOWN = ROOT / "tests" / "versions.json"
 
 
+@cache
 def code_of(path: Path) -> str:
     """Return the code of a file without comments, docstrings and places."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
