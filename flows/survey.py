@@ -26,7 +26,7 @@ from spectralzoom.flows.tasks.stages.effects import choose_effects
 from spectralzoom.flows.tasks.stages.maps import ground, segment
 from spectralzoom.flows.tasks.stages.placement import locate, rectify_fine, register_coarse, register_fine
 from spectralzoom.pipeline.errors import SurveyStopped
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.store import Ref
 
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
@@ -70,7 +70,7 @@ def draw_class_map(opened: OpenSurvey) -> None:
         ground(opened, class_map, mosaic)
 
 
-def _draw_captured(opened: OpenSurvey) -> tuple[StageRef, StageRef]:
+def _draw_captured(opened: OpenSurvey) -> tuple[Ref, Ref]:
     """Capture the field in one or two passes, and segment it; return mosaic and class map."""
     effects = choose_effects(opened)
     signal = captured_signal(opened, "coarse", effects)

@@ -35,8 +35,7 @@ from spectralzoom.pipeline.geometry.scan import exposing
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.pipeline.planning.uniform_scans import format_scan, frontier
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef, is_archive, store_at
+from spectralzoom.storage.store import Archive, Ref, is_archive
 
 
 def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
@@ -69,7 +68,7 @@ class _WaitsError(IncompleteStoreError):
 
 
 @dataclass(frozen=True)
-class _Awaited(StageRef):
+class _Awaited(Ref):
     """Address of a store that is still to be made: reading its path, or an unknown key, raises _WaitsError."""
 
     made_by: str = ""
@@ -88,10 +87,10 @@ class Planner(OpenSurvey):
         super().__init__(run)
         self.rows: list[StageForecast] = []
 
-    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
+    def __call__(self, stage: str, /, *inputs: Ref) -> Ref:
         """Add the forecast of a stage, and return the address that its store would have."""
         product = STAGES[stage].product.name
-        ref: StageRef = _Awaited(product, "", Path(), made_by=stage)
+        ref: Ref = _Awaited(product, "", Path(), made_by=stage)
         try:
             wanted = STAGES[stage].wants(self.run, *inputs)
             key = STAGES[stage].key(wanted)
@@ -101,19 +100,19 @@ class Planner(OpenSurvey):
             row = StageForecast(stage, "blocked", None, why)
         else:
             row = StageForecast(stage, "to run" if found is None else "cached", key)
-            ref = found or _Awaited(product, key, store_at(self.run.archive.root, product, key).path, made_by=stage)
+            ref = found or _Awaited(product, key, self.run.archive.ref(product, key).path, made_by=stage)
         if row not in self.rows:  # the later of two passes asks for lines of the first again
             self.rows.append(row)
         self.products[stage] = ref
         return ref
 
-    def goes_back(self, request: StageRef) -> bool:
+    def goes_back(self, request: Ref) -> bool:
         """Return whether the survey may ask for more lines."""
         with suppress(PipelineError, OSError):
             return super().goes_back(request)
         return not self.run.plan.plain
 
-    def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
+    def take_as_found(self, stage: str, ref: Ref, *inputs: Ref) -> None:
         """Add a store that is not made again, because later ones were made of it."""
         self.rows.append(StageForecast(stage, "cached", ref.key))
         self.products[stage] = ref

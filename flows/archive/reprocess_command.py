@@ -31,12 +31,10 @@ from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import canonical_json
-from spectralzoom.storage.archive.lineage import Catalogue
-from spectralzoom.storage.archive.records import Run, read_run
 from spectralzoom.storage.parallel.pool import THREADS, WorkerPool
 from spectralzoom.storage.readers.recordings import stores_of_lines
+from spectralzoom.storage.runs import Catalogue, Run, read_run
+from spectralzoom.storage.store import Archive, text_of
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
 
@@ -89,7 +87,7 @@ def reprocess_fields(
     SettingsError: no field has this name; ArchiveError: the archive cannot be read or written.
     """
     opened = Archive.open(archive, create=False, write=not dry_run)
-    catalogue = Catalogue.read(opened.root)
+    catalogue = Catalogue.read(opened)
     if weights is not None:
         describe_weights(weights)  # raises an error before any survey
     fields = newest_runs(catalogue)
@@ -187,7 +185,7 @@ def fields_of(catalogue: Catalogue) -> list[list[Run]]:
                 break
             lit = by_name[name]
         asked = [lit.settings.get(name) for name in ("source", "visit")]
-        found.setdefault(canonical_json([called(run), lit.receipt.get("scene", run.uri), *asked]), []).append(run)
+        found.setdefault(text_of([called(run), lit.receipt.get("scene", run.uri), *asked]), []).append(run)
     return list(found.values())
 
 
@@ -204,10 +202,12 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     changed. The settings stay as they are otherwise. Raises SettingsError, BudgetError: as `asked_again`; SceneError:
     the raw cubes are gone too.
     """
-    raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
+    raw = set(
+        stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri]["cleared"])
+    )
     stores = [catalogue.stores.get(uri) for uri in raw]
     is_there = _is_there(run, settings)
-    if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
+    if not stores or any(one is None or one["problem"] is not None or one["cleared"] for one in stores):
         if is_there:
             return settings
         raise SceneError(
@@ -262,9 +262,9 @@ def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> s
         uri
         for uri, store in found.items()
         if store is None
-        or store.problem is not None
-        or store.version != str(now.get(store.ref.stage))
-        or (store.ref.stage in by_weights and store.params.get("weights", weights) != weights)
+        or store["problem"] is not None
+        or store["version"] != now.get(store["stage"])
+        or (store["stage"] in by_weights and store["params"].get("weights", weights) != weights)
     }
 
 

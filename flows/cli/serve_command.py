@@ -36,8 +36,8 @@ from spectralzoom.flows.terminal.processes import DONE, terminable
 from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.staging import read_toml, take_lock
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import read_toml, take_lock
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -28,8 +28,7 @@ from spectralzoom.models.network.machine import keep_freed_memory
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.store import Archive, Ref
 
 TITLES = {"effects": "choice of effects", "capture": "scan"}
 PATCH = 16  # of the shipped weights, so that scans are those of their surveys
@@ -75,7 +74,7 @@ def simulate(
             progress.show(name, 0.0)
             return replace(run, report=lambda done: progress.show(name, done))
 
-        def made(name: str, stage: Stage, wanted: Wanted) -> tuple[StageRef, bool]:
+        def made(name: str, stage: Stage, wanted: Wanted) -> tuple[Ref, bool]:
             ref, built = stage.produce(run.archive, wanted)
             progress.show(name, 1.0, "" if built else "cached", ended=True)
             return ref, built
@@ -116,9 +115,7 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     return run, coarse_pass if coarse else full, notes
 
 
-def _record(
-    run: CaptureRun, sweeps: Sequence[Sweep], effects: StageRef, raw: StageRef, cpu_s: float | None
-) -> dict[str, Any]:
+def _record(run: CaptureRun, sweeps: Sequence[Sweep], effects: Ref, raw: Ref, cpu_s: float | None) -> dict[str, Any]:
     manifest = load_manifest(effects)
     return {
         "scene": run.scene.key,

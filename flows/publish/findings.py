@@ -23,11 +23,10 @@ from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace
 from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
 from spectralzoom.pipeline.ground.zones import figures_of_plot
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import read_table
 from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
 from spectralzoom.storage.arrays.ground_maps import GroundMap
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
+from spectralzoom.storage.store import Ref, read_table
 
 PLOTS_FILE = "plots.csv"
 STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
@@ -163,7 +162,7 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
+def find_map(run: SurveyRun, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
     """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
     found: dict[str, Any] = {}
     unclassed = drawn.classes == UNLABELLED
@@ -183,7 +182,7 @@ def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
     return found if expected is None else found | {"expected": expected}
 
 
-def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
+def _expected(run: SurveyRun, ref: Ref) -> dict[str, Any] | None:
     """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
     They were compared for maps of uniform scans segmented in full without a prior map. Pixels without a class do not

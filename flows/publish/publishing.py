@@ -15,8 +15,8 @@ from spectralzoom.flows.tasks.prefect_tasks import as_task, inside_flow
 from spectralzoom.flows.tasks.stages.attention import load_plan
 from spectralzoom.flows.tasks.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.tasks.stages.condense import raw_differs
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.runs import Catalogue
+from spectralzoom.storage.store import Ref
 
 PASSES = (capture_fine.name, capture_coarse.name)  # in the order in which they are condensed
 WIDTH_PX = 800  # of the picture in the text
@@ -27,7 +27,7 @@ def publish(survey: OpenSurvey) -> RunRef:
     return as_task(_publish, "publish")(survey, *survey.products.values())
 
 
-def _publish(survey: OpenSurvey, *products: StageRef) -> RunRef:
+def _publish(survey: OpenSurvey, *products: Ref) -> RunRef:
     _clear_first_mosaic(survey)
     plan = load_plan(survey.products["score"])
     published = publish_run(survey, plan)
@@ -49,7 +49,7 @@ def _clear_raw(survey: OpenSurvey, run: RunRef) -> RunRef:
     passes = survey.products.there(*PASSES)
     if not survey.products.signals or any(archive.find(raw.stage, raw.key) is None for raw in passes):
         return run  # cleared before
-    catalogue = Catalogue.read(archive.root)
+    catalogue = Catalogue.read(archive)
     others = [one for raw in passes for one in catalogue.named_by(raw.uri) if one.settings.get("keep") != KEEP_SIGNAL]
     kept = f"{others[0].uri} keeps them" if others else None
     why = kept or raw_differs(passes, survey.products.signals[0], survey.run.camera)
@@ -69,7 +69,7 @@ def _clear_first_mosaic(survey: OpenSurvey) -> None:
     first = survey.products.get("rectify")
     if first is None or "rectify_fine" not in survey.products or survey.registers:  # fine sweeps are registered on it
         return
-    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
+    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive).runs):
         archive.clear(first, wait=False)
 
 

@@ -42,17 +42,15 @@ from spectralzoom.flows.tasks.stages.attention import READING, load_plan, read_i
 from spectralzoom.flows.tasks.stages.effects import load_manifest
 from spectralzoom.flows.tasks.stages.maps import STORE
 from spectralzoom.flows.tasks.stages.placement import SIGNAL_RECORD, load_registration
-from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import CURE, read_table
-from spectralzoom.storage.archive.records import RECEIPT, read_run
-from spectralzoom.storage.archive.whole_files import to_json
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
+from spectralzoom.storage.runs import RECEIPT, read_run
+from spectralzoom.storage.store import Ref, damage, read_table
+from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
@@ -70,7 +68,7 @@ def load_receipt(folder: Path) -> Receipt:
     """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
     found = read_run(folder)
     if found.problem is not None:
-        raise IncompleteStoreError(f"{found.uri}: {found.problem}; {CURE}")
+        raise damage(folder, found.problem)
     return check_receipt(found.receipt)
 
 
@@ -80,17 +78,23 @@ def publish_run(survey: OpenSurvey, plan: FinePlan) -> Published:
     rests_on = run.archive.manifest_hashes(products.values())
     shown = quicklook_data(run, products, plan)
     quicklook = draw_quicklook(shown)
-    with run.archive.new_run(run.name) as draft:
-        receipt = make_receipt(survey, plan, f"runs/{draft.id}", count_bytes(survey, plan, rests_on))
-        field = field_map(shown, run.prior)
-        page = render_report(receipt, quicklook, field=field)
-        draft.write_file("quicklook.png", quicklook)
+
+    receipt: Receipt = {}
+
+    def write(folder: Path, uri: str) -> Facts:
+        """Write the files of the run into a folder, and return facts for its manifest."""
+        nonlocal receipt
+        receipt = make_receipt(survey, plan, uri, count_bytes(survey, plan, rests_on))
+        page = render_report(receipt, quicklook, field=field_map(shown, run.prior))
+        (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
-            draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
-        draft.write_file(RECEIPT, to_json(receipt))
-        draft.write_file(REPORT, page)
-        draft.publish(rests_on=rests_on, survey=receipt["survey"], settings=receipt["settings"])
-    return Published(receipt, draft.published)
+            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]))
+        (folder / RECEIPT).write_text(to_json(receipt), encoding="utf-8")
+        (folder / REPORT).write_text(page, encoding="utf-8")
+        return {"survey": receipt["survey"], "settings": receipt["settings"]}
+
+    folder = run.archive.publish_run(run.name, write, list(products.values()))
+    return Published(receipt, folder)
 
 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str, data_bytes: Facts) -> Receipt:
@@ -239,7 +243,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     return found
 
 
-def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
+def _partly_seen(run: SurveyRun, mosaic: Ref, plan: FinePlan) -> int:
     """Count the chosen patches that the fine pass did not capture completely."""
     kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
     if kinds is None:
@@ -248,7 +252,7 @@ def _partly_seen(run: SurveyRun, mosaic: StageRef, plan: FinePlan) -> int:
     return int(np.count_nonzero(patch_pixels(run.grid, coarse)[plan.patch_index].any(axis=(1, 2))))
 
 
-def _pointing(ref: StageRef) -> dict[str, Any]:
+def _pointing(ref: Ref) -> dict[str, Any]:
     """Return the pointing corrections of a pass; residuals only where there are more windows than unknowns."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
@@ -280,6 +284,6 @@ def count_bytes(survey: OpenSurvey, plan: FinePlan, rests_on: Iterable[str]) -> 
     return {
         "captured": captured,
         "written": survey.bytes_written,
-        "kept": sum(archive.sizes(uri for uri in rests_on if uri not in others).values()),
+        "kept": sum(archive.size_of(uri) for uri in rests_on if uri not in others),
         "reference": reference,
     }

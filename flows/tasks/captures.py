@@ -21,7 +21,7 @@ from spectralzoom.flows.tasks.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.tasks.stages.condense import condense_coarse, condense_fine
 from spectralzoom.flows.tasks.stages.placement import rectify
 from spectralzoom.pipeline.errors import IncompleteStoreError
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.store import Ref
 
 OPENING = "plan"
 _opened: ContextVar[list[tuple[Settings, SurveyRun]] | None] = ContextVar("opened", default=None)
@@ -85,7 +85,7 @@ def _due_time() -> datetime | None:
     return datetime.fromisoformat(flow_run.expected_start_time.isoformat()).replace(microsecond=0)
 
 
-def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
+def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: Ref) -> Ref:
     """Return the stored sweeps of a pass, ``coarse`` or ``fine``; capture them if the archive lacks them.
 
     Raises RigError: another survey uses the rig.
@@ -94,7 +94,7 @@ def capture_pass(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef
     return PASSES[sweeps](survey, *inputs)
 
 
-def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
+def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: Ref) -> Ref:
     """Return the condensed sweeps of a pass; capture only what the archive lacks. Raises as `capture_pass`."""
     condense, stage = CONDENSED[sweeps], PASSES[sweeps]
     before = survey.products.there("capture_coarse") if sweeps == "fine" else []
@@ -114,7 +114,7 @@ def captured_signal(survey: OpenSurvey, sweeps: str, *inputs: StageRef) -> Stage
     return condense(survey, raw, *before)
 
 
-def first_mosaic(survey: OpenSurvey, *inputs: StageRef | None) -> StageRef:
+def first_mosaic(survey: OpenSurvey, *inputs: Ref | None) -> Ref:
     """Return the mosaic of the first pass; one that was cleared after the second pass is not made again."""
     given = [ref for ref in inputs if ref is not None]
     with suppress(IncompleteStoreError):  # an incomplete input is an error of the stage

@@ -21,10 +21,9 @@ from spectralzoom.flows.tasks.stages.effects import choose_effects
 from spectralzoom.flows.tasks.stages.maps import ground, segment
 from spectralzoom.flows.tasks.stages.placement import locate, rectify, rectify_fine, register_coarse, register_fine
 from spectralzoom.pipeline.errors import SurveyStopped
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import manifest_sha256
-from spectralzoom.storage.archive.records import StageRecord
-from spectralzoom.storage.archive.staging import bytes_below
+from spectralzoom.storage.runs import StageRecord
+from spectralzoom.storage.store import Ref, manifest_sha256
+from spectralzoom.storage.whole_files import bytes_in
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 LEASE_S = 60  # until a lost process frees that limit
@@ -56,25 +55,25 @@ class RunRef:
         return self.folder.name
 
 
-class Products(dict[str, StageRef]):
+class Products(dict[str, Ref]):
     """Stores of a survey by stage."""
 
     @property
-    def mosaic(self) -> StageRef:
+    def mosaic(self) -> Ref:
         """Return the mosaic of all passes, or of the raster."""
         return self.there("rectify_fine", "rectify", "condense_raster")[0]
 
     @property
-    def signals(self) -> list[StageRef]:
+    def signals(self) -> list[Ref]:
         """Return the store of all condensed lines; empty for a raster."""
         return self.there("condense_fine", "condense_coarse")[:1]
 
     @property
-    def judged(self) -> list[StageRef]:
+    def judged(self) -> list[Ref]:
         """Return the inputs of the evaluation."""
         return [self.mosaic, *self.there("score", "segment", "choose_effects", "register_coarse")]
 
-    def there(self, *stages: str) -> list[StageRef]:
+    def there(self, *stages: str) -> list[Ref]:
         """Return the stores of those stages that ran."""
         return [self[name] for name in stages if name in self]
 
@@ -97,7 +96,7 @@ class OpenSurvey:
         """Return the name of the field, for names of Prefect runs."""
         return self.run.name
 
-    def goes_back(self, request: StageRef) -> bool:
+    def goes_back(self, request: Ref) -> bool:
         """Return whether the plan requests a second pass."""
         return not self.run.plan.plain and bool(load_plan(request).sweeps)
 
@@ -130,7 +129,7 @@ class OpenSurvey:
             self._held.enter_context(self.run.settings.pool.open())
             yield
 
-    def hold_rig(self, capture: Stage, *inputs: StageRef) -> None:
+    def hold_rig(self, capture: Stage, *inputs: Ref) -> None:
         """Lock the rig of this machine until the survey ends, if the archive lacks the sweeps of a capture.
 
         Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
@@ -154,12 +153,12 @@ class OpenSurvey:
         self._held.enter_context(rig_to_oneself(self.run.settings.rig.port))
         self._holds_rig = True
 
-    def stop_after(self, ref: StageRef, *stages: str) -> None:
+    def stop_after(self, ref: Ref, *stages: str) -> None:
         """Raise SurveyStopped if one of ``stages``, whose last store is ``ref``, is ``until`` of the settings."""
         if self.run.settings.until in stages:
             raise SurveyStopped(str(self.run.settings.until), ref.uri, self.run.archive.name)
 
-    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
+    def __call__(self, stage: str, /, *inputs: Ref) -> Ref:
         """Return the store of a stage, from the archive or built."""
         shown = True
 
@@ -189,14 +188,14 @@ class OpenSurvey:
         spent = (time.perf_counter() - wall_s, time.process_time() - cpu_s, peak_bytes()) if built else ()
         self._record(stage, ref, inputs, state, *spent)
         if built:
-            self._written += bytes_below(self.run.archive.root / ref.uri)
+            self._written += bytes_in(self.run.archive.root / ref.uri)
         watch(stage, state, 1.0)
         record = self.records[stage]
         took = "found" if record.wall_s is None else f"{record.wall_s:.1f} s"
         self.observer.log(f"{TITLES[stage]}: {took}, {(record.bytes_out or 0) / 1e6:.1f} MB, {ref.uri}")
         return ref
 
-    def take_as_found(self, stage: str, ref: StageRef, *inputs: StageRef) -> None:
+    def take_as_found(self, stage: str, ref: Ref, *inputs: Ref) -> None:
         """Record an existing store of ``inputs``, whose files may have been deleted."""
         self._record(stage, ref, inputs, "cached")
         self.observer.watch(stage, "cached", 1.0)
@@ -204,8 +203,8 @@ class OpenSurvey:
     def _record(
         self,
         stage: str,
-        ref: StageRef,
-        inputs: Sequence[StageRef],
+        ref: Ref,
+        inputs: Sequence[Ref],
         state: Literal["ran", "cached"],
         wall: float | None = None,
         cpu: float | None = None,

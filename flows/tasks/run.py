@@ -72,12 +72,11 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, US
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from spectralzoom.pipeline.source import References
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import is_archive
 from spectralzoom.storage.arrays.layout import image_spec
 from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.readers.open_cubes import load_labels_array
 from spectralzoom.storage.readers.scene_files import RasterPixels, SceneFile
+from spectralzoom.storage.store import Archive, is_archive
 
 PRIOR_MAP_GAIN = 3.0  # least gain with a prior map over that without one: losses are then alike (prior-maps.md)
 REPRESENTATIVE = 3  # exposures of a second pass, for which effects are chosen

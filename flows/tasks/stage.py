@@ -25,13 +25,11 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.tasks.prefect_tasks import as_task
 from spectralzoom.models.network.machine import give_back_freed_memory
-from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import georeference_record
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef, array_digest, stage_key
-from spectralzoom.storage.archive.manifests import is_cleared, try_manifest
 from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.arrays.layout import consolidate_stores
+from spectralzoom.storage.store import Archive, Ref, array_digest, stage_key
 
 Report = Callable[[float], None]  # progress of a stage, 0..1
 
@@ -74,7 +72,7 @@ class Wanted:
 
     build: Callable[[Path], None]  # writes into a given folder
     params: Mapping[str, Any]
-    inputs: Sequence[StageRef] = ()
+    inputs: Sequence[Ref] = ()
     then: Callable[[], object] = field(default=lambda: None)  # called once the store exists
     shown: bool = True  # on terminals; False if there is nothing to decide or compute
 
@@ -91,7 +89,7 @@ class Stage:
     retries: int  # by Prefect, after an OSError
     named: str | None  # name in receipts, where another stage has the same product
 
-    def __call__(self, survey: Callable[..., StageRef], *inputs: StageRef | None) -> StageRef:
+    def __call__(self, survey: Callable[..., Ref], *inputs: Ref | None) -> Ref:
         """Return the store of the stage, from the archive or built; a task inside a Prefect flow.
 
         Inputs that are None are ignored. Inside a flow, an OSError is retried ``retries`` times.
@@ -99,7 +97,7 @@ class Stage:
         run = as_task(run_stage, self.name, retries=self.retries)
         return run(survey, self.name, *(ref for ref in inputs if ref is not None))
 
-    def addresses(self, ref: StageRef) -> dict[str, str]:
+    def addresses(self, ref: Ref) -> dict[str, str]:
         """Return the addresses of its store, or of the files in it, by their names in receipts."""
         if self.named is not None or not self.product.files:
             return {self.named or self.name: "/".join((ref.uri, *self.product.files))}
@@ -107,36 +105,24 @@ class Stage:
 
     def key(self, wanted: Wanted) -> str:
         """Return the key of a request: a hash of version, parameters and the keys of the inputs."""
-        return stage_key(self.product.name, self.product.version, wanted.params, [ref.key for ref in wanted.inputs])
+        return stage_key(self.product.name, self.product.version, wanted.params, wanted.inputs)
 
-    def find(self, archive: Archive, wanted: Wanted) -> StageRef | None:
+    def find(self, archive: Archive, wanted: Wanted) -> Ref | None:
         """Return the requested store; None where the archive lacks it."""
         return archive.find(self.product.name, self.key(wanted))
 
-    def produce(self, archive: Archive, wanted: Wanted) -> tuple[StageRef, bool]:
+    def produce(self, archive: Archive, wanted: Wanted) -> tuple[Ref, bool]:
         """Find or build the requested store; return it, and whether it was built.
 
         Raises ArchiveError: another survey has cleared an input meanwhile.
         """
 
         def build(folder: Path) -> None:
-            """Build the store, and check that its inputs are the same afterwards."""
-            folders = [archive.root / ref.uri for ref in wanted.inputs]
-            before = [try_manifest(one) for one in folders]
-            try:
-                wanted.build(folder)
-            finally:  # a cleared array reads as nodata, or fails
-                if any(map(is_cleared, folders)) or [try_manifest(one) for one in folders] != before:
-                    raise ArchiveError(
-                        f"another survey has cleared an input of {self.name} meanwhile; repeat the command"
-                    )
+            wanted.build(folder)
+            consolidate_stores(folder)
 
         ref, built = archive.produce(
-            self.product.name,
-            build,
-            version=self.product.version,
-            params=wanted.params,
-            inputs=[ref.key for ref in wanted.inputs],
+            self.product.name, build, version=self.product.version, params=wanted.params, inputs=wanted.inputs
         )
         if built:
             give_back_freed_memory()
@@ -144,7 +130,7 @@ class Stage:
         return ref, built
 
 
-def run_stage(survey: Callable[..., StageRef], stage: str, *inputs: StageRef) -> StageRef:
+def run_stage(survey: Callable[..., Ref], stage: str, *inputs: Ref) -> Ref:
     """Run a stage of a survey by name."""
     return survey(stage, *inputs)
 
@@ -159,7 +145,7 @@ def stage(
         needs = inspect.getfullargspec(function).kwonlyargs
 
         @wraps(function)
-        def wants(run: Any, *stores: StageRef) -> Wanted:
+        def wants(run: Any, *stores: Ref) -> Wanted:
             for ref in stores:
                 _ = ref.key  # raises an error in a plan, where inputs are not known yet
             return function(*stores, **{name: needed(run, name) for name in needs})

@@ -29,10 +29,9 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.geometry.scan import Axis
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.keys import StageRef, array_digest
-from spectralzoom.storage.archive.manifests import read_table
-from spectralzoom.storage.archive.whole_files import to_json
 from spectralzoom.storage.arrays.class_maps import load_class_map
+from spectralzoom.storage.store import Ref, array_digest, read_table
+from spectralzoom.storage.whole_files import to_json
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=18, files=(RECORD,), by_weights=True)
@@ -40,10 +39,10 @@ ACCURACY = Product("evaluate", version=18, files=(RECORD,), by_weights=True)
 
 @stage("evaluate", "accuracy", ACCURACY)
 def evaluate(
-    mosaic: StageRef,
-    attention: StageRef,
-    class_map: StageRef,
-    *sources: StageRef,
+    mosaic: Ref,
+    attention: Ref,
+    class_map: Ref,
+    *sources: Ref,
     gains: PatchGains,
     plan: CapturePlan,
     simulated: SimulatedSource,
@@ -78,7 +77,7 @@ def evaluate(
     return Wanted(build, params, [mosaic, attention, class_map, *sources])
 
 
-def map_offset(simulated: SimulatedSource, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
+def map_offset(simulated: SimulatedSource, pointing: Sequence[Ref]) -> NDArray[np.float64]:
     """Return the offset of the map from the scene, (along, scan) px: the pointing error of the reference sweep.
 
     Registration corrects relative errors only. The simulator knows the absolute one.
@@ -110,6 +109,6 @@ def map_figures(names: Sequence[str], counts: NDArray[np.int64]) -> dict[str, An
     }
 
 
-def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
+def load_accuracy(evaluated: Ref) -> dict[str, Any]:
     """Read the figures of an evaluation."""
     return read_table(evaluated.path / RECORD)

@@ -23,9 +23,8 @@ from spectralzoom.pipeline.geometry.scan import Sweep, exposing
 from spectralzoom.pipeline.planning.coverage import patches_shown
 from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
 from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance, format_scan
-from spectralzoom.storage.archive.keys import StageRef, array_digest
-from spectralzoom.storage.archive.manifests import read_table, write_table
 from spectralzoom.storage.arrays.mosaics import Attention, chosen_patches, open_mosaic, write_attention
+from spectralzoom.storage.store import Ref, array_digest, read_table, write_table
 
 READING = "attention.zarr"  # beside a class map whose drawing chose the patches
 ATTENTION = Product("score", version=20, files=("attention.zarr", "plan.json"), by_weights=True)
@@ -56,7 +55,7 @@ class PatchGains:
             **self.zones.key,
         }
 
-    def by_policy(self, mosaic: StageRef, report: Report) -> Scores:
+    def by_policy(self, mosaic: Ref, report: Report) -> Scores:
         """Return the (patch,) expected gain by the policy."""
         if self.policy in SEEING_POLICIES:
             return self.within_zones(self.work.score(self.policy, mosaic, self.capture, report).ravel())
@@ -81,7 +80,7 @@ class PatchGains:
 
 @stage("score", "patch scores", ATTENTION)
 def score(
-    mosaic: StageRef,
+    mosaic: Ref,
     *,
     gains: PatchGains,
     second_pass: SecondPass | None,
@@ -137,7 +136,7 @@ def score(
 
 
 def gain_by_record(
-    gains: PatchGains, mosaic: StageRef, second_pass: SecondPass, record: ScanPerformance, report: Report
+    gains: PatchGains, mosaic: Ref, second_pass: SecondPass, record: ScanPerformance, report: Report
 ) -> tuple[Scores, FinePlan]:
     """Return the expected wrong pixels of the first pass, and the second pass of the highest expected gain."""
     errors = gains.work.expected_errors(mosaic, gains.capture, report)
@@ -161,13 +160,13 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
     return FinePlan([], patch_index, 0.0, 0.0, "scan", f"{what} scanned once: {scan}")
 
 
-def load_plan(attention: StageRef) -> FinePlan:
+def load_plan(attention: Ref) -> FinePlan:
     """Read the plan of the second pass: sweeps, and the patches that they cover."""
     plan = read_table(attention.path / "plan.json")
     return FinePlan([Sweep(**one) for one in plan.pop("sweeps")], np.array(plan.pop("patch_index"), np.intp), **plan)
 
 
-def read_in_full(attention: StageRef, class_map: StageRef) -> NDArray[np.intp]:
+def read_in_full(attention: Ref, class_map: Ref) -> NDArray[np.intp]:
     """Return the patches (patch,) that the full network read, chosen before or during segmentation."""
     store = class_map.path / READING
     return chosen_patches(store if store.exists() else attention.path / "attention.zarr")

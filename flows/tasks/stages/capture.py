@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,27 +24,23 @@ from spectralzoom.pipeline.signal.condense import LineStatistics
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from spectralzoom.pipeline.source import Line, Source
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef, stage_key
-from spectralzoom.storage.archive.manifests import write_table
 from spectralzoom.storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHeader
 from spectralzoom.storage.arrays.spool import Spool
 from spectralzoom.storage.parallel.pool import WorkerPool
+from spectralzoom.storage.store import Archive, Ref, stage_key, write_table
 
 RAW = Product("capture", version=13)
 RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes
 
 
 @stage("capture_coarse", "capture", RAW, inputs=1, retries=2, named="raw_coarse")
-def capture_coarse(effects: StageRef, *, plan: CapturePlan, recorder: SweepRecorder, report: Report) -> Wanted:
+def capture_coarse(effects: Ref, *, plan: CapturePlan, recorder: SweepRecorder, report: Report) -> Wanted:
     """Capture the first pass, or the uniform scan."""
     return recorder.wanted(plan.coarse, [effects], report)
 
 
 @stage("capture_fine", "capture of requested lines", RAW, inputs=2, retries=2, named="raw_fine")
-def capture_fine(
-    attention: StageRef, effects: StageRef, *, plan: CapturePlan, recorder: SweepRecorder, report: Report
-) -> Wanted:
+def capture_fine(attention: Ref, effects: Ref, *, plan: CapturePlan, recorder: SweepRecorder, report: Report) -> Wanted:
     """Capture the second pass."""
     return recorder.wanted(load_plan(attention).sweeps, [attention, effects], report, begins_s=plan.coarse_s)
 
@@ -64,12 +59,12 @@ class SweepRecorder:
     pool: WorkerPool
 
     def wanted(
-        self, sweeps: Sequence[Sweep], inputs: Sequence[StageRef], report: Report, *, begins_s: float = 0.0
+        self, sweeps: Sequence[Sweep], inputs: Sequence[Ref], report: Report, *, begins_s: float = 0.0
     ) -> Wanted:
         """Request sweeps, one after the other from ``begins_s`` on, with the effects of the last input."""
         clock = sweep_starts(sweeps, self.camera, self.cost, after_s=begins_s)
         params = {**self.source_key, "sweeps": [asdict(sweep) for sweep in sweeps], "starts_s": list(clock.values())}
-        key = stage_key(RAW.name, RAW.version, params, [ref.key for ref in inputs])
+        key = stage_key(RAW.name, RAW.version, params, inputs)
         total = sum(sweep.lines for sweep in sweeps) or 1
 
         def build(path: Path) -> None:
@@ -91,7 +86,7 @@ class SweepRecorder:
                 if source.record is not None:
                     write_table(path / RIG_RECORD, source.record)
 
-        return Wanted(build, params, inputs, then=partial(self.archive.drop_spool, key))
+        return Wanted(build, params, inputs)
 
     def _capture(
         self,

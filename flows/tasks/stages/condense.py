@@ -37,14 +37,13 @@ from spectralzoom.pipeline.signal.subspace import (
     with_shared,
 )
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import check_files, read_table, write_table
 from spectralzoom.storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import MosaicWriter
 from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from spectralzoom.storage.arrays.spool import line_values
 from spectralzoom.storage.readers.scene_files import RasterPixels
+from spectralzoom.storage.store import Ref, check_store, read_table, write_table
 
 SIGNAL = Product("condense", version=5)
 SIGNAL_FINE = Product("condense_fine", version=6)
@@ -53,7 +52,7 @@ MOST_COMPARED = 65_536  # rare spectra, in which shared directions are searched 
 MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
-def condense(*passes: StageRef, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
+def condense(*passes: Ref, camera: LineCamera, signal: SignalChoice, report: Report) -> Wanted:
     """Compress the sweeps of all passes with common components."""
 
     def build(path: Path) -> None:
@@ -159,19 +158,19 @@ def _write_sweeps(
     return done
 
 
-def raw_differs(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
+def raw_differs(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str | None:
     """Return why raw lines must be kept, or None if they can be deleted: every line is compared with its scores.
 
     ``passes`` are the captures in the order of their compression. Before, every byte of the store is verified.
     """
     try:
-        check_files(signal.path, hashes=True)
+        check_store(signal.path, every_byte=True)
         return _lines_differ(passes, signal, camera)
     except IncompleteStoreError as error:
         return f"{error}"
 
 
-def _lines_differ(passes: Sequence[StageRef], signal: StageRef, camera: LineCamera) -> str | None:
+def _lines_differ(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str | None:
     record = read_table(signal.path / SIGNAL_RECORD)
     if record["rare"] > MOST_RARE * max(record["spectra"], 1):
         fraction = 100 * record["rare"] / record["spectra"]

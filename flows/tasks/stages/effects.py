@@ -22,9 +22,8 @@ from spectralzoom.pipeline.simulator.rig_model import OF_THE_SCENE, Rig
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.selection.choice import decide, list_effects, sum_up
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import read_table
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.store import Ref, read_table
+from spectralzoom.storage.whole_files import to_json
 
 RECORD = "effects.json"
 MANIFEST = Product("effects", version=12, files=(RECORD,))
@@ -80,12 +79,12 @@ def _parts(rig: Rig) -> dict[str, Any]:
     return parts | {"sky": {name: value for name, value in parts["sky"].items() if name not in OF_THE_SCENE}}
 
 
-def load_manifest(effects: StageRef) -> dict[str, Any]:
+def load_manifest(effects: Ref) -> dict[str, Any]:
     """Read the table of effects: ``effects``, a row for each, and ``total``."""
     return read_table(effects.path / RECORD)
 
 
-def chosen_effects(effects: StageRef) -> dict[Effect, str]:
+def chosen_effects(effects: Ref) -> dict[Effect, str]:
     """Return the chosen effects with their variants. Raises IncompleteStoreError: this version lacks one."""
     chosen: dict[Effect, str] = {}
     for row in load_manifest(effects)["effects"]:

@@ -20,8 +20,6 @@ from spectralzoom.models.weights.files import ReaderPart
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import PosedField, areas_by_number
 from spectralzoom.pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import write_table
 from spectralzoom.storage.arrays.class_maps import (
     NOT_BELIEVED,
     OLD_CLASS,
@@ -34,6 +32,7 @@ from spectralzoom.storage.arrays.class_maps import (
 from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from spectralzoom.storage.arrays.layout import NO_CLASS, blank_pixels
 from spectralzoom.storage.arrays.mosaics import Attention, choose_bands, develop, open_mosaic, write_attention
+from spectralzoom.storage.store import Ref, write_table
 
 CLASS_MAP = Product("segment", version=27, files=(MAP, PROBABILITIES), by_weights=True)
 SPECTRA = "spectra.json"  # beside a map: pixels out of range, and patches unlike the training data
@@ -41,8 +40,8 @@ SPECTRA = "spectra.json"  # beside a map: pixels out of range, and patches unlik
 
 @stage("segment", "class map", CLASS_MAP)
 def segment(
-    mosaic: StageRef,
-    attention: StageRef,
+    mosaic: Ref,
+    attention: Ref,
     *,
     gains: PatchGains,
     prior: Prior | None,
@@ -147,7 +146,7 @@ GROUND = Product("ground", version=7, files=(STORE,))
 
 
 @stage("ground", "map in a projected CRS", GROUND)
-def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, report: Report) -> Wanted:
+def ground(class_map: Ref, mosaic: Ref, *, ground_grid: GroundGrid, report: Report) -> Wanted:
     """Project class map, changes and picture to the ground, by the pose of the rig."""
 
     def build(path: Path) -> None:
@@ -195,7 +194,7 @@ def ground(class_map: StageRef, mosaic: StageRef, *, ground_grid: GroundGrid, re
     return Wanted(build, params, [class_map, mosaic])
 
 
-def colours_of(mosaic: StageRef) -> NDArray[np.float32]:
+def colours_of(mosaic: Ref) -> NDArray[np.float32]:
     """Return three bands of a mosaic as a picture (y, x, 3) in 1..255; NaN where nothing was captured."""
     seen = open_mosaic(mosaic.path / "mosaic.zarr")
     bands, caption = choose_bands(seen.wavelength_nm)

@@ -42,12 +42,11 @@ from spectralzoom.pipeline.rectify.registration.seams import Anchor, Registratio
 from spectralzoom.pipeline.rectify.scan_paths import ScanPath
 from spectralzoom.pipeline.rectify.sweep_paths import SweepPath, capture_numbers, interlaced_paths, sweep_paths
 from spectralzoom.pipeline.signal.components import BROAD_BANDS, Components
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import read_table, write_table
 from spectralzoom.storage.arrays.geolocation import Tables, open_geolocation, path_digest, write_geolocation
 from spectralzoom.storage.arrays.mosaics import MosaicWriter, open_mosaic
 from spectralzoom.storage.arrays.signal_cubes import open_signal_cubes
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, THREADS, WorkerPool, memory_refusal, mib, run_blocks
+from spectralzoom.storage.store import Ref, read_table, write_table
 
 REGISTRATION, TIE_POINTS = "registration.json", "geolocation.zarr"
 SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic
@@ -59,7 +58,7 @@ MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
 
-def open_sweeps(signal: StageRef, registration: StageRef | None, camera: LineCamera) -> list[SweepPath]:
+def open_sweeps(signal: Ref, registration: Ref | None, camera: LineCamera) -> list[SweepPath]:
     """Open the compressed sweeps, by name, with the corrections of a registration."""
     found = None if registration is None else read_table(registration.path / REGISTRATION)["sweeps"]
     return sweep_paths(open_signal_cubes(signal.path), camera, found)
@@ -69,13 +68,13 @@ def open_sweeps(signal: StageRef, registration: StageRef | None, camera: LineCam
 class MosaicRecipe:
     """Recipe of a mosaic: stores and parameters, valid in every process that can read the stores."""
 
-    signal: StageRef  # compressed sweeps
+    signal: Ref  # compressed sweeps
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
-    geolocation: StageRef | None = None  # tie points of the sweeps; None computes them
+    geolocation: Ref | None = None  # tie points of the sweeps; None computes them
     interlaced: bool = False  # sweeps of two passes with lines between each other
-    registration: StageRef | None = None
+    registration: Ref | None = None
 
     def sweeps(self) -> list[SweepPath]:
         """Open the sweeps, in the order of their names. Raises IncompleteStoreError: one is missing or damaged."""
@@ -170,7 +169,7 @@ def tile_budget(
 
 @stage("register_coarse", "registration of the sweeps", POINTING, inputs=1, named="coarse_pointing")
 def register_coarse(
-    signal: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
+    signal: Ref, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Estimate pointing and radiometric gain of the coarse sweeps from the overlaps of neighbours."""
 
@@ -225,7 +224,7 @@ def _shift_record(shift: SweepShift) -> dict[str, Any]:
 
 @stage("register_fine", "registration to the mosaic", POINTING, inputs=2, named="fine_pointing")
 def register_fine(
-    signal: StageRef, mosaic: StageRef, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
+    signal: Ref, mosaic: Ref, *, camera: LineCamera, pointing_px: float, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Register each fine sweep on the coarse mosaic, which has pointing errors itself."""
 
@@ -252,14 +251,14 @@ def register_fine(
     return Wanted(build, {"prior_px": pointing_px, "pass": "fine", "grid": asdict(frame.grid)}, [signal, mosaic])
 
 
-def load_registration(registration: StageRef) -> dict[str, Any]:
+def load_registration(registration: Ref) -> dict[str, Any]:
     """Read a registration: offset, drift and gain by sweep; reference, sweeps without overlap, and windows."""
     return read_table(registration.path / REGISTRATION)
 
 
 @stage("locate", "geolocation grid", GEOLOCATION)
 def locate(
-    signal: StageRef, registration: StageRef | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
+    signal: Ref, registration: Ref | None = None, *, camera: LineCamera, frame: FieldFrame, report: Report
 ) -> Wanted:
     """Compute the geolocation grid, which all surveys along the same path share."""
     grid = PixelGrid.of_scene(frame.grid)
@@ -292,9 +291,9 @@ def locate(
 
 @stage("rectify", "mosaic", MOSAIC)
 def rectify(
-    signal: StageRef,
-    geolocation: StageRef,
-    registration: StageRef | None = None,
+    signal: Ref,
+    geolocation: Ref,
+    registration: Ref | None = None,
     *,
     camera: LineCamera,
     frame: FieldFrame,
@@ -320,8 +319,8 @@ def rectify(
 
 @stage("rectify_fine", "mosaic of all passes", MERGED)
 def rectify_fine(
-    signal: StageRef,
-    registration: StageRef | None = None,
+    signal: Ref,
+    registration: Ref | None = None,
     *,
     camera: LineCamera,
     frame: FieldFrame,
@@ -350,7 +349,7 @@ def rectify_fine(
     return Wanted(build, params, [signal, *([] if registration is None else [registration])])
 
 
-def mosaic_of_sweeps(path: Path, signal: StageRef, frame: FieldFrame) -> MosaicWriter:
+def mosaic_of_sweeps(path: Path, signal: Ref, frame: FieldFrame) -> MosaicWriter:
     """Create the mosaic of compressed sweeps, in the pixels of the scene, and copy the record of their signal."""
     sweeps = open_signal_cubes(signal.path)
     shutil.copyfile(signal.path / SIGNAL_RECORD, path / SIGNAL_RECORD)

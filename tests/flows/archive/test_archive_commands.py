@@ -18,9 +18,9 @@ from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.figures import format_bytes
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import ArchiveError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.records import read_run
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import to_json
 from tests.conftest import QUIET
 from tests.storage.small_archive import flip, small_survey
 

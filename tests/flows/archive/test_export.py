@@ -22,8 +22,8 @@ from spectralzoom.flows.archive.export_layers import ExportedRun
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET
 from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects

@@ -21,7 +21,7 @@ from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.terminal.figures import format_seconds
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, Flags, Survey
 from tests.flows.conftest import be_version, python
 

@@ -20,8 +20,8 @@ from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.runs import Catalogue
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.flows.conftest import be_version, turned
 from tests.prior_work import without_effects

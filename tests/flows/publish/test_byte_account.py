@@ -11,7 +11,7 @@ import pytest
 from spectralzoom.flows.archive.commands import contents
 from spectralzoom.flows.publish.receipt_table import saving_rows
 from spectralzoom.flows.publish.report import render_report
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
 from tests.flows.publish.test_receipt import make_receipt, printed

@@ -26,8 +26,8 @@ from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.weights.files import add_reader, load_weights
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.records import read_run
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import Archive
 from tests.conftest import CLASSES, QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects

@@ -23,7 +23,7 @@ from spectralzoom.flows.tasks import prefect_tasks
 from spectralzoom.flows.tasks.open_survey import STAGES
 from spectralzoom.flows.tasks.stage import Stage, Wanted
 from spectralzoom.pipeline.errors import ArchiveError, RigError
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.flows.conftest import Ended, class_map, newest_run, problems
 
 pytestmark = pytest.mark.usefixtures("no_effects")

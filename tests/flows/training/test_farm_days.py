@@ -25,8 +25,8 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.runs import Catalogue
+from spectralzoom.storage.store import Archive
 
 BANDS = (20, 60, 110, 160, 210, 250)
 

@@ -20,11 +20,9 @@ from hypothesis import strategies as st
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.storage.archive import manifests, staging
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import canonical_json, stage_key
-from spectralzoom.storage.archive.manifests import check_files, read_table
-from spectralzoom.storage.archive.staging import take_lock
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive, check_store, read_table, stage_key, text_of
+from spectralzoom.storage.whole_files import take_lock
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -46,7 +44,7 @@ def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
     assert (manifest["version"], manifest["params"], manifest["inputs"]) == (3, {"tol": 0.1}, ["k0"])
     assert set(manifest["files"]) == {"inner/a.txt", "b.bin"}
     assert archive.stored_bytes(ref) == 25600 + 7
-    check_files(ref.path, hashes=True)
+    check_store(ref.path, hashes=True)
     assert archive.refs() == [ref]
 
 
@@ -136,7 +134,7 @@ def test_publishing_a_key_again_keeps_the_first_store(archive: Archive) -> None:
     path = _publish(archive, text="first")
     _publish(archive, text="second")
     assert (path / "inner" / "a.txt").read_text() == "first"
-    check_files(archive.refs()[0].path, hashes=True)
+    check_store(archive.refs()[0].path, hashes=True)
 
 
 def test_open_refuses_paths_that_are_no_archive(tmp_path: Path) -> None:
@@ -188,7 +186,7 @@ def test_full_disks_harm_nothing(tmp_path: Path, archive: Archive, where: str, m
             archive.produce("mosaic", build, version=1, params={})
     assert [ref.key for ref in archive.refs()] == ["old"]
     assert not list(tmp_path.glob("stages/*/*.part"))
-    check_files(archive.refs()[0].path, hashes=True)
+    check_store(archive.refs()[0].path, hashes=True)
 
 
 def test_errors_outside_of_the_archive_keep_their_type(tmp_path: Path) -> None:
@@ -348,11 +346,11 @@ def test_every_part_counts() -> None:
 def test_canonical_json_agrees_for_equivalent_types() -> None:
     """2 and 2.0, lists and tuples, numpy and Python numbers, paths and dataclasses have the same text."""
     sweep = Sweep("a", "fine", "x", 0.0, -3.5, 10)
-    assert canonical_json({"a": (1, 2.0, -0.0)}) == canonical_json({"a": [np.int64(1), np.float64(2), 0]})
-    assert canonical_json(sweep) == canonical_json(dataclasses.asdict(sweep))
-    assert canonical_json([Path("a/b"), {3, 1}]) == '["a/b",[1,3]]'
-    assert canonical_json(float("nan")) == '"nan"'
-    assert canonical_json(np.ones(3)) != canonical_json(np.ones(3, np.float32))
+    assert text_of({"a": (1, 2.0, -0.0)}) == text_of({"a": [np.int64(1), np.float64(2), 0]})
+    assert text_of(sweep) == text_of(dataclasses.asdict(sweep))
+    assert text_of([Path("a/b"), {3, 1}]) == '["a/b",[1,3]]'
+    assert text_of(float("nan")) == '"nan"'
+    assert text_of(np.ones(3)) != text_of(np.ones(3, np.float32))
 
 
 def test_stage_key_refuses_values_without_a_stable_text() -> None:

@@ -10,10 +10,8 @@ import pytest
 
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.archive import lineage
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import in_text
-from spectralzoom.storage.archive.records import Run
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import Run, verify_everything
+from spectralzoom.storage.store import Archive, uri_of
 from tests.storage.small_archive import flip, rewrite, small_survey
 
 
@@ -132,7 +130,7 @@ def test_a_product_name_means_the_newest_readable_run(tmp_path: Path, archive: A
 def test_find_product_refuses_unknown_names(tmp_path: Path, text: str, words: str) -> None:
     """The error lists the products of the newest run; a product whose store is missing has its own message."""
     small_survey(Archive.open(tmp_path))
-    shutil.rmtree(tmp_path / str(in_text(lineage.Catalogue.read(tmp_path).runs[-1].products["mosaic"])))
+    shutil.rmtree(tmp_path / str(uri_of(lineage.Catalogue.read(tmp_path).runs[-1].products["mosaic"])))
     with pytest.raises(ArchiveError, match=words):
         lineage.find_product(lineage.Catalogue.read(tmp_path), text)
 

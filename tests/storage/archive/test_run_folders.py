@@ -11,16 +11,15 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.pipeline.errors import ArchiveError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.staging import PART_SUFFIX
-from spectralzoom.storage.maintenance.garbage import clear_up
+from spectralzoom.storage.runs import clear_up
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import PART
 from tests.storage.small_archive import problems, small_survey
 
 ROOT = Path(__file__).parents[3]
 KILL_EVERYWHERE = """
 import os, shutil, sys
 from pathlib import Path
-from spectralzoom.storage.archive.archive import Archive
 from tests.faults.injection import end_at, logged_calls
 from tests.storage.small_archive import small_survey
 
@@ -96,5 +95,5 @@ def test_an_archive_verifies_after_a_kill_at_any_system_call(archive: Archive, t
         again = small_survey(opened)
         assert problems(opened) == []
         assert opened.is_there(again.mosaic.uri)
-        assert not [*out.rglob(f"*{PART_SUFFIX}")]
+        assert not [*out.rglob(f"*{PART}")]
     assert seen == {0, 1}

@@ -11,10 +11,8 @@ import pytest
 
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
 from spectralzoom.storage.archive import manifests
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.records import read_store
-from spectralzoom.storage.maintenance.garbage import clear_up
+from spectralzoom.storage.runs import clear_up
+from spectralzoom.storage.store import Archive, Ref
 from tests.storage.small_archive import problems, small_survey
 
 
@@ -24,7 +22,7 @@ def cleared(archive: Archive) -> list[str]:
     return [ref.uri for ref in there if archive.clear(ref, wait=False)]
 
 
-def content(ref: StageRef) -> str:
+def content(ref: Ref) -> str:
     """Return the hash of the one file of a small store."""
     return hashlib.sha256((ref.path / "data.bin").read_bytes()).hexdigest()
 

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.pipeline.errors import SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.maintenance.garbage import IN_USE, Clearance, Removal, clear_up, plan_clearance
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import IN_USE, Clearance, Removal, clear_up, verify_everything
+from spectralzoom.storage.store import Archive
 from tests.storage.small_archive import flip, grow_old, make_store, problems, small_survey
 
 

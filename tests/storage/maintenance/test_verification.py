@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from spectralzoom.pipeline.errors import IncompleteStoreError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
 from spectralzoom.storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive, Ref
 from tests.storage.small_archive import flip, small_survey
 
 
-def _with_cube(archive: Archive) -> StageRef:
+def _with_cube(archive: Archive) -> Ref:
     """Make a store with a cube of (130, 700, 3): shards of 64 rows and 640 columns, chunks of 32 x 32."""
     values = np.random.default_rng(2).integers(0, 4096, (130, 700, 3), dtype=np.uint16)
 
@@ -110,7 +109,7 @@ def test_a_store_removed_during_verify_is_not_damage(archive: Archive) -> None:
     """gc may run at the same time; a store that a run names must be there."""
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
-    def clear(ref: StageRef) -> list[str]:
+    def clear(ref: Ref) -> list[str]:
         return [one.uri for one in verify_everything(archive, lambda *_: archive.discard(ref) and None) if one.problem]
 
     assert clear(other.map) == []

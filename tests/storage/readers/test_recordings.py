@@ -20,9 +20,9 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from spectralzoom.storage.readers.recordings import RecordedWith, _middle_s, open_recording
+from spectralzoom.storage.store import Archive
 from tests.envi_files import write_recorded_files
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 from tests.storage.readers.test_envi_cubes import write_envi
