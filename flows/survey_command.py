@@ -28,7 +28,7 @@ from spectralzoom.flows.tasks.prefect_tasks import Observer, inside_flow, observ
 from spectralzoom.flows.terminal.progress import StageProgress
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import remove, take_lock
+from spectralzoom.storage.whole_files import refusals, remove, take_lock
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -86,7 +86,8 @@ def _prefect_server(out: str) -> Iterator[None]:
         return
     root = Archive.open(out).root
     home = root / ".prefect"
-    release = take_lock(root / ".locks" / "prefect.lock", wait=False)
+    with refusals(root, "lock", every=True):
+        release = take_lock(root / ".locks" / "prefect.lock", wait=False)
     if release is None:
         home = root / f".prefect-{os.getpid()}"
         atexit.register(remove, home)

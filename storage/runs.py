@@ -28,9 +28,10 @@ from spectralzoom.storage.store import (
     descendants,
     file_problem,
     inputs_first,
+    is_ahead,
     is_name,
-    lies_in_future,
     listed_bytes,
+    past_runs,
     problems_of,
     try_manifest,
     uri_of,
@@ -116,7 +117,7 @@ class Run:
     @property
     def in_future(self) -> bool:
         """Return whether it was published later than now, by a clock that was wrong then or is wrong now."""
-        return lies_in_future(self.folder)
+        return is_ahead(self.folder.name) or is_ahead(self.created)
 
 
 def _as(kind: Any, value: Any) -> Any:
@@ -168,10 +169,13 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     parts = text.rstrip("/").split("/")
     if not all(map(is_name, parts)):
         raise ArchiveError(f"{text!r} cannot be a name in an archive; use letters, digits, '_', '-' and '.'")
-    past = [run for run in catalogue.runs if not run.in_future]
     name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text
-    if runs := past if name == LATEST else [run for run in catalogue.runs if name == run.folder.name]:
+    if runs := [run for run in catalogue.runs if name == run.folder.name]:
         return runs[-1]
+    folders = past_runs(run.folder for run in catalogue.runs)
+    past = [run for run in catalogue.runs if run.folder in folders]
+    if past and name == LATEST:
+        return past[-1]
     if name != text:
         there = [run.uri for run in reversed(catalogue.runs)]
         raise NoRunError(f"there is no run {name} in this archive; there is {list_some(there, 3) or 'none'}")

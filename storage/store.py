@@ -23,6 +23,7 @@ import math
 import os
 import re
 import secrets
+import shlex
 import shutil
 import stat
 import time
@@ -210,6 +211,8 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     empty = {"files": {}, "params": {}, "inputs": [], RESTS_ON: {}, "settings": {}, "created": ""}
     path = folder / MANIFEST
     try:
+        if folder.is_symlink():
+            return empty, "it is a link, expected a folder"
         if not stat.S_ISREG(path.lstat().st_mode):
             return empty, f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
         return parse_manifest(path.read_bytes()), None
@@ -282,23 +285,32 @@ def check_store(folder: Path, *, every_byte: bool = False) -> None:
 
     Raises IncompleteStoreError: a file is missing or differs; ArchiveError: a link leads out of the archive.
     """
-    root = folder.parents[1 if folder.parent.name == "runs" else 2]
-    if not folder.resolve().is_relative_to(root.resolve()):
-        raise ArchiveError(f"{folder} leads out of the archive; put the folder itself there in place of the link")
+    if not (folder.is_symlink() or folder.is_dir()):
+        raise ArchiveError(f"{folder} is {'a file' if folder.exists() else 'not there'}, expected a folder; see why")
+    if not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve()):
+        raise ArchiveError(f"{folder} is reached by a link that leads out of the archive; put the folder in its place")
     for problem in problems_of(folder, every_byte=every_byte):
         raise damage(folder, problem)
 
 
 def damage(folder: Path, problem: str) -> IncompleteStoreError:
     """Return the error of a damaged store or run: what was made of it, and the command that removes it."""
-    root = folder.parents[1 if folder.parent.name == "runs" else 2]
-    uri = folder.relative_to(root).as_posix()
-    with suppress(OSError):
-        made = sorted(descendants(Archive(root).manifests(), [uri]))
+    root = _root_of(folder)
+    made = descendants(Archive(root).manifests(), [folder.absolute().relative_to(root).as_posix()])
     below = f" and what was made of it, {list_some(made)}," if made else ""
     return IncompleteStoreError(
-        f"{folder} is damaged: {problem}; restore it from a copy, or remove it{below} by: spectralzoom gc {root} "
-        "--damaged; the next survey makes them again"
+        f"{folder} is damaged: {problem}; restore it from a copy, or remove it{below} by spectralzoom gc --damaged "
+        f"{shlex.quote(str(root))}; the next survey makes it again"
+    )
+
+
+def _root_of(folder: Path) -> Path:
+    """Return the archive of a store or run; the folder above where it was copied out of its archive."""
+    above = folder.absolute().parents
+    return (
+        above[2]
+        if len(above) > 2 and above[1].name == "stages"
+        else above[min(len(above) - 1, int(above[0].name == "runs"))]
     )
 
 
@@ -526,7 +538,7 @@ class Archive:
     def _folders(self, kind: str) -> list[Path]:
         """Return the folders of ``stages`` or ``runs`` that are no leftovers, with or without a manifest."""
         above = [self.root / kind] if kind == "runs" else [*filter(is_folder, entries(self.root / kind))]
-        return [one for folder in above for one in entries(folder) if is_name(one.name) and is_folder(one)]
+        return [one for folder in above for one in entries(folder) if is_name(one.name) and _leads_on(one)]
 
     def _is_free(self, lock: str) -> bool:
         path = self.root / ".locks" / f"{lock}.lock"
@@ -538,7 +550,8 @@ class Archive:
     @contextmanager
     def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
         """Hold a lock while the block runs; yield False where another process holds it and ``wait`` is false."""
-        release = take_lock(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
+        with refusals(self.root, "lock", every=True):
+            release = take_lock(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
         try:
             yield release is not None
         finally:
@@ -579,12 +592,7 @@ class Archive:
 
     def past_runs(self) -> list[Path]:
         """Return the published runs but those that lie in the future, which a warning names."""
-        past = [one for one in self.runs() if not lies_in_future(one)]
-        if ahead := [one.name for one in self.runs() if one not in past]:
-            log.warning(
-                "%s: %s in the future and not taken as the latest; check the clock", self.name, list_some(ahead)
-            )
-        return past
+        return past_runs(self.runs())
 
     def run_folder(self, name: str) -> Path:
         """Return the folder of a published run by name, address or ``latest``. Raises NoRunError."""
@@ -720,6 +728,11 @@ def _delete_cleared(folder: Path) -> None:
             shutil.rmtree(path) if is_folder(path) else path.unlink(missing_ok=True)
 
 
+def _leads_on(path: Path) -> bool:
+    """Return whether a path is a folder, or a link, which counts as a damaged store and is never followed."""
+    return path.is_symlink() or path.is_dir()
+
+
 def _lock_name(path: Path) -> str:
     """Return the name of the lock of a store, run, spool or leftover."""
     kind = CAPTURED if path.parent.name == "spool" else path.parent.name
@@ -754,11 +767,20 @@ def run_stem(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
 
 
-def lies_in_future(folder: Path) -> bool:
-    """Return whether a run's time, by its name or its manifest, is later than now."""
-    for text in (f"{folder.name[:SECOND]}+00:00", try_manifest(folder)[0]["created"]):
-        with suppress(ValueError):
-            moment = datetime.fromisoformat(text)
-            if (moment.replace(tzinfo=moment.tzinfo or UTC)).timestamp() > time.time() + CLOCK_S:
-                return True
-    return False
+def past_runs(folders: Iterable[Path]) -> list[Path]:
+    """Return the runs that are not in the future, by names and manifests; a warning names the others."""
+    found: dict[bool, list[Path]] = {True: [], False: []}
+    for folder in folders:
+        found[is_ahead(folder.name) or is_ahead(try_manifest(folder)[0]["created"])].append(folder)
+    if ahead := [one.name for one in found[True]]:
+        log.warning("%s: in the future, and so not taken as the latest run; check the clock", list_some(ahead))
+    return found[False]
+
+
+def is_ahead(text: str) -> bool:
+    """Return whether the time in a run's name, or of a manifest, is later than now."""
+    try:
+        moment = datetime.fromisoformat(text if "+" in text else text[:SECOND])
+        return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S
+    except ValueError:
+        return False

@@ -61,7 +61,7 @@ def entries(folder: Path) -> list[Path]:
 def files_in(folder: Path) -> dict[str, os.stat_result]:
     """Return all files below a folder by their names in it, without those that go meanwhile. Links are not followed."""
     found: dict[str, os.stat_result] = {}
-    waiting = [str(folder)]
+    waiting = [] if folder.is_symlink() else [str(folder)]
     while waiting:
         with suppress(FileNotFoundError, NotADirectoryError), os.scandir(waiting.pop()) as listed:
             for one in listed:
@@ -120,11 +120,11 @@ def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callabl
     """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
 
     None where another holds it and ``wait`` is false; a ``shared`` lock excludes only others. A second release does
-    nothing. Raises ArchiveError: the file system has no such lock.
+    nothing. Raises OSError: the path cannot be locked.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    with refusals(path, "lock", every=True), ExitStack() as held:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as held:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         file = held.enter_context(os.fdopen(descriptor))  # its second close does nothing
         try:

@@ -20,7 +20,7 @@ from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, for
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
 from spectralzoom.storage.runs import Catalogue, Finding, Run, clear_up, find_product, verify_everything
-from spectralzoom.storage.store import Archive, ancestors, descendants
+from spectralzoom.storage.store import Archive, descendants
 from spectralzoom.storage.whole_files import to_json
 
 SHORT_KEY = 12
@@ -177,10 +177,8 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     found = find_product(catalogue, product)
     if isinstance(found, Run):
         shown: set[str] = set()
-        trees = [
-            _tree(catalogue, uri, shown)
-            for uri in sorted(set(found.facts["inputs"]) - {*ancestors(catalogue.stores, found.facts["inputs"])})
-        ]
+        below = {one for uri in found.names & catalogue.stores.keys() for one in catalogue.stores[uri]["inputs"]}
+        trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         told = {"problem": found.problem, "command": command(found.settings, archive.name)}
         return {"archive": archive.name, "product": found.uri, **told, "lineage": trees}
     runs = [run.uri for run in catalogue.named_by(found)]

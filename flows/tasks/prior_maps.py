@@ -117,7 +117,7 @@ def _usable(
     if run.problem is not None:
         return run.problem
     if run.in_future:
-        return "it lies in the future; check the clock"
+        return "it was published in the future; check the clock"
     places = [run.products.get(name, "").split("/") for name in (PROBABILITIES, "mosaic")]
     if any(len(parts) < 3 for parts in places):
         return "it left no class probabilities"

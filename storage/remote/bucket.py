@@ -9,6 +9,7 @@ compared with its hash before it is sent, and after it is fetched.
 from __future__ import annotations
 
 import hashlib
+import logging
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
@@ -19,16 +20,19 @@ from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
 from spectralzoom.storage.remote.objects import Objects, some_at_a_time
 from spectralzoom.storage.store import (
     CLEARED,
+    LATEST,
     MANIFEST,
     RESTS_ON,
     Archive,
     check_store,
+    is_ahead,
     is_cleared,
     parse_manifest,
     uri_of,
 )
 
 Report = Callable[[str, float], None]  # address, and the fraction that is done
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -122,12 +126,23 @@ def _fetch(uri: str, objects: Objects, archive: Archive, listed: Collection[str]
 def _of_run(objects: Objects, run: str, there: Collection[str]) -> list[str]:
     """Return the addresses of the stores that a run names, and of the run."""
     runs = sorted(uri for uri in there if uri.startswith("runs/"))
-    uri = runs[-1] if run == "latest" and runs else f"runs/{run.removeprefix('runs/')}"
+    uri = f"runs/{run.removeprefix('runs/')}"
+    if run == LATEST:
+        uri = next((one for one in reversed(runs) if not _is_ahead(one, objects)), uri)
     text = objects.read(f"{uri}/{MANIFEST}") if uri in there else None
     if text is None:
         known = ", ".join(name.removeprefix("runs/") for name in runs[-5:]) or "none"
         raise ArchiveError(f"{objects.place.url} has no run {run!r}; its latest are {known}")
     return [*sorted(_manifest(uri, text)[RESTS_ON].keys() & set(there)), uri]
+
+
+def _is_ahead(uri: str, objects: Objects) -> bool:
+    """Return whether a run lies in the future, which a warning says."""
+    text = objects.read(f"{uri}/{MANIFEST}")
+    ahead = text is None or is_ahead(uri.removeprefix("runs/")) or is_ahead(_manifest(uri, text)["created"])
+    if ahead:
+        log.warning("%s lies in the future, and so is not taken as the latest run; check the clock", uri)
+    return ahead
 
 
 def _conflicts(objects: Objects, archive: Archive, both: Iterable[str]) -> list[str]:

@@ -146,8 +146,8 @@ def test_damaged_plan_stops_survey(settings: Settings, archive: Path, survey_png
     """The survey stops there with one message."""
     (path,) = archive.glob("stages/score/*/plan.json")
     path.write_text(path.read_text().replace(*change))
-    fine = _plan(settings, archive)["capture_fine"]
-    assert (fine.state, "plan.json has changed" in fine.why) == ("blocked", True)
+    score = _plan(settings, archive)["score"]
+    assert (score.state, "plan.json has changed" in score.why) == ("blocked", True)
     with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*gc --damaged"):
         survey_png(archive)
 

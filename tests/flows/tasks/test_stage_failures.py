@@ -203,7 +203,7 @@ def test_failed_reprocessing_resumes(server: str, walk: Walk, tmp_path: Path, mo
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     archive = Archive.open(out)
     (missing,) = archive.refs("segment")
-    archive.discard(missing)
+    archive.discard(missing.uri)
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "segment", failing("segment", refusal("segment")))
         state = reprocess(archive=str(out), return_state=True)
