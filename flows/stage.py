@@ -24,6 +24,7 @@ from typing import Annotated, Any, Concatenate, Generic, Literal, ParamSpec, Typ
 
 from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.storage.store import Archive, Ref
+from spectralzoom.storage.whole_files import bytes_in
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -265,11 +266,6 @@ class Stores:
         for ref in request.inputs:
             self.restore(ref)
         self.rows[row.name] = row
-
-
-def bytes_in(folder: Path) -> int:
-    """Return the bytes of all files below a folder."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def peak_bytes() -> int:

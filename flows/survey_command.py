@@ -29,8 +29,8 @@ from spectralzoom.flows.tasks.local_server import (
 from spectralzoom.flows.tasks.observer import Observer, observed_by
 from spectralzoom.flows.terminal.progress import StageProgress
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.staging import remove_tree, take_lock
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import refusals, remove, take_lock
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -89,10 +89,11 @@ def _prefect_server(out: str) -> Iterator[None]:
         return
     root = Archive.open(out).root
     home = root / ".prefect"
-    release = take_lock(root / ".locks" / "prefect.lock", wait=False)
+    with refusals(root, "lock", every=True):
+        release = take_lock(root / ".locks" / "prefect.lock", wait=False)
     if release is None:
         home = root / f".prefect-{os.getpid()}"
-        atexit.register(remove_tree, home)
+        atexit.register(remove, home)
     try:
         with quiet_environment(home), local_server(home):
             yield

@@ -74,8 +74,8 @@ from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
 from spectralzoom.pipeline.source import SweepLines
-from spectralzoom.storage.archive.whole_files import to_json
 from spectralzoom.storage.arrays.layout import packed_size
+from spectralzoom.storage.whole_files import to_json
 
 Setting = str | float
 Values = NDArray[np.float32]

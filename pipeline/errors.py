@@ -5,6 +5,7 @@ A message names the wrong value, what is allowed, and what to do.
 
 from __future__ import annotations
 
+import errno
 import re
 import unicodedata
 from collections.abc import Callable, Sequence
@@ -36,6 +37,25 @@ def is_visible(character: str) -> bool:
 def list_some(names: Sequence[str], most: int = 5) -> str:
     """Return the first names, and how many there are beyond them."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+_DISK_ADVICE = {
+    errno.ENOSPC: "the disk is full: free some space and run again",
+    errno.EDQUOT: "the disk quota is used up: free some space and run again",
+    errno.EROFS: "the file system is read-only: mount it for writing or choose another folder",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "permission is denied: change the rights or choose another folder"),
+    errno.EIO: "the disk reports an error: check the disk, then run again",
+    errno.EFBIG: "a file may not grow so large here: raise ulimit -f, or choose a folder on another file system",
+    errno.EMFILE: "too many files are open: raise ulimit -n",
+    errno.ENAMETOOLONG: "the name is too long for this file system: give a shorter one",
+    errno.ENOLCK: "the file system has no locks: choose a folder on a local disk",
+    errno.ELOOP: "a link stands where a file of its own belongs: see where it leads, remove it and run again",
+}
+
+
+def disk_advice(error: OSError) -> str | None:
+    """Return the meaning of a disk error and what to do; None for other errors."""
+    return _DISK_ADVICE.get(error.errno or 0)
 
 
 class PipelineError(Exception):

@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spectralzoom.pipeline.errors import IncompleteStoreError, NoRunError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import LATEST
-from spectralzoom.storage.archive.manifests import CURE
-from spectralzoom.storage.archive.records import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.arrays.layout import damage_named, open_group
+from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
+from spectralzoom.storage.store import LATEST, Archive, damage
 
 if TYPE_CHECKING:
     import xarray
@@ -99,7 +97,7 @@ class OpenedRun:
         """
         found: Run = read_run(self.folder)
         if found.problem is not None:
-            raise IncompleteStoreError(f"{found.uri} of {self._archive.name}: {found.problem}; {CURE}")
+            raise damage(self.folder, found.problem)
         return found.receipt
 
     @property

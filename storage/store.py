@@ -1,9 +1,786 @@
-"""Names of the archive in one place."""
+"""Keep an archive: immutable stores, one folder for each stage and key, and one folder for each run.
 
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef as Ref
-from spectralzoom.storage.archive.keys import array_digest
-from spectralzoom.storage.archive.manifests import check_files, read_table, write_table
-from spectralzoom.storage.archive.whole_files import to_json
+::
 
-__all__ = ["Archive", "Ref", "array_digest", "check_files", "read_table", "to_json", "write_table"]
+    stages/<stage>/<key>/   what a stage made, and manifest.json: parameters, inputs, size and SHA-256 of every file
+    runs/<name>/            receipt, report and pictures of a survey, with the same kind of manifest
+    spool/<key>/            lines of a capture under way
+    .locks/                 held while something is made
+
+A folder is written under another name (``.part``), synced, and renamed. So a kill at any moment leaves either the whole
+store or a leftover that `Archive.reclaim` removes. Published files never change; a ``cleared`` store keeps its manifest
+alone. Every opening of a store compares the sizes of its files, and the SHA-256 of all but the chunks of arrays, which
+have a checksum of their own.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import logging
+import math
+import os
+import re
+import secrets
+import shlex
+import shutil
+import stat
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields, is_dataclass
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path, PurePosixPath
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, list_some
+from spectralzoom.storage.whole_files import (
+    PART,
+    aside,
+    bytes_in,
+    entries,
+    files_in,
+    is_folder,
+    refusals,
+    remove,
+    sha256,
+    sync,
+    take_lock,
+)
+
+MANIFEST, CLEARED, OLD = "manifest.json", "cleared", ".old.part"
+RESTS_ON = "rests_on"  # of a run's manifest: address of every store below it -> SHA-256 of its manifest.json
+LATEST = "latest"
+KEY_LENGTH = 20
+SECOND = len("20261120T101701")  # of a run's name: when it was begun
+CLOCK_S = 2.0  # clocks of two machines differ by less
+CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
+_PART_OF = re.compile(r"(\.[0-9a-f]{8})?(\.old)?\.part$")
+_BUCKET = re.compile(r"(?i)[a-z][a-z0-9+]+:(?=/)")
+_CHUNK = re.compile(r".*\.zarr/.*/c[/.][0-9/.]+")  # of an array; each has a crc32c (arrays.layout)
+
+log = logging.getLogger(__name__)
+
+
+# --- keys -------------------------------------------------------------------------------------------------------------
+
+
+def plain(value: object) -> Any:
+    """Return a parameter in JSON types.
+
+    Floats keep 12 digits, 2.0 is 2, NaN and infinities are text. An array is the hash of its bytes; an object with a
+    ``key`` is that key. Raises ArchiveError: the value has no lasting text, such as a function.
+    """
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return f"{value}"
+        short = float(f"{value:.12g}")
+        return int(short) if short.is_integer() and abs(short) < 2.0**53 else short
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype.kind != "O":
+        return [value.dtype.str, list(value.shape), hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]
+    if isinstance(value, Mapping):
+        return {str(name): plain(one) for name, one in value.items()}
+    if hasattr(value, "key") and not isinstance(value, type):
+        return plain(value.key)
+    if is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if hasattr(value, "model_dump"):
+        return plain(value.model_dump())
+    if isinstance(value, Sequence) and not isinstance(value, bytes):
+        return [plain(one) for one in value]
+    raise ArchiveError(f"{type(value).__name__} {value!r} cannot be part of a key; give numbers, text, lists or tables")
+
+
+def text_of(facts: object) -> str:
+    """Return the same text for the same meaning: sorted names, short numbers, no spaces."""
+    return json.dumps(plain(facts), sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def stage_key(stage: str, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()) -> str:
+    """Return the key of a stage's store; the order of inputs counts, that of parameters does not."""
+    facts = {"stage": stage, "version": version, "params": params, "inputs": [one.key for one in inputs]}
+    return hashlib.sha256(text_of(facts).encode()).hexdigest()[:KEY_LENGTH]
+
+
+def array_digest(array: NDArray[np.generic]) -> str:
+    """Return a hash of an array's shape and values."""
+    return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).hexdigest()[:KEY_LENGTH]
+
+
+@dataclass(frozen=True)
+class Ref:
+    """Address of a store: what tasks pass on instead of arrays."""
+
+    stage: str
+    key: str
+    path: Path = field(compare=False)
+
+    @property
+    def uri(self) -> str:
+        """Address relative to the archive."""
+        return f"stages/{self.stage}/{self.key}"
+
+
+def is_name(name: str) -> bool:
+    """Return whether this can be the name of a stage, a store or a run."""
+    return _NAME.fullmatch(name) is not None and not name.endswith(PART)
+
+
+def uri_of(address: str) -> str | None:
+    """Return ``stages/STAGE/KEY`` or ``runs/NAME`` of an address of it or of a file in it; None for other text."""
+    parts = address.split("/")
+    count = {"stages": 3, "runs": 2}.get(parts[0], len(parts) + 1)
+    return "/".join(parts[:count]) if len(parts) >= count and all(map(is_name, parts)) else None
+
+
+def write_table(path: Path, content: Mapping[str, Any]) -> None:
+    """Write plain values in their own order; numpy's numbers become floats."""
+    path.write_text(json.dumps(content, indent=1, default=float) + "\n")
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file directly in a published store.
+
+    Raises IncompleteStoreError: the file is not in the store's manifest, or differs from it.
+    """
+    entry = read_manifest(path.parent)["files"].get(path.name)
+    problem = "is in no manifest" if entry is None else file_problem(path, *entry)
+    if problem is not None:
+        raise damage(path.parent, f"{path.name} {problem}")
+    return cast(dict[str, Any], json.loads(path.read_bytes()))
+
+
+# --- manifests --------------------------------------------------------------------------------------------------------
+
+
+def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Sync every file of a folder, and write the manifest with their sizes and hashes beside ``facts``."""
+    files = {}
+    for name in sorted(files_in(folder)):
+        sync(folder / name)
+        files[name] = [(folder / name).stat().st_size, sha256(folder / name)]
+    created = datetime.now(UTC).isoformat(timespec="milliseconds")
+    (folder / MANIFEST).write_text(manifest_text({"created": created, **facts, "files": files}))
+
+
+def manifest_text(content: Mapping[str, Any]) -> str:
+    """Return the text of a manifest with its ``seal``, by which a flipped bit of the manifest itself is found."""
+    content = plain(content)
+    return json.dumps({**content, "seal": hashlib.sha256(text_of(content).encode()).hexdigest()}, indent=1) + "\n"
+
+
+def parse_manifest(written: bytes) -> dict[str, Any]:
+    """Return the content of a manifest; tables and lists that it lacks are empty. Raises ValueError: it is damaged."""
+    try:
+        content = json.loads(written)
+        if not isinstance(content, dict):
+            raise ValueError("it is no table")
+        seal = content.pop("seal", None)
+        sealed = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    if seal != hashlib.sha256(sealed.encode()).hexdigest():
+        raise ValueError("it has changed since it was published: its seal does not fit")
+    kinds = {"files": dict, "params": dict, "inputs": list, RESTS_ON: dict, "settings": dict, "created": str}
+    for name, kind in kinds.items():
+        if not isinstance(content.setdefault(name, kind()), kind):
+            raise ValueError(f"its {name} are of another type than expected")
+    for name, entry in content["files"].items():
+        if not name or name.startswith("/") or "\0" in name or ".." in PurePosixPath(name).parts:
+            raise ValueError(f"it lists {name!r}, which is no file of this folder")
+        if not (isinstance(entry, list) and [type(one) for one in entry] == [int, str]):
+            raise ValueError(f"it gives no size and hash of {name!r}")
+    for uri in (*content["inputs"], *content[RESTS_ON]):
+        if not isinstance(uri, str) or uri_of(uri) != uri:
+            raise ValueError(f"it names {uri!r}, which is no store")
+    return content
+
+
+def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
+    """Return the content of a folder's manifest and None, or an empty manifest and the problem."""
+    empty = {"files": {}, "params": {}, "inputs": [], RESTS_ON: {}, "settings": {}, "created": ""}
+    path = folder / MANIFEST
+    try:
+        if folder.is_symlink():
+            return empty, "it is a link, expected a folder"
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return empty, f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
+        return parse_manifest(path.read_bytes()), None
+    except FileNotFoundError:
+        return empty, f"{MANIFEST} is missing"
+    except (OSError, ValueError) as error:
+        return empty, f"{MANIFEST} is damaged: {(error.strerror if isinstance(error, OSError) else None) or error}"
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a published folder. Raises IncompleteStoreError: it is missing or damaged."""
+    content, problem = try_manifest(folder)
+    if problem is not None:
+        raise damage(folder, problem)
+    return content
+
+
+def manifest_sha256(folder: Path) -> str:
+    """Return the SHA-256 of a folder's manifest. Raises IncompleteStoreError: there is none."""
+    try:
+        return sha256(folder / MANIFEST)
+    except OSError as error:
+        raise damage(folder, f"{MANIFEST} cannot be read: {error.strerror}") from error
+
+
+def is_cleared(folder: Path) -> bool:
+    """Return whether a store's files were deleted, or are being deleted."""
+    return os.path.lexists(folder / CLEARED)
+
+
+def file_problem(path: Path, size: int, digest: str | None) -> str | None:
+    """Return the difference of a file from size and SHA-256, as text behind its name; None without one."""
+    try:
+        about = path.lstat()
+        if not stat.S_ISREG(about.st_mode):
+            return "is no file of its own, but a link, folder or pipe"
+        if about.st_size != size:
+            return f"has {about.st_size} bytes, expected {size}"
+        if digest is not None and sha256(path) != digest:
+            return "has changed since it was published (its SHA-256 differs)"
+    except FileNotFoundError:
+        return "is missing"
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+    return None
+
+
+def problems_of(folder: Path, *, every_byte: bool) -> Iterator[str]:
+    """Yield the differences of a published folder from its manifest, file by file.
+
+    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only.
+    """
+    manifest, problem = try_manifest(folder)
+    if problem is not None:
+        yield problem
+    elif not is_cleared(folder):
+        there, found = files_in(folder), []
+        for name, (size, digest) in manifest["files"].items():
+            own = None if _CHUNK.fullmatch(name) and not every_byte else digest
+            problem = file_problem(folder / name, size, own) if name in there else "is missing"
+            found += [f"{name} {problem}"] if problem else []
+        for name in sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else ():
+            found.append(f"{name} is not in the manifest: take it out of the archive")
+        changed = found and (is_cleared(folder) or try_manifest(folder)[0] != manifest)  # meanwhile, or made anew
+        yield from problems_of(folder, every_byte=every_byte) if changed else found
+
+
+def check_store(folder: Path, *, every_byte: bool = False) -> None:
+    """Compare a published folder with its manifest.
+
+    Raises IncompleteStoreError: a file is missing or differs; ArchiveError: a link leads out of the archive.
+    """
+    if not (folder.is_symlink() or folder.is_dir()):
+        raise ArchiveError(f"{folder} is {'a file' if folder.exists() else 'not there'}, expected a folder; see why")
+    if not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve()):
+        raise ArchiveError(f"{folder} is reached by a link that leads out of the archive; put the folder in its place")
+    for problem in problems_of(folder, every_byte=every_byte):
+        raise damage(folder, problem)
+
+
+def damage(folder: Path, problem: str) -> IncompleteStoreError:
+    """Return the error of a damaged store or run: what was made of it, and the command that removes it."""
+    root = _root_of(folder)
+    made = descendants(Archive(root).manifests(), [folder.absolute().relative_to(root).as_posix()])
+    below = f" and what was made of it, {list_some(made)}," if made else ""
+    return IncompleteStoreError(
+        f"{folder} is damaged: {problem}; restore it from a copy, or remove it{below} by spectralzoom gc --damaged "
+        f"{shlex.quote(str(root))}; the next survey makes it again"
+    )
+
+
+def _root_of(folder: Path) -> Path:
+    """Return the archive of a store or run; the folder above where it was copied out of its archive."""
+    above = folder.absolute().parents
+    return (
+        above[2]
+        if len(above) > 2 and above[1].name == "stages"
+        else above[min(len(above) - 1, int(above[0].name == "runs"))]
+    )
+
+
+# --- the archive ------------------------------------------------------------------------------------------------------
+
+
+class Archive:
+    """A folder of stores and runs; it may be copied as it is, by rsync or to a bucket, at any time."""
+
+    def __init__(self, root: Path, *, writes: bool = True) -> None:
+        self.root = root
+        self.writes = writes
+        self.spooled_bytes = 0  # of the spools that were removed
+
+    @classmethod
+    def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
+        """Open the archive in a folder, or create it with ``create``.
+
+        Raises ArchiveError: the path is a file, a bucket or missing, or cannot be read or written to (``write``).
+        """
+        path = Path(root).absolute()
+        if (found := _BUCKET.match(str(root))) is not None:
+            raise ArchiveError(
+                f"{found[0]}//{str(root)[found.end() :].lstrip('/')} is not a folder: expected that of an archive; "
+                "spectralzoom pull copies one from s3://bucket/prefix, and push copies it there"
+            )
+        with refusals(path, "use the archive", every=True):
+            if path.exists() and not path.is_dir():
+                cure = "choose another folder" if create else "check the name"
+                raise ArchiveError(f"{root} is a file, expected a folder for the archive; {cure}")
+            for part in ("stages", "runs", "spool", ".locks"):
+                if (path / part).is_symlink() or ((path / part).exists() and not (path / part).is_dir()):
+                    raise ArchiveError(f"{path / part} is a file or a link, expected a folder; move it away")
+            if not (path / "stages").is_dir():
+                if not create:
+                    state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
+                    raise ArchiveError(f"{root} {state}; check the name, or make an archive with survey --out")
+                (path / "stages").mkdir(parents=True, exist_ok=True)
+                sync(path)
+                sync(path.parent)
+            if write:
+                _check_writable(path, create=create)
+        return cls(path, writes=write)
+
+    @property
+    def name(self) -> str:
+        """Return the address that opens it again."""
+        return str(self.root)
+
+    # --- stores -------------------------------------------------------------------------------------------------------
+
+    def key(self, stage: str, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()) -> str:
+        """Return the key of a stage's store, as `stage_key`."""
+        return stage_key(stage, version, params, inputs)
+
+    def ref(self, stage: str, key: str) -> Ref:
+        """Return the address of a store, whether it exists or not. Raises ArchiveError: a name is not allowed."""
+        for name in (stage, key):
+            if not is_name(name):
+                raise ArchiveError(f"{name!r} cannot be a name in an archive; use letters, digits, '_', '-' and '.'")
+        return Ref(stage, key, self.root / "stages" / stage / key)
+
+    def refs(self, stage: str | None = None) -> list[Ref]:
+        """Return every published store (of one stage), by stage and key."""
+        folders = self._folders("stages")
+        return [Ref(one.parent.name, one.name, one) for one in folders if stage in (None, one.parent.name)]
+
+    def find(self, stage: str, key: str) -> Ref | None:
+        """Return the published store; None where there is none or its files were cleared away.
+
+        Raises IncompleteStoreError: it is damaged.
+        """
+        ref = self.ref(stage, key)
+        with refusals(self.root, "read the archive"):
+            if not os.path.lexists(ref.path):
+                return None
+            check_store(ref.path)
+            return None if is_cleared(ref.path) else ref
+
+    def locate(self, address: str) -> Path:
+        """Return the path on this machine of a store, a run, or a file in one, by its address.
+
+        Raises IncompleteStoreError: it is missing, damaged or cleared; ArchiveError: it is outside of the archive.
+        """
+        if (uri := uri_of(address)) is None:
+            raise ArchiveError(f"{address!r} is no address in an archive; expected stages/STAGE/KEY or runs/NAME")
+        with refusals(self.root, "read the archive"):
+            check_store(self.root / uri)
+        if is_cleared(self.root / uri):
+            raise IncompleteStoreError(
+                f"{self.name}/{uri}: its files were cleared away. Run its survey again, for raw lines with --keep raw"
+                " (explain prints the command of the run): only cleared stores are built again"
+            )
+        return self.root / address
+
+    def is_there(self, uri: str) -> bool:
+        """Return whether a store has its files, not its manifest alone."""
+        return uri_of(uri) is not None and (self.root / uri).is_dir() and not is_cleared(self.root / uri)
+
+    def is_known(self, ref: Ref) -> bool:
+        """Return whether a store was published here, even if its files were cleared away."""
+        return (self.root / ref.uri).is_dir()
+
+    def produce(
+        self, stage: str, build: Build, *, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()
+    ) -> tuple[Ref, bool]:
+        """Return the store with these parameters and inputs, and whether ``build`` has written it now.
+
+        One process at a time builds a store; the others wait for it. Raises ArchiveError: the disk refuses, or another
+        process has cleared an input meanwhile.
+        """
+        ref = self.ref(stage, stage_key(stage, version, params, inputs))
+        if self.find(stage, ref.key) is not None:
+            return ref, False
+        facts = {"stage": stage, "version": version, "params": params, "inputs": [one.uri for one in inputs]}
+
+        def build_of_inputs(folder: Path) -> Mapping[str, Any]:
+            paths = [self.root / one.uri for one in inputs]
+            before = [try_manifest(path) for path in paths]
+            try:
+                build(folder)
+            finally:  # a cleared array reads as nodata, or fails
+                if any(map(is_cleared, paths)) or [try_manifest(path) for path in paths] != before:
+                    raise ArchiveError(f"another survey has cleared an input of {stage} meanwhile; repeat the command")
+            return facts
+
+        with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{ref.key}"):
+            if self.find(stage, ref.key) is not None:  # another process was first
+                return ref, False
+            built = publish(ref.path, build_of_inputs)
+            spool = self.root / "spool" / ref.key
+            self.spooled_bytes += bytes_in(spool)
+            remove(spool)
+        return ref, built
+
+    def spool_folder(self, key: str) -> Path:
+        """Return a folder for lines of the store under construction; it outlives the process until `produce` ends."""
+        folder = self.root / "spool" / self.ref("capture", key).key
+        with refusals(self.root, "write to the archive"):
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def adopt(self, uri: str, fetch: Callable[[Path], None]) -> bool:
+        """Publish a copy that ``fetch`` writes with its manifest; return False where it is here already."""
+        final = self.root / uri
+        with refusals(self.root, "write to the archive"), self._locked(_lock_name(final)):
+            return not final.exists() and publish(final, fetch)
+
+    def clear(self, ref: Ref, *, wait: bool = True) -> bool:
+        """Mark a store as cleared and delete its files but the manifest; a later request builds it again.
+
+        False where another process holds it and ``wait`` is false. Raises IncompleteStoreError: its manifest is
+        damaged.
+        """
+        final = self.root / ref.uri
+        with (
+            refusals(self.root, "clear up the archive", every=True),
+            self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held,
+        ):
+            if held:
+                read_manifest(final)
+                (final / CLEARED).touch()
+                sync(final)
+                _delete_cleared(final)
+        return held
+
+    def discard(self, uri: str) -> bool:
+        """Remove a store, a run or a leftover; False where another process holds it, or the disk refuses."""
+        path = self.root / uri
+        with self._locked(_lock_name(path), wait=False) as held:
+            if held and is_cleared(path) and path in self._cleared_leftovers():
+                _delete_cleared(path)
+            elif held and path.name.endswith(OLD) and not (whole := path.with_name(path.name.split(".")[0])).exists():
+                path.rename(whole)  # a cleared store that was to be replaced
+            elif held:
+                remove(path)
+        return held and (is_cleared(path) or not os.path.lexists(path))
+
+    @contextmanager
+    def in_use(self, *, alone: bool = False) -> Iterator[bool]:
+        """Keep other processes from removing stores while the block runs; many may use an archive at a time.
+
+        ``alone`` asks for exclusive use, and yields False at once where another process uses the archive.
+        """
+        with self._locked("use", wait=not alone, shared=not alone) as held:
+            yield held
+
+    def reclaim(self) -> list[str]:
+        """Remove what killed processes left in this folder; return the addresses."""
+        with refusals(self.root, "clear up the archive", every=True):
+            return [uri for uri in self.leftovers() if self.discard(uri)]
+
+    def leftovers(self) -> list[str]:
+        """Return unfinished folders, spools of published captures, and cleared stores with files; not those in use."""
+        places = [
+            *entries(self.root / "runs"),
+            *(one for stage in entries(self.root / "stages") for one in entries(stage)),
+        ]
+        found = [one for one in places if one.name.endswith(PART)] + self._cleared_leftovers()
+        for spool in entries(self.root / "spool"):
+            stores = [stage / spool.name for stage in entries(self.root / "stages")]
+            if any(try_manifest(one)[1] is None and not is_cleared(one) for one in stores):
+                found.append(spool)
+        return [one.relative_to(self.root).as_posix() for one in sorted(found) if self._is_free(_lock_name(one))]
+
+    def replaced(self) -> set[str]:
+        """Return the addresses of cleared stores that a killed process was replacing; `reclaim` puts them back."""
+        inside = [one for stage in entries(self.root / "stages") for one in entries(stage) if one.name.endswith(OLD)]
+        return {f"stages/{one.parent.name}/{_PART_OF.sub('', one.name)}" for one in inside}
+
+    def strays(self) -> list[Path]:
+        """Return what lies among stores and runs and is neither."""
+        stages = [one for one in entries(self.root / "stages") if is_folder(one)]
+        loose = [one for one in entries(self.root / "stages") if not is_folder(one)]
+        inside = [one for folder in (*stages, self.root / "runs") for one in entries(folder)]
+        known = {*self._folders("stages"), *self._folders("runs")}
+        return loose + [one for one in inside if one not in known and not one.name.endswith(PART)]
+
+    def _cleared_leftovers(self) -> list[Path]:
+        """Return the cleared stores that still have files."""
+        return [
+            one for one in self._folders("stages") if is_cleared(one) and files_in(one).keys() - {MANIFEST, CLEARED}
+        ]
+
+    def _folders(self, kind: str) -> list[Path]:
+        """Return the folders of ``stages`` or ``runs`` that are no leftovers, with or without a manifest."""
+        above = [self.root / kind] if kind == "runs" else [*filter(is_folder, entries(self.root / kind))]
+        return [one for folder in above for one in entries(folder) if is_name(one.name) and _leads_on(one)]
+
+    def _is_free(self, lock: str) -> bool:
+        path = self.root / ".locks" / f"{lock}.lock"
+        release = take_lock(path, wait=False) if path.exists() else lambda: None
+        if release is not None:
+            release()
+        return release is not None
+
+    @contextmanager
+    def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
+        """Hold a lock while the block runs; yield False where another process holds it and ``wait`` is false."""
+        with refusals(self.root, "lock", every=True):
+            release = take_lock(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
+        try:
+            yield release is not None
+        finally:
+            if release is not None:
+                release()
+
+    # --- runs ---------------------------------------------------------------------------------------------------------
+
+    def publish_run(
+        self, name: str, build: Callable[[Path, str], Mapping[str, Any] | None], inputs: Sequence[Ref] = ()
+    ) -> Path:
+        """Publish a run below ``runs`` and return its folder.
+
+        ``build`` gets a folder to write into and the run's address, and returns facts for the manifest. ``inputs`` are
+        the stores that the run names; `gc` keeps them, and all that they were made of.
+        """
+        begun = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
+        for number in count(1):
+            final = self.root / "runs" / (begun if number == 1 else f"{begun}-{number}")
+
+            def write(folder: Path, uri: str = f"runs/{final.name}") -> Mapping[str, Any]:
+                facts = build(folder, uri) or {}
+                return {**facts, "inputs": [one.uri for one in inputs], RESTS_ON: self.manifest_hashes(inputs)}
+
+            with refusals(self.root, "write to the archive"), self._locked(_lock_name(final), wait=False) as held:
+                if held and not final.exists() and publish(final, write):
+                    return final
+        raise AssertionError("unreachable")
+
+    def runs(self) -> list[Path]:
+        """Return the folders of the published runs, oldest first: by the second in their names, then as written."""
+        ages = dict[Path, int]()
+        with refusals(self.root, "read the archive", every=True):
+            for path in self._folders("runs"):
+                with suppress(FileNotFoundError):
+                    ages[path] = (path / MANIFEST).lstat().st_mtime_ns
+        return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
+
+    def past_runs(self) -> list[Path]:
+        """Return the published runs but those that lie in the future, which a warning names."""
+        return past_runs(self.runs())
+
+    def run_folder(self, name: str) -> Path:
+        """Return the folder of a published run by name, address or ``latest``. Raises NoRunError."""
+        called = name.rstrip("/").removeprefix("runs/")
+        folders = self.past_runs() if called == LATEST else self.runs()
+        folder = next((one for one in reversed(folders) if called in (one.name, LATEST)), None)
+        if folder is None:
+            known = ", ".join(one.name for one in self.runs()[-5:])
+            there = f"has no run {name!r}; its latest are {known}" if known else "has no run; survey into it first"
+            raise NoRunError(f"{self.name} {there}")
+        return folder
+
+    # --- manifests and lineage ----------------------------------------------------------------------------------------
+
+    def manifest(self, ref: Ref) -> dict[str, Any]:
+        """Return the manifest of a store: stage, version, params, inputs, created, files."""
+        return read_manifest(self.root / ref.uri)
+
+    def stored_bytes(self, ref: Ref) -> int:
+        """Return the size of a store's files as they were published; cleared files count too."""
+        return listed_bytes(self.manifest(ref))
+
+    def size_of(self, uri: str) -> int:
+        """Return the present bytes of all files of a store or run, manifest included."""
+        return bytes_in(self.root / uri)
+
+    def manifests(self) -> dict[str, dict[str, Any]]:
+        """Return the manifests of all stores, then runs, by address, each with its ``problem`` and ``cleared``."""
+        found: dict[str, dict[str, Any]] = {}
+        with refusals(self.root, "read the archive", every=True):
+            for path in (*self._folders("stages"), *self._folders("runs")):
+                content, problem = try_manifest(path)
+                if problem is None or path.exists():  # else another process has removed it
+                    uri = path.relative_to(self.root).as_posix()
+                    found[uri] = {**content, "problem": problem, "cleared": is_cleared(path)}
+        return found
+
+    def manifest_hashes(self, refs: Iterable[Ref]) -> dict[str, str]:
+        """Return the SHA-256 of the manifests of stores and all their inputs, and so of every byte, by address."""
+        found: dict[str, str] = {}
+        waiting = [ref.uri for ref in refs]
+        while waiting:
+            if (uri := waiting.pop()) not in found and (self.root / uri).is_dir():
+                found[uri] = manifest_sha256(self.root / uri)
+                waiting += try_manifest(self.root / uri)[0]["inputs"]
+        return dict(sorted(found.items()))
+
+    def lineage(self, uri: str) -> list[str]:
+        """Return a store or run and all that it was made of, the nearest first."""
+        return [uri, *ancestors(self.manifests(), [uri])]
+
+
+Build = Callable[[Path], object]  # writes into a given folder
+Manifests = Mapping[str, Mapping[str, Any]]
+
+
+def ancestors(known: Manifests, uris: Iterable[str]) -> list[str]:
+    """Return all inputs of these stores, direct and indirect, without themselves, the nearest first."""
+    found = list(uris)
+    begun = len(found)
+    for uri in found:  # which grows
+        found += [one for one in dict.fromkeys(known.get(uri, {}).get("inputs", ())) if one not in found]
+    return found[begun:]
+
+
+def descendants(known: Manifests, uris: Iterable[str]) -> list[str]:
+    """Return all stores that were made of these, directly or not, without themselves, inputs first."""
+    found = begun = set(uris)
+    ordered = inputs_first(known, known)
+    while new := {uri for uri in ordered if uri not in found and not found.isdisjoint(known[uri]["inputs"])}:
+        found = found | new
+    return [uri for uri in ordered if uri in found - begun and uri.startswith("stages/")]
+
+
+def inputs_first(known: Manifests, uris: Iterable[str]) -> list[str]:
+    """Return these stores with inputs before the stores made of them."""
+    wanted = set(uris)
+    ordered, seen = dict[str, None](), set[str]()
+    waiting = [(uri, False) for uri in sorted(wanted, reverse=True)]
+    while waiting:
+        uri, is_next = waiting.pop()
+        if is_next:
+            ordered[uri] = None
+        elif uri not in seen:
+            seen.add(uri)
+            waiting += [(uri, True), *((one, False) for one in known.get(uri, {}).get("inputs", ()))]
+    return [uri for uri in ordered if uri in wanted]
+
+
+def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> bool:
+    """Build a folder aside, sync it, and give it its name in one step.
+
+    ``build`` returns facts for the manifest, or None where it has written one. Returns False where another process,
+    whose lock this one did not see, has published the same name meanwhile. Raises ArchiveError: another process has
+    removed the folder.
+    """
+    part, old = aside(final), aside(final, OLD)
+    part.mkdir(parents=True)
+    descriptor = os.open(part, os.O_RDONLY)  # while it is open, no other folder gets its number
+    try:
+        facts = build(part)
+        with refusals(final.parents[1], "write to", every=True):
+            if facts is not None:
+                write_manifest(part, facts)
+            for path in (*(part / name for name in files_in(part)), *(Path(one[0]) for one in os.walk(part))):
+                sync(path)
+            sync(final.parents[1])  # the parent may be new: without its own name what it holds is lost
+            if not os.path.samestat(os.fstat(descriptor), part.stat()):
+                raise FileNotFoundError(errno.ENOENT, "another process has removed it", str(part))
+            if is_cleared(final):
+                final.rename(old)
+            try:
+                part.rename(final)
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                    raise
+                return False
+            sync(final.parent)
+        return True
+    finally:
+        os.close(descriptor)
+        with suppress(OSError):
+            if old.exists() and not final.exists():
+                old.rename(final)
+        remove(old)
+        remove(part)
+
+
+def _delete_cleared(folder: Path) -> None:
+    """Delete the files of a store that is marked as cleared."""
+    for path in entries(folder):
+        if path.name not in (MANIFEST, CLEARED):
+            shutil.rmtree(path) if is_folder(path) else path.unlink(missing_ok=True)
+
+
+def _leads_on(path: Path) -> bool:
+    """Return whether a path is a folder, or a link, which counts as a damaged store and is never followed."""
+    return path.is_symlink() or path.is_dir()
+
+
+def _lock_name(path: Path) -> str:
+    """Return the name of the lock of a store, run, spool or leftover."""
+    kind = CAPTURED if path.parent.name == "spool" else path.parent.name
+    return f"{kind}-{_PART_OF.sub('', path.name)}"
+
+
+def _check_writable(path: Path, *, create: bool) -> None:
+    """Write a small file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
+    probe = path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
+    try:
+        probe.write_bytes(b"written to see whether this can be written to")
+    except OSError as error:
+        if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+    finally:
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)
+
+
+def listed_bytes(manifest: Mapping[str, Any]) -> int:
+    """Return the size of all files that a manifest lists."""
+    return sum(size for size, _ in manifest["files"].values())
+
+
+def is_archive(address: str | Path) -> bool:
+    """Return whether there is an archive to open, or a file that will be refused."""
+    return (Path(address) / "stages").is_dir() or Path(address).is_file()
+
+
+def run_stem(name: str) -> str:
+    """Return a survey's name as it stands in the name of a run's folder, behind the time."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
+
+
+def past_runs(folders: Iterable[Path]) -> list[Path]:
+    """Return the runs that are not in the future, by names and manifests; a warning names the others."""
+    found: dict[bool, list[Path]] = {True: [], False: []}
+    for folder in folders:
+        found[is_ahead(folder.name) or is_ahead(try_manifest(folder)[0]["created"])].append(folder)
+    if ahead := [one.name for one in found[True]]:
+        log.warning("%s: in the future, and so not taken as the latest run; check the clock", list_some(ahead))
+    return found[False]
+
+
+def is_ahead(text: str) -> bool:
+    """Return whether the time in a run's name, or of a manifest, is later than now."""
+    try:
+        moment = datetime.fromisoformat(text if "+" in text else text[:SECOND])
+        return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S
+    except ValueError:
+        return False

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from spectralzoom.flows.publish.receipt import Receipt, check_receipt
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 
 # differs between runs of the same seed
 OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")

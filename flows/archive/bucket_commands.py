@@ -13,9 +13,9 @@ from spectralzoom.flows.settings.flags import ArchiveName, AsJson
 from spectralzoom.flows.terminal.figures import counted, format_bytes
 from spectralzoom.flows.terminal.processes import DONE, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, stderr
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.remote import bucket
 from spectralzoom.storage.remote.objects import Objects, parse_place
+from spectralzoom.storage.store import Archive
 
 BucketName = Annotated[str, Parameter(name="bucket", help="Address in a bucket: s3://bucket/prefix.")]
 

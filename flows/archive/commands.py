@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import PurePath
 from typing import Any
 
@@ -20,12 +19,9 @@ from spectralzoom.flows.tasks.scores import score_of
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.lineage import Catalogue, find_product
-from spectralzoom.storage.archive.records import Run
-from spectralzoom.storage.archive.whole_files import to_json
-from spectralzoom.storage.maintenance.garbage import clear_up
-from spectralzoom.storage.maintenance.verification import Finding, verify_everything
+from spectralzoom.storage.runs import Catalogue, Finding, Run, clear_up, find_product, verify_everything
+from spectralzoom.storage.store import Archive, descendants
+from spectralzoom.storage.whole_files import to_json
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "stage", "what")  # never folded
@@ -107,7 +103,7 @@ def gc(
         "archive": opened.name,
         "dry_run": dry_run,
         "bytes": done.size,
-        "removals": [asdict(removal) for removal in done.removals],
+        "removals": [removal._asdict() for removal in done.removals],
         "kept": done.kept,
         "obstacle": done.obstacle,
     }
@@ -117,21 +113,22 @@ def gc(
 
 def contents(archive: Archive) -> dict[str, Any]:
     """Return the runs of an archive, newest last, and its stores by stage, oldest first."""
-    catalogue = Catalogue.read(archive.root)
+    catalogue = Catalogue.read(archive)
     of_runs = (uri for run in catalogue.runs for uri in (run.uri, *run.names))  # also of stores that are missing
-    sizes = archive.sizes(sorted({*catalogue.stores, *of_runs}))
+    sizes = {uri: archive.size_of(uri) for uri in sorted({*catalogue.stores, *of_runs})}
     stages: dict[str, list[dict[str, Any]]] = {}
-    for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
+    for uri, store in sorted(catalogue.stores.items(), key=lambda one: (one[1]["created"], one[0])):
+        _, stage, key = uri.split("/")
         row = {
-            "key": store.ref.key,
-            "version": store.version,
-            "created": store.created,
-            "bytes": sizes[store.ref.uri],  # with its manifest
-            "cleared": store.cleared,
-            "runs": len(catalogue.named_by(store.ref.uri)),
-            "problem": store.problem,
+            "key": key,
+            "version": str(store.get("version", "")),
+            "created": store["created"],
+            "bytes": sizes[uri],  # with its manifest
+            "cleared": store["cleared"],
+            "runs": len(catalogue.named_by(uri)),
+            "problem": store["problem"],
         }
-        stages.setdefault(store.ref.stage, []).append(row)
+        stages.setdefault(stage, []).append(row)
     return {
         "archive": archive.name,
         "runs": [
@@ -142,7 +139,7 @@ def contents(archive: Archive) -> dict[str, Any]:
             }
             for run in catalogue.runs
         ],
-        "stages": stages,
+        "stages": dict(sorted(stages.items())),
         "bytes": sum(sizes.values()),
         "shared_bytes": sum(size for uri, size in sizes.items() if len(catalogue.named_by(uri)) > 1),
     }
@@ -166,7 +163,7 @@ def _run_state(catalogue: Catalogue, run: Run) -> str:
     if run.problem is not None:
         return "damaged"
     stores = [catalogue.stores.get(uri) for uri in run.names]
-    damaged = sum(store is not None and store.problem is not None for store in stores)
+    damaged = sum(store is not None and store["problem"] is not None for store in stores)
     counts = ((stores.count(None), "missing"), (damaged, "damaged"))
     return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
 
@@ -176,11 +173,11 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
 
     Raises ArchiveError: there is no such product.
     """
-    catalogue = Catalogue.read(archive.root)
+    catalogue = Catalogue.read(archive)
     found = find_product(catalogue, product)
     if isinstance(found, Run):
-        below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
         shown: set[str] = set()
+        below = {one for uri in found.names & catalogue.stores.keys() for one in catalogue.stores[uri]["inputs"]}
         trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
         told = {"problem": found.problem, "command": command(found.settings, archive.name)}
         return {"archive": archive.name, "product": found.uri, **told, "lineage": trees}
@@ -195,18 +192,18 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
         return {"uri": uri, "problem": "is not there", "inputs": []}
     node = {
         "uri": uri,
-        "stage": store.ref.stage,
-        "key": store.ref.key,
-        "version": store.version,
-        "cleared": store.cleared,
-        "called": sorted(catalogue.roles(uri)),
-        "problem": store.problem,
+        "stage": uri.split("/")[1],
+        "key": uri.split("/")[2],
+        "version": str(store.get("version", "")),
+        "cleared": store["cleared"],
+        "called": sorted(catalogue.called(uri)),
+        "problem": store["problem"],
         "inputs": [],
     }
     if uri in shown:
         return node | {"see": "above"}
     shown.add(uri)
-    return node | {"inputs": [_tree(catalogue, one, shown) for one in catalogue.inputs_of(uri)]}
+    return node | {"inputs": [_tree(catalogue, one, shown) for one in store["inputs"]]}
 
 
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
@@ -218,11 +215,11 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
         "archive": archive.name,
         "checked": len(places),
         "whole": len(places - damaged),
-        "problems": [asdict(finding) for finding in bad],
+        "problems": [finding._asdict() for finding in bad],
     }
     if damaged:
-        catalogue = Catalogue.read(archive.root)
-        below = catalogue.descendants(damaged)
+        catalogue = Catalogue.read(archive)
+        below = set(descendants(catalogue.stores, damaged))
         runs = [run for run in catalogue.runs if run.uri in damaged or run.names & (damaged | below)]
         surveys = {command(run.settings, archive.name): run.uri for run in runs if run.settings}
         content |= {

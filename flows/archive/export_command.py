@@ -34,11 +34,9 @@ from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, chec
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import print_json, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.manifests import read_manifest
-from spectralzoom.storage.archive.staging import take_lock
-from spectralzoom.storage.archive.whole_files import remove_leftovers, to_json, write_whole
 from spectralzoom.storage.export.image_files import write_cog
+from spectralzoom.storage.store import Archive, read_manifest
+from spectralzoom.storage.whole_files import remove_leftovers, take_lock, to_json, write_whole
 
 COLLECTION = "collection.json"
 COG, CSV = "image/tiff; application=geotiff; profile=cloud-optimized", "text/csv"

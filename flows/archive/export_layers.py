@@ -24,14 +24,13 @@ from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, Sh
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out
 from spectralzoom.pipeline.products.indices import SpectralIndex, find_index
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import LATEST, StageRef
-from spectralzoom.storage.archive.records import RECEIPT, read_run, read_store
 from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
+from spectralzoom.storage.runs import RECEIPT, read_run
+from spectralzoom.storage.store import LATEST, Archive, Ref, uri_of
 
 
 @Parameter(name="*")
@@ -115,7 +114,7 @@ class ExportedRun:
         known = 10 if self.receipt["source"] == RIG else 19  # characters: to the day, or to the second
         return (began, ended) if visit[:known] == began[:known] else (visit, visit)
 
-    def store(self, product: str) -> StageRef | None:
+    def store(self, product: str) -> Ref | None:
         """Return the store of a product; None if there is none, or if its files were cleared away.
 
         Raises IncompleteStoreError: the archive has lost the store or a part of it.
@@ -123,9 +122,10 @@ class ExportedRun:
         uri = self.receipt["products"].get(product)
         if uri is None:
             return None
-        _, stage, key = uri.split("/")[:3]
+        parts = (uri_of(uri) or "stages//").split("/")  # of a damaged receipt: no name, and an error
+        stage, key = parts[1], parts[-1]
         ref = self.archive.find(stage, key)
-        if ref is None and read_store(self.archive.ref(stage, key)).cleared:
+        if ref is None and self.archive.is_known(self.archive.ref(stage, key)):
             return None
         if ref is None:
             raise IncompleteStoreError(

@@ -13,9 +13,9 @@ from affine import Affine
 from spectralzoom.flows.archive.export_layers import ExportedRun, ProductChoice
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.storage.archive.whole_files import written_aside
 from spectralzoom.storage.arrays.class_maps import legend_of
 from spectralzoom.storage.arrays.ground_maps import open_image
+from spectralzoom.storage.whole_files import written_aside
 
 GEOPACKAGE, SHAPEFILE = "application/geopackage+sqlite3", "application/vnd.shp"
 PARTS = (".shp", ".shx", ".dbf", ".cpg", ".prj")  # of a shapefile

@@ -18,12 +18,12 @@ from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from spectralzoom.pipeline.ground.view import GroundView, RigPose
 from spectralzoom.pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
-from spectralzoom.storage.archive.whole_files import write_whole
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import open_image
 from spectralzoom.storage.arrays.layout import open_group, read_bands
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
 from spectralzoom.storage.export.image_files import CogImage
+from spectralzoom.storage.whole_files import write_whole
 
 COLUMNS = (
     *("class", "pixels", "hectares", "fraction", "mean_confidence"),

@@ -30,8 +30,7 @@ from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.pipeline.geometry.scan import exposing
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.pipeline.planning.uniform_scans import frontier
-from spectralzoom.storage.archive.keys import is_archive
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, is_archive
 
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}

@@ -30,12 +30,10 @@ from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import canonical_json
-from spectralzoom.storage.archive.lineage import Catalogue
-from spectralzoom.storage.archive.records import Run, read_run
 from spectralzoom.storage.parallel.pool import THREADS, WorkerPool
 from spectralzoom.storage.readers.recordings import stores_of_lines
+from spectralzoom.storage.runs import Catalogue, Run, read_run
+from spectralzoom.storage.store import Archive, text_of
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "controls", "prior", "keep")  # not in raw cubes
 
@@ -88,7 +86,7 @@ def reprocess_fields(
     SettingsError: no field has this name; ArchiveError: the archive cannot be read or written.
     """
     opened = Archive.open(archive, create=False, write=not dry_run)
-    catalogue = Catalogue.read(opened.root)
+    catalogue = Catalogue.read(opened)
     if weights is not None:
         describe_weights(weights)  # raises an error before any survey
     fields = newest_runs(catalogue)
@@ -191,7 +189,7 @@ def fields_of(catalogue: Catalogue) -> list[list[Run]]:
                 break
             lit = by_name[name]
         asked = [lit.settings.get(name) for name in ("source", "visit")]
-        found.setdefault(canonical_json([called(run), lit.receipt.get("scene", run.uri), *asked]), []).append(run)
+        found.setdefault(text_of([called(run), lit.receipt.get("scene", run.uri), *asked]), []).append(run)
     return list(found.values())
 
 
@@ -207,9 +205,11 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     That is the case if captures are made otherwise by now, or if the files of a recording or scene are gone or changed.
     Raises SettingsError, BudgetError: as `asked_again`; SceneError: the raw cubes are gone too.
     """
-    raw = set(stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri].cleared))
+    raw = set(
+        stores_of_lines(run.products, lambda uri: uri in catalogue.stores and not catalogue.stores[uri]["cleared"])
+    )
     stores = [catalogue.stores.get(uri) for uri in raw]
-    if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
+    if not stores or any(one is None or one["problem"] is not None or one["cleared"] for one in stores):
         if settings.source == RIG:
             return settings
         raise SceneError(

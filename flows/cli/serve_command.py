@@ -37,8 +37,8 @@ from spectralzoom.flows.terminal.processes import DONE, terminable
 from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.staging import read_toml, take_lock
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import read_toml, refusals, take_lock
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -77,7 +77,8 @@ def serve(
     home = next(iter(archives.values())) / ".prefect"
     with suppress(KeyboardInterrupt), terminable(), ExitStack() as held:
         for name, root in archives.items():
-            release = take_lock(root / ".locks" / "serve.lock", wait=False)
+            with refusals(root, "lock", every=True):
+                release = take_lock(root / ".locks" / "serve.lock", wait=False)
             if release is None:
                 raise ArchiveError(
                     f"another serve uses the archive {name}; give all its fields to that one, or stop it"

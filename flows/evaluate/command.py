@@ -27,7 +27,7 @@ from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_te
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
 from spectralzoom.models.weights.files import Weights, load_weights
-from spectralzoom.storage.archive.whole_files import to_json, write_whole
+from spectralzoom.storage.whole_files import to_json, write_whole
 
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
 CAPTION = (

@@ -20,7 +20,7 @@ from spectralzoom.flows.stage import Stores, inside_flow, task_in_flow
 from spectralzoom.flows.stages.condense import raw_differs
 from spectralzoom.flows.stages.score import load_plan
 from spectralzoom.pipeline.errors import SurveyStopped
-from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.runs import Catalogue
 from spectralzoom.storage.store import Archive, Ref
 
 WIDTH_PX = 800  # of the picture in the text
@@ -62,7 +62,7 @@ def clear_raw(stores: Stores, plan: SurveyPlan, products: Products, run: RunRef,
     def work(*_: Ref) -> RunRef:
         archive = stores.archive
         if all(map(stores.has, raws)):
-            catalogue = Catalogue.read(archive.root)
+            catalogue = Catalogue.read(archive)
             named = (one for raw in raws for one in catalogue.named_by(raw.uri))
             others = [one for one in named if one.settings.get("keep") != KEEP_SIGNAL]
             kept = f"{others[0].uri} keeps them" if others else None
@@ -81,7 +81,7 @@ def clear_first_mosaic(archive: Archive, plan: SurveyPlan, products: Products) -
     if products.first is None or products.second is None or plan.registers:  # fine sweeps are registered on it
         return
     first = products.first.mosaic
-    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive.root).runs):
+    if not any(run.products.get("mosaic", "").startswith(first.uri) for run in Catalogue.read(archive).runs):
         archive.clear(first, wait=False)
 
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from spectralzoom.flows.settings.survey_settings import RASTER
 from spectralzoom.pipeline.errors import ShapeError
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json
 
 Receipt = dict[str, Any]
 Facts = dict[str, Any]

@@ -32,8 +32,8 @@ from spectralzoom.flows.publish.receipt_table import (
 from spectralzoom.flows.tasks.scores import error_matrix, format_false_classes
 from spectralzoom.flows.terminal.figures import format_percent, format_points
 from spectralzoom.pipeline.errors import visible
-from spectralzoom.storage.archive.records import LINE_PRODUCTS
 from spectralzoom.storage.readers.open_cubes import split_variable
+from spectralzoom.storage.runs import LINE_PRODUCTS
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry
 MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")

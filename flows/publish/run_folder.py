@@ -6,7 +6,6 @@ The receipt counts the bytes of the survey's stores, and not those of its own fo
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -45,16 +44,15 @@ from spectralzoom.flows.stages.score import READING, load_plan, read_in_full
 from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
 from spectralzoom.flows.tasks.scene import seen_in_training
-from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.archive.manifests import CURE
-from spectralzoom.storage.archive.records import RECEIPT, read_run
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
-from spectralzoom.storage.store import Ref, read_table, to_json
+from spectralzoom.storage.runs import RECEIPT, read_run
+from spectralzoom.storage.store import Ref, damage, read_table
+from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
 COSTS_OF_STAGE = ("wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
@@ -73,34 +71,34 @@ def load_receipt(folder: Path) -> Receipt:
     """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
     found = read_run(folder)
     if found.problem is not None:
-        raise IncompleteStoreError(f"{found.uri}: {found.problem}; {CURE}")
+        raise damage(folder, found.problem)
     return check_receipt(found.receipt)
 
 
 def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: datetime) -> Published:
     """Publish the products of a survey as a run folder with receipt.json, quicklook.png and report.html."""
-    archive = stores.archive
-    fine = load_plan(products.attention)
-    rests_on = archive.manifest_hashes(products.stores())
-    shown = quicklook_data(plan, products, fine)
+    shown = quicklook_data(plan, products)
     quicklook = draw_quicklook(shown)
-    with archive.new_run(plan.field.name) as draft:
-        data_bytes = count_bytes(stores, plan, products, fine, rests_on)
-        receipt = make_receipt(stores, plan, products, f"runs/{draft.id}", data_bytes, started)
+    receipt: Receipt = {}
+
+    def write(folder: Path, uri: str) -> Facts:
+        """Write the files of the run into a folder, and return facts for its manifest."""
+        nonlocal receipt
+        receipt = make_receipt(stores, plan, products, uri, started)
         page = render_report(receipt, quicklook, field=field_map(shown, plan.field.prior))
-        draft.write_file("quicklook.png", quicklook)
+        (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
-            draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
-        draft.write_file(RECEIPT, to_json(receipt))
-        draft.write_file(REPORT, page)
-        draft.publish(rests_on=rests_on, survey=receipt["survey"], settings=receipt["settings"])
-    return Published(receipt, draft.published)
+            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]))
+        (folder / RECEIPT).write_text(to_json(receipt), encoding="utf-8")
+        (folder / REPORT).write_text(page, encoding="utf-8")
+        return {"survey": receipt["survey"], "settings": receipt["settings"]}
+
+    folder = stores.archive.publish_run(plan.field.name, write, products.stores())
+    return Published(receipt, folder)
 
 
-def make_receipt(
-    stores: Stores, plan: SurveyPlan, products: Products, folder: str, data_bytes: Facts, started: datetime
-) -> Receipt:
-    """Return the receipt of a run whose folder has the address ``folder``."""
+def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str, started: datetime) -> Receipt:
+    """Return the receipt of a run whose folder has the address ``uri``."""
     read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # a plan assumes `SMOOTH` of them
     plan = replace(plan, costs=replace(plan.costs, bands=read))
     field = plan.field
@@ -126,12 +124,12 @@ def make_receipt(
         settings=asked_settings(plan),
         stages=[_stage_row(row) for row in stores.rows.values()],
         savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)),
-        data_bytes=data_bytes,
+        data_bytes=count_bytes(stores, plan, products, fine),
         accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
         training_scene=seen_in_training(field.scene, field.described),
         effects=effects.get("effects"),
         effects_total=effects.get("total"),
-        products={**places, **{name: f"{folder}/{name}" for name in files}},
+        products={**places, **{name: f"{uri}/{name}" for name in files}},
         scans={name: as_figures(scan) for name, scan in scans.items() if scan is not None},
         **find_out(plan, products),
     )
@@ -180,8 +178,9 @@ def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[s
     return {**{name: entry.as_dict() for name, entry in entries.items()}, "capture_s": capture, **of_model}
 
 
-def quicklook_data(plan: SurveyPlan, products: Products, fine: FinePlan) -> QuicklookData:
+def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
     """Return the data of the quicklook, with three bands."""
+    fine = load_plan(products.attention)
     bands, caption = choose_bands(plan.field.scene.wavelength_nm)
     found = load_class_map(products.class_map.path / "class_map.zarr")
     thin = thinned(found.classes)
@@ -288,11 +287,10 @@ def _pointing(ref: Ref) -> dict[str, Any]:
     }
 
 
-def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: FinePlan, rests_on: Iterable[str]) -> Facts:
+def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: FinePlan) -> Facts:
     """Return the bytes that a survey captured, wrote and keeps, and those of the reference.
 
-    ``rests_on`` are its stores and their inputs. Raw lines that the setting ``keep`` drops do not count as kept, nor do
-    the stores of the visit of its prior map.
+    Raw lines that the setting ``keep`` drops do not count as kept, nor do the stores of the visit of its prior map.
     """
     field, archive = plan.field, stores.archive
     bands = len(field.scene.wavelength_nm)
@@ -306,6 +304,6 @@ def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: Fine
     return {
         "captured": captured,
         "written": stores.bytes_written,
-        "kept": sum(archive.sizes(uri for uri in rests_on if uri not in others).values()),
+        "kept": sum(map(archive.size_of, archive.manifest_hashes(products.stores()).keys() - others)),
         "reference": reference,
     }

@@ -42,10 +42,10 @@ from spectralzoom.pipeline.rig.device_settings import MOST_PAIRS
 from spectralzoom.pipeline.setting_fields import format_number, span_of
 from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_NAMES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
-from spectralzoom.storage.archive.keys import is_archive
-from spectralzoom.storage.archive.records import Run, moment_of
-from spectralzoom.storage.archive.staging import read_toml
 from spectralzoom.storage.readers.recordings import find_recorded_run
+from spectralzoom.storage.runs import Run, moment_of
+from spectralzoom.storage.store import is_archive
+from spectralzoom.storage.whole_files import read_toml
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,9 +20,9 @@ from spectralzoom.pipeline.setting_fields import format_number, numbers_of
 from spectralzoom.pipeline.simulator.effects.probe import Unit
 from spectralzoom.pipeline.simulator.render import BY_NAME
 from spectralzoom.pipeline.simulator.selection.choice import named_effects
-from spectralzoom.storage.archive.records import YEARS, moment_of
-from spectralzoom.storage.archive.staging import is_name
 from spectralzoom.storage.parallel.pool import WorkerPool
+from spectralzoom.storage.runs import YEARS, moment_of
+from spectralzoom.storage.store import is_name
 
 LEAST_MEMORY = 256 * 1024**2
 EXTENT_WHOLE, EXTENT_PART = "whole", "part"

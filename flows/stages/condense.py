@@ -43,7 +43,7 @@ from spectralzoom.storage.arrays.mosaics import MosaicWriter
 from spectralzoom.storage.arrays.signal_cubes import LineRows, SignalCubeWriter, open_signal_cubes
 from spectralzoom.storage.arrays.spool import line_values
 from spectralzoom.storage.readers.scene_files import RasterPixels
-from spectralzoom.storage.store import Ref, check_files, read_table, write_table
+from spectralzoom.storage.store import Ref, check_store, read_table, write_table
 
 MADE_BY = ("pipeline/signal", "storage/arrays/signal_cubes.py", "storage/arrays/mosaics.py")
 SIGNAL_RECORD = "signal.json"  # of compressed sweeps; a copy lies beside their mosaic
@@ -169,7 +169,7 @@ def raw_differs(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str |
     ``passes`` are the captures in the order of their compression. Before, every byte of the store is verified.
     """
     try:
-        check_files(signal.path, hashes=True)
+        check_store(signal.path, every_byte=True)
         return _lines_differ(passes, signal, camera)
     except IncompleteStoreError as error:
         return f"{error}"

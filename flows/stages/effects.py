@@ -18,7 +18,8 @@ from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.selection.choice import decide, list_effects, sum_up
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
-from spectralzoom.storage.store import Ref, read_table, to_json
+from spectralzoom.storage.store import Ref, read_table
+from spectralzoom.storage.whole_files import to_json
 
 RECORD = "effects.json"
 

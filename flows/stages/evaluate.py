@@ -28,7 +28,8 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.geometry.scan import Axis
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.storage.arrays.class_maps import load_class_map
-from spectralzoom.storage.store import Ref, read_table, to_json
+from spectralzoom.storage.store import Ref, read_table
+from spectralzoom.storage.whole_files import to_json
 
 RECORD = "accuracy.json"
 

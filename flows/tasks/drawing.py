@@ -44,7 +44,6 @@ from spectralzoom.models.reading.prior_map import (
 from spectralzoom.models.reading.regions import Region
 from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.geometry.grid import pad_by_reflection, patch_pixels
-from spectralzoom.storage.archive.keys import StageRef
 from spectralzoom.storage.arrays.class_maps import (
     ProbabilityStore,
     packed_probabilities,
@@ -53,6 +52,7 @@ from spectralzoom.storage.arrays.class_maps import (
 )
 from spectralzoom.storage.arrays.mosaics import Mosaic, chosen_patches, open_mosaic
 from spectralzoom.storage.parallel.pool import run_blocks
+from spectralzoom.storage.store import Ref
 
 MAP, PROBABILITIES = "class_map.zarr", "class_probabilities.zarr"
 MOST_OVERVIEWS = 16  # regions whose overviews are kept: 0.5 GB; they say how frequent each class is in the field
@@ -64,8 +64,8 @@ class Drawing:
     """Draws a region of the class map: what a worker needs for that."""
 
     weights: WeightsFile
-    mosaic: StageRef
-    attention: StageRef  # whose ranks say which patches are read in detail
+    mosaic: Ref
+    attention: Ref  # whose ranks say which patches are read in detail
     capture: LineSpec  # of the mosaic's pixels, where it does not say so itself
     prior: Prior | None = None  # prior map of the field
     left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn

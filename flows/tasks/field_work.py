@@ -34,9 +34,9 @@ from spectralzoom.models.weights.files import Description, Weights, describe_wei
 from spectralzoom.pipeline.errors import WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.rectify.region import free_tiles
-from spectralzoom.storage.archive.keys import StageRef
 from spectralzoom.storage.arrays.mosaics import open_mosaic
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, Report, WorkerPool, memory_refusal, mib, run_blocks
+from spectralzoom.storage.store import Ref
 
 if TYPE_CHECKING:
     from spectralzoom.models.network.temporal_reader import TemporalReader
@@ -106,7 +106,7 @@ class MosaicReader:
     """Base of the workers that read a mosaic by the network."""
 
     weights: WeightsFile
-    mosaic: StageRef
+    mosaic: Ref
     capture: LineSpec  # of pixels for which the mosaic has none
 
 
@@ -165,7 +165,7 @@ class Readings(MosaicReader):
         return np.stack([region.crop(classes_by(weights, seen, some)) for some in (kept[:0], kept[kept >= 0])])
 
 
-def coarse_region(weights: Weights, mosaic: StageRef, region: Region, capture: LineSpec) -> CoarsePass:
+def coarse_region(weights: Weights, mosaic: Ref, region: Region, capture: LineSpec) -> CoarsePass:
     """Read a region of a stored mosaic, in blocks of rows, after the memory of the one before is given back.
 
     ``capture`` is the capture of pixels for which the mosaic has none.
@@ -216,7 +216,7 @@ class FieldWork:
         several = len(self.regions) > 1
         return {"weights": self.weights, "regions": [REGION_PX, HALO_PX] if several else None}
 
-    def score(self, policy: str, mosaic: StageRef, capture: LineSpec, report: Report) -> NDArray[np.float64]:
+    def score(self, policy: str, mosaic: Ref, capture: LineSpec, report: Report) -> NDArray[np.float64]:
         """Return the scores of all patches of the padded grid, (patch_y, patch_x).
 
         Raises SettingsError: one region does not fit the memory.
@@ -226,7 +226,7 @@ class FieldWork:
         )
         return gain_of(found[..., 0, :], found[..., 1, :].sum(axis=(0, 1))) if policy == GAIN else found
 
-    def expected_errors(self, mosaic: StageRef, capture: LineSpec, report: Report) -> PatchExpectedErrors:
+    def expected_errors(self, mosaic: Ref, capture: LineSpec, report: Report) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
 
         Raises SettingsError: one region does not fit the memory.
@@ -238,7 +238,7 @@ class FieldWork:
         pixels = pixels.reshape(-1, *parts[0].wrong.shape)
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
 
-    def readings(self, mosaic: StageRef, capture: LineSpec, report: Report) -> NDArray[np.uint8]:
+    def readings(self, mosaic: Ref, capture: LineSpec, report: Report) -> NDArray[np.uint8]:
         """Return the class maps (2, y, x) by the overview, and by the full network everywhere. Raises as `score`."""
         grid = self.regions[0].field
         parts = self._of_regions(Readings(self.weights, mosaic, capture), mosaic, grid.every_patch(), report)
@@ -248,7 +248,7 @@ class FieldWork:
         return maps
 
     def _of_regions(
-        self, worker: Callable[[Region], Any], mosaic: StageRef, patch_index: NDArray[np.integer], report: Report
+        self, worker: Callable[[Region], Any], mosaic: Ref, patch_index: NDArray[np.integer], report: Report
     ) -> list[Any]:
         """Run a worker that reads ``patch_index`` in full for all regions."""
         pool = self.pool_for(patch_index, len(open_mosaic(mosaic.path / "mosaic.zarr").components))

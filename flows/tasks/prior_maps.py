@@ -18,11 +18,10 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, shift_px
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.archive.archive import Archive, run_stem
-from spectralzoom.storage.archive.keys import StageRef, published_runs
-from spectralzoom.storage.archive.records import Run, moment_of, read_run
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore
 from spectralzoom.storage.arrays.georeference import load_geobox
+from spectralzoom.storage.runs import Run, moment_of, read_run
+from spectralzoom.storage.store import Archive, Ref, run_stem
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
@@ -40,8 +39,8 @@ class Prior:
     """The earlier run whose class probabilities a visit starts from."""
 
     run: str
-    probabilities: StageRef  # the store with class_probabilities.zarr
-    mosaic: StageRef  # of that run
+    probabilities: Ref  # the store with class_probabilities.zarr
+    mosaic: Ref  # of that run
     days: float  # between that visit and this one
     day_of_year: float | None  # of this visit; None if it is unknown
     classes: tuple[int, ...]  # of each class of the weights the number in the class probabilities; -1 for a new class
@@ -52,7 +51,7 @@ class Prior:
         return {"days": self.days, "day_of_year": self.day_of_year, "classes": self.classes}
 
     @property
-    def stores(self) -> list[StageRef]:
+    def stores(self) -> list[Ref]:
         """Return the stores of earlier runs that a visit reads."""
         return [self.probabilities, self.mosaic]
 
@@ -101,7 +100,7 @@ def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> 
     # The prior map may choose the extent: then the extent does not identify the light.
     chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
     light = [key for key in OF_THE_LIGHT if key not in chosen]
-    for number, folder in enumerate(reversed(published_runs(archive.root))):
+    for number, folder in enumerate(reversed(archive.runs())):
         if run_stem(name) not in folder.name:  # no receipt has to be read for that
             continue
         run = read_run(folder)
@@ -109,7 +108,7 @@ def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> 
             if run.receipt.get("scene") == scene_key and all(run.settings.get(key) == asked[key] for key in light):
                 continue  # made of the requested light itself: no earlier visit
             days = _days_since(run, settings.visit, settings.moment)
-            if days >= 0:
+            if days >= 0 or run.in_future:  # which a note names
                 found.append((days, number, run))
             if len(found) >= NEWEST_RUNS:
                 break
@@ -122,6 +121,8 @@ def _usable(
     """Return the run as a prior, or the reason why it cannot be one."""
     if run.problem is not None:
         return run.problem
+    if run.in_future:
+        return "it was published in the future; check the clock"
     places = [run.products.get(name, "").split("/") for name in (PROBABILITIES, "mosaic")]
     if any(len(parts) < 3 for parts in places):
         return "it left no class probabilities"

@@ -19,9 +19,9 @@ from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.source import Source
-from spectralzoom.storage.archive.keys import stage_key
 from spectralzoom.storage.readers.recordings import RecordedWith, Recording, find_recorded_run, open_recording
 from spectralzoom.storage.readers.scene_files import load_field_labels
+from spectralzoom.storage.store import stage_key
 
 OFF_CENTRE_PX = 0.5  # least offset of a recorded field that is noted
 

@@ -29,8 +29,8 @@ from spectralzoom.pipeline.simulator.effects.effect import Effect
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.pipeline.source import Source
-from spectralzoom.storage.archive.keys import array_digest
 from spectralzoom.storage.arrays.spool import FetchedFiles
+from spectralzoom.storage.store import array_digest
 
 FETCHED = "camera"  # folder within a capture's spool
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name

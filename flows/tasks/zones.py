@@ -19,8 +19,8 @@ from spectralzoom.pipeline.ground.map_grid import ground_grid
 from spectralzoom.pipeline.ground.view import GroundView
 from spectralzoom.pipeline.ground.zones import Mask, extent_deg, on_field, patch_means, pixels_inside
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.archive.keys import array_digest
 from spectralzoom.storage.readers.polygons import ZoneFile, place_on_earth, read_zones
+from spectralzoom.storage.store import array_digest
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from spectralzoom.pipeline.errors import ArchiveError, PipelineError, SettingsError
-from spectralzoom.storage.archive.staging import disk_advice
+from spectralzoom.pipeline.errors import ArchiveError, PipelineError, SettingsError, disk_advice
 
 DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
 TERMINATED = 128 + signal.SIGTERM  # the exit code that a shell reports after SIGTERM

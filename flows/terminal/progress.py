@@ -19,7 +19,7 @@ from rich.text import Text
 
 from spectralzoom.flows.terminal.figures import format_seconds
 from spectralzoom.pipeline.errors import visible
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json
 
 PIPED_WIDTH = 120  # of tables without a terminal
 

@@ -22,11 +22,11 @@ from spectralzoom.flows.terminal.processes import DONE, writing
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.storage.archive.whole_files import write_whole
 from spectralzoom.storage.readers import label_files
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
+from spectralzoom.storage.whole_files import write_whole
 
 KEPT = ("class_attribute", "unlabelled")  # of an existing file
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.rectify.placed import TieTable
 from spectralzoom.pipeline.rectify.scan_paths import ScanPath
-from spectralzoom.storage.archive.keys import KEY_LENGTH
 from spectralzoom.storage.arrays.layout import (
     create_group,
     damage_named,
@@ -22,6 +21,7 @@ from spectralzoom.storage.arrays.layout import (
     write_image,
     write_small,
 )
+from spectralzoom.storage.store import KEY_LENGTH
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 

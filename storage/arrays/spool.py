@@ -35,11 +35,11 @@ from urllib.parse import quote
 
 import numpy as np
 
-from spectralzoom.pipeline.errors import RigError, list_some
+from spectralzoom.pipeline.errors import RigError, disk_advice, list_some
 from spectralzoom.pipeline.rig.transports import NotKept
 from spectralzoom.pipeline.source import Line
-from spectralzoom.storage.archive.keys import plain
-from spectralzoom.storage.archive.staging import format_disk_error, sync_path, write_all
+from spectralzoom.storage.store import plain
+from spectralzoom.storage.whole_files import sync
 
 SYNC_LINES = 64
 MOST_NAMED = 8
@@ -73,7 +73,7 @@ class Spool:
             if not spool.path.exists():
                 spool.path.write_bytes(spool._head)
                 for named in (spool.path, folder, folder.parent, folder.parent.parent):  # lines need their file's name
-                    sync_path(named)
+                    sync(named)
             spool._recover()
         return spool
 
@@ -181,6 +181,18 @@ def line_values(numbers: Sequence[int]) -> str:
     return f"line{'s' if len(numbers) > 1 else ''} {list_some(list(map(str, numbers)), MOST_NAMED)}"
 
 
+def format_disk_error(error: OSError) -> str:
+    """Return `disk_advice`, or the system's message."""
+    return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
+
+
+def write_all(descriptor: int, content: bytes | memoryview) -> None:
+    """Write every byte, in several calls if need be."""
+    view = memoryview(content)
+    while view:
+        view = view[os.write(descriptor, view) :]
+
+
 @contextmanager
 def _refusals(path: Path, lines: int) -> Iterator[None]:
     """Turn a disk's refusal into a RigError that says how many lines are kept."""
@@ -250,7 +262,7 @@ class FetchedFiles:
                     write_all(file.fileno(), _SUM.pack(before + len(data), crc32))
                 self._crc32[name] = crc32
             if not before:
-                sync_path(self.folder)
+                sync(self.folder)
         except OSError as error:
             self._crc32.pop(name, None)  # what the disk took of it is compared next time
             with suppress(OSError):

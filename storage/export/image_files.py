@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import ArchiveError
-from spectralzoom.storage.archive.whole_files import written_aside
 from spectralzoom.storage.arrays.class_maps import ClassNames
 from spectralzoom.storage.arrays.georeference import AngularGrid
+from spectralzoom.storage.whole_files import written_aside
 
 TILE = 512  # px: rasters within one tile need no overviews
 ANGULAR = (

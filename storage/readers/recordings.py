@@ -33,11 +33,6 @@ from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
 from spectralzoom.pipeline.ground.georeference import geobox_of_record
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import array_digest, is_archive, store_at
-from spectralzoom.storage.archive.manifests import check_files, manifest_sha256
-from spectralzoom.storage.archive.records import LINE_PRODUCTS, Run, read_run, read_store
-from spectralzoom.storage.archive.staging import MANIFEST_NAME
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.cube_sources import CubeSource
@@ -56,6 +51,16 @@ from spectralzoom.storage.readers.recorded_files import (
     with_bits,
 )
 from spectralzoom.storage.readers.zarr_files import lost_chunks
+from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
+from spectralzoom.storage.store import (
+    MANIFEST,
+    Archive,
+    array_digest,
+    check_store,
+    is_archive,
+    manifest_sha256,
+    try_manifest,
+)
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"
@@ -148,8 +153,8 @@ def open_recording(
             raise SettingsError(
                 f"--{name} is for files, and {address} holds raw cubes, which have their own; leave --{name} out"
             )
-    for folder in {path.parent for path in stores if (path.parent / MANIFEST_NAME).is_file()}:
-        check_files(folder, hashes=False)
+    for folder in {path.parent for path in stores if (path.parent / MANIFEST).is_file()}:
+        check_store(folder)
     cubes = [open_lines(path) for path in stores]
     first = cubes[0]
     for path, cube in zip(stores, cubes, strict=True):
@@ -165,7 +170,7 @@ def open_recording(
     )
     light = tuple(
         f"{path.name} {manifest_sha256(path.parent)}"
-        if (path.parent / MANIFEST_NAME).is_file()
+        if (path.parent / MANIFEST).is_file()
         else " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
         for path in stores
     )
@@ -403,7 +408,7 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
         return None
     archive, run, _ = _run_with_cubes(*named)
     parts = run.products.get("mosaic", "").split("/")  # stages/STAGE/KEY/mosaic.zarr
-    params = read_store(store_at(archive.root, *parts[1:3])).params if len(parts) > 3 else {}
+    params = try_manifest(archive.ref(*parts[1:3]).path)[0]["params"] if len(parts) > 3 else {}
     grid = params.get("grid", {})
     if not {"height", "width"} <= set(grid):
         return RecordedRun(run, None, None)
@@ -423,7 +428,7 @@ def _named_run(address: str | Path) -> tuple[str, str | None] | None:
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
     """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
     archive = Archive.open(address, create=False, write=False)
-    for folder in reversed(archive.runs()) if name is None else [archive.run_folder(name)]:
+    for folder in reversed(archive.past_runs()) if name is None else [archive.run_folder(name)]:
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:

@@ -17,7 +17,6 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
-from spectralzoom.storage.archive.staging import file_hash
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -37,6 +36,7 @@ from spectralzoom.storage.readers.scene_toml import (
     find_scene_settings,
     settle_wavelengths,
 )
+from spectralzoom.storage.whole_files import sha256
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed
@@ -160,10 +160,10 @@ def _light_hash(
 def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
     """Return the hash of all files, and of their names within a folder."""
     if files == (file,):
-        return file_hash(file)
+        return sha256(file)
     within = [file.is_dir() and entry.is_relative_to(file) for entry in files]
     names = [entry.relative_to(file).as_posix() if inside else "" for entry, inside in zip(files, within, strict=True)]
-    return _digest(*((name, file_hash(entry)) for name, entry in zip(names, files, strict=True)))
+    return _digest(*((name, sha256(entry)) for name, entry in zip(names, files, strict=True)))
 
 
 def _chosen_bands(

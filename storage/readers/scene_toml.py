@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, ValidationError, model_validator
 
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
-from spectralzoom.storage.archive.staging import read_toml
 from spectralzoom.storage.readers.cube_sources import Bands
+from spectralzoom.storage.whole_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
 IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scene.toml may be above such a folder

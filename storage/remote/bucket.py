@@ -9,6 +9,7 @@ compared with its hash before it is sent, and after it is fetched.
 from __future__ import annotations
 
 import hashlib
+import logging
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
@@ -16,14 +17,22 @@ from pathlib import Path
 from typing import Any
 
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import in_text
-from spectralzoom.storage.archive.manifests import CLEARED, as_table, check_files, is_cleared, parse_manifest
-from spectralzoom.storage.archive.records import RESTS_ON
-from spectralzoom.storage.archive.staging import MANIFEST_NAME, is_name
 from spectralzoom.storage.remote.objects import Objects, some_at_a_time
+from spectralzoom.storage.store import (
+    CLEARED,
+    LATEST,
+    MANIFEST,
+    RESTS_ON,
+    Archive,
+    check_store,
+    is_ahead,
+    is_cleared,
+    parse_manifest,
+    uri_of,
+)
 
 Report = Callable[[str, float], None]  # address, and the fraction that is done
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -46,7 +55,7 @@ def push(archive: Archive, objects: Objects, report: Report) -> Copied:
     ArchiveError: the bucket ignores conditional puts.
     """
     with archive.in_use():
-        here = [ref.uri for ref in archive.refs()] + [f"runs/{folder.name}" for folder in archive.runs()]
+        here = list(archive.manifests())
         there = _published(objects.listing())
         waiting = [uri for uri in here if uri not in there]
         if waiting:
@@ -83,61 +92,74 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
 
 def _send(folder: Path, uri: str, objects: Objects) -> int:
     """Send one store or run, its manifest last; return the bytes of its files."""
-    check_files(folder, hashes=True)
-    text = (folder / MANIFEST_NAME).read_bytes()
+    check_store(folder, every_byte=True)
+    text = (folder / MANIFEST).read_bytes()
     place = _files_at(uri, text)
     names: list[str] = [] if is_cleared(folder) else [*_manifest(uri, text)["files"]]
     if is_cleared(folder):
         objects.write(f"{place}/{CLEARED}", b"")
     some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), names)
-    objects.create(f"{uri}/{MANIFEST_NAME}", text)  # else another writer was first: its store is as good
+    objects.create(f"{uri}/{MANIFEST}", text)  # else another writer was first: its store is as good
     return sum((folder / name).stat().st_size for name in names)
 
 
 def _fetch(uri: str, objects: Objects, archive: Archive, listed: Collection[str]) -> int:
     """Fetch one store or run into the archive; return the bytes of its files."""
-    text = objects.read(f"{uri}/{MANIFEST_NAME}")
+    text = objects.read(f"{uri}/{MANIFEST}")
     if text is None:  # another machine has removed it meanwhile
         return 0
     place = _files_at(uri, text)
     files = _manifest(f"{objects.place.url}/{uri}", text)["files"]
-    with archive.adopt(uri) as part:
-        if part is None:  # another process has fetched or made it
-            return 0
-        (part / MANIFEST_NAME).write_bytes(text)
-        if f"{place}/{CLEARED}" in listed:
+    is_cleared_there = f"{place}/{CLEARED}" in listed
+
+    def fetch(part: Path) -> None:
+        (part / MANIFEST).write_bytes(text)
+        if is_cleared_there:
             (part / CLEARED).touch()
-            return 0
-        some_at_a_time(lambda name: objects.fetch(f"{place}/{name}", part / name, files[name]["sha256"]), files)
-    return sum(entry["size"] for entry in files.values())
+        else:
+            some_at_a_time(lambda name: objects.fetch(f"{place}/{name}", part / name, files[name][1]), files)
+
+    fetched = archive.adopt(uri, fetch)  # else another process has fetched or made it
+    return sum(size for size, _ in files.values()) if fetched and not is_cleared_there else 0
 
 
 def _of_run(objects: Objects, run: str, there: Collection[str]) -> list[str]:
     """Return the addresses of the stores that a run names, and of the run."""
     runs = sorted(uri for uri in there if uri.startswith("runs/"))
-    uri = runs[-1] if run == "latest" and runs else f"runs/{run.removeprefix('runs/')}"
-    text = objects.read(f"{uri}/{MANIFEST_NAME}") if uri in there else None
+    uri = f"runs/{run.removeprefix('runs/')}"
+    if run == LATEST:
+        uri = next((one for one in reversed(runs) if not _is_ahead(one, objects)), uri)
+    text = objects.read(f"{uri}/{MANIFEST}") if uri in there else None
     if text is None:
         known = ", ".join(name.removeprefix("runs/") for name in runs[-5:]) or "none"
         raise ArchiveError(f"{objects.place.url} has no run {run!r}; its latest are {known}")
-    return [*sorted(as_table(_manifest(uri, text).get(RESTS_ON)).keys() & set(there)), uri]
+    return [*sorted(_manifest(uri, text)[RESTS_ON].keys() & set(there)), uri]
+
+
+def _is_ahead(uri: str, objects: Objects) -> bool:
+    """Return whether a run lies in the future, which a warning says."""
+    text = objects.read(f"{uri}/{MANIFEST}")
+    ahead = text is None or is_ahead(uri.removeprefix("runs/")) or is_ahead(_manifest(uri, text)["created"])
+    if ahead:
+        log.warning("%s lies in the future, and so is not taken as the latest run; check the clock", uri)
+    return ahead
 
 
 def _conflicts(objects: Objects, archive: Archive, both: Iterable[str]) -> list[str]:
     """Return the runs of two machines that have one name."""
     runs = sorted(uri for uri in both if uri.startswith("runs/"))
-    texts = ((uri, (archive.root / uri / MANIFEST_NAME).read_bytes()) for uri in runs)
-    return [uri for uri, text in texts if objects.read(f"{uri}/{MANIFEST_NAME}") != text]
+    texts = ((uri, (archive.root / uri / MANIFEST).read_bytes()) for uri in runs)
+    return [uri for uri, text in texts if objects.read(f"{uri}/{MANIFEST}") != text]
 
 
 def _published(listed: Collection[str]) -> list[str]:
     """Return the addresses of stores and runs that have a manifest in the bucket."""
-    ends = (name.removesuffix(f"/{MANIFEST_NAME}") for name in listed if name.endswith(f"/{MANIFEST_NAME}"))
+    ends = (name.removesuffix(f"/{MANIFEST}") for name in listed if name.endswith(f"/{MANIFEST}"))
     return [uri for uri in ends if _is_address(uri)]
 
 
 def _is_address(uri: str) -> bool:
-    return in_text(uri) == uri or (uri.startswith("runs/") and is_name(uri.removeprefix("runs/")))
+    return uri_of(uri) == uri
 
 
 def _files_at(uri: str, manifest: bytes) -> str:
@@ -147,10 +169,10 @@ def _files_at(uri: str, manifest: bytes) -> str:
 
 def _manifest(place: str, text: bytes) -> dict[str, Any]:
     """Return the content of a manifest. Raises IncompleteStoreError: it is damaged."""
-    content, problem = parse_manifest(text)
-    if problem is not None:
-        raise IncompleteStoreError(f"{place}/{MANIFEST_NAME} is damaged: {problem}")
-    return content
+    try:
+        return parse_manifest(text)
+    except ValueError as error:
+        raise IncompleteStoreError(f"{place}/{MANIFEST} is damaged: {error}") from error
 
 
 def _check_conditional_puts(objects: Objects) -> None:

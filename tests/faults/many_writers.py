@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words

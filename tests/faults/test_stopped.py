@@ -22,17 +22,14 @@ from tests.faults.small_survey import SETTINGS, Subject, problems, stored, words
 from tests.receipts import comparable, receipts
 
 GOING_ON = "terminated; run the same command to resume"
-SYNCED: dict[str, Any] = {
-    "place": "spectralzoom.storage.archive.manifests:sync_path",
-    "call": 60,
-}  # before which it is stopped
+SYNCED: dict[str, Any] = {"place": "spectralzoom.storage.store:sync", "call": 60}  # before which it is stopped
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "in the controls": ("spectralzoom.flows.tasks.stages.accuracy:mixed", 1, signal.SIGTERM),
     "before the publication": ("spectralzoom.flows.publish.publishing:publish_run", 1, signal.SIGKILL),
-    "in the publication": ("spectralzoom.storage.archive.run_folders:rename_into_place", 1, signal.SIGKILL),
+    "in the publication": ("spectralzoom.storage.store:publish", 1, signal.SIGKILL),
 }
 SECOND_PASS = {
-    "spectralzoom.storage.archive.archive:Archive.spool_folder": 2,
+    "spectralzoom.storage.store:Archive.spool_folder": 2,
     "spectralzoom.storage.arrays.spool:Spool.append": 20,
 }  # as PLACES
 KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`

@@ -20,9 +20,9 @@ from PIL import Image
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.stage import Stage
 from spectralzoom.flows.tasks.local_server import QUIET, local_server
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.class_maps import load_class_map
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.conftest import Flags, Survey
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects

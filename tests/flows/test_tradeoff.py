@@ -23,7 +23,7 @@ from spectralzoom.flows.tradeoff import (
     tradeoff,
 )
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json
 
 
 class Clock:

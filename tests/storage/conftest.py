@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 
 
 @pytest.fixture

@@ -8,20 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.manifests import manifest_text
 from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive, Ref, manifest_text
 
 
 @dataclass(frozen=True)
 class Small:
     """Stores of one survey: raw lines, their mosaic, a map of both, and the run that names them, if any."""
 
-    raw: StageRef
-    mosaic: StageRef
-    map: StageRef
+    raw: Ref
+    mosaic: Ref
+    map: Ref
     run: Path = Path("no run")
 
 
@@ -34,7 +32,7 @@ def small_survey(
     archive: Archive, *, seed: int = 0, kernel: str = "bilinear", named: bool = True, simulated: bool = True
 ) -> Small:
     """Make (or find) the stores of one survey, and a run that rests on them where ``named``."""
-    light = {"scene": "farm", "seed": seed, **({"effects": ["shot"]} if simulated else {"source": "rig"})}
+    light = {"scene": "farm", "seed": seed, "source": "sim" if simulated else "rig"}
     raw = make_store(archive, "capture", light, [])
     mosaic = make_store(archive, "rectify", {"grid": {"height": 8, "width": 8}, "kernel": kernel}, [raw])
     drawn = make_store(archive, "segment", {"weights": "w0"}, [mosaic, raw])
@@ -46,19 +44,26 @@ def small_survey(
         "stages": [{"name": "capture_coarse", "key": raw.key, "state": "ran", "wall_s": 1.5, "cpu_s": 1.0}],
         "products": {"class_map": f"{drawn.uri}/class_map.zarr", "mosaic": f"{mosaic.uri}/mosaic.zarr"},
     }
-    with archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", json.dumps(receipt))
-        folder = draft.publish(survey="farm", rests_on=archive.manifest_hashes([drawn]))
-    return Small(raw, mosaic, drawn, folder)
+    return Small(raw, mosaic, drawn, publish_receipt(archive, receipt, drawn, settings=receipt["settings"]))
 
 
-def make_store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[StageRef]) -> StageRef:
+def publish_receipt(archive: Archive, receipt: Any, *inputs: Ref, name: str = "farm", **facts: Any) -> Path:
+    """Publish a run with a receipt alone, a table or its text."""
+
+    def write(folder: Path, uri: str) -> dict[str, Any]:
+        (folder / "receipt.json").write_text(receipt if isinstance(receipt, str) else json.dumps(receipt))
+        return facts
+
+    return archive.publish_run(name, write, inputs)
+
+
+def make_store(archive: Archive, stage: str, params: dict[str, Any], inputs: list[Ref]) -> Ref:
     """Make (or find) a store of one file."""
 
     def build(path: Path) -> None:
         (path / "data.bin").write_bytes(json.dumps([stage, params]).encode() * 40)
 
-    return archive.produce(stage, build, version=1, params=params, inputs=[ref.key for ref in inputs])[0]
+    return archive.produce(stage, build, version=1, params=params, inputs=inputs)[0]
 
 
 def flip(path: Path, at: int = -3, bit: int = 2) -> None:
@@ -74,7 +79,7 @@ def rewrite(path: Path, **facts: Any) -> None:
     path.write_text(manifest_text(content))
 
 
-def grow_old(ref: StageRef, days: float) -> None:
+def grow_old(ref: Ref, days: float) -> None:
     """Set a store's date back, in its manifest and on its file."""
     path = ref.path / "manifest.json"
     rewrite(path, created="2020-01-01T00:00:00+00:00")

@@ -19,8 +19,8 @@ from PIL import Image
 
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.pipeline.errors import SettingsError
-from spectralzoom.storage.archive.records import moment_of
 from spectralzoom.storage.readers.scene_files import load_scene_file
+from spectralzoom.storage.runs import moment_of
 from tests.flows.conftest import command_line
 from tests.storage.readers.test_label_grids import write
 

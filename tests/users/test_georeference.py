@@ -24,9 +24,9 @@ from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.ground.georeference import pixel_rows_m2
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.mosaics import open_mosaic
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.prior_work import without_effects
 from tests.storage.readers.test_envi_cubes import write_envi

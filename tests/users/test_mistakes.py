@@ -11,8 +11,8 @@ import pytest
 
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.training.data import load_data_set
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.readers.scene_files import load_scene_file
+from spectralzoom.storage.store import Archive
 from tests.flows.conftest import command_line
 from tests.users.mistaken_files import NM, write_files
 

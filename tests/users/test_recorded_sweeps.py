@@ -30,12 +30,11 @@ from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import array_digest
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from spectralzoom.storage.arrays.mosaics import open_mosaic
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive, array_digest
 from tests.blocks import block_means
 from tests.conftest import QUIET, Survey, WeightsMaker, patchy_scene, random_weights
 from tests.envi_files import write_recorded_files

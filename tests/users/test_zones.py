@@ -20,10 +20,10 @@ from spectralzoom.flows.settings.load import load_settings, parse_settings
 from spectralzoom.flows.tasks.run import SurveyRun, open_run
 from spectralzoom.pipeline.errors import SettingsError, ZoneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import chosen_patches
+from spectralzoom.storage.store import Archive
 from tests.conftest import Survey
 from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch

@@ -18,9 +18,9 @@ from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.figures import format_bytes
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import ArchiveError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.records import read_run
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import Archive, publish
+from spectralzoom.storage.whole_files import to_json
 from tests.conftest import QUIET
 from tests.storage.small_archive import flip, small_survey
 
@@ -75,7 +75,7 @@ def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest
     (coarse.path / "manifest.json").unlink()
     flip(Archive.open(archive).runs()[0] / "receipt.json", at=40)
     content = _json(capsys, lambda: ls(archive, as_json=True))
-    assert [run["state"] for run in content["runs"]] == ["damaged", "1 missing and 1 damaged"]
+    assert [run["state"] for run in content["runs"]] == ["damaged", "2 damaged"]
     flip(Archive.open(archive).runs()[0] / "manifest.json", at=40)
     assert gc(archive, keep_days=0) == PARTLY
     assert "no store is removed" in capsys.readouterr().out
@@ -118,10 +118,9 @@ def test_explain_shows_damaged_and_circular_lineage(tmp_path: Path, capsys: pyte
     archive = Archive.open(tmp_path)
     small = small_survey(archive)
     flip(small.raw.path / "manifest.json", at=40)
-    archive.discard(small.mosaic)
+    archive.discard(small.mosaic.uri)
     for key, given in (("aaaa", "bbbb"), ("bbbb", "aaaa")):
-        with archive.publish("segment", key, inputs=[given]):
-            pass
+        publish(archive.ref("segment", key).path, lambda folder, given=given: {"inputs": [f"stages/segment/{given}"]})
     (top,) = _json(capsys, lambda: explain(tmp_path, small.map.uri, as_json=True))["lineage"]
     assert [one["problem"].split(":")[0] for one in top["inputs"]] == ["is not there", "manifest.json is damaged"]
     (top,) = _json(capsys, lambda: explain(tmp_path, "aaaa", as_json=True))["lineage"]

@@ -22,13 +22,13 @@ from spectralzoom.flows.archive.export_layers import ExportedRun
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET
 from tests.exported_run import POSE, Exported
 from tests.prior_work import without_effects
 from tests.storage.export.stac_rules import core_problems, is_cog
-from tests.storage.small_archive import flip
+from tests.storage.small_archive import flip, publish_receipt
 
 
 @pytest.fixture(scope="module")
@@ -148,9 +148,8 @@ def test_rigs_have_the_time_of_a_run(tmp_path: Path, source: str, visit: str | N
     """A rig's time is that of its run, unless the visit names another date; a file's time is that of its visit."""
     receipt: Any = {"source": source, "started": "2026-06-21T08:00:00Z", "finished": "2026-06-21T08:05:00Z"}
     archive = Archive.open(tmp_path)
-    draft = archive.new_run("field")
-    draft.write_file("receipt.json", json.dumps(receipt))
-    assert ExportedRun(archive, draft.publish(settings={"visit": visit}), receipt).observed == observed
+    folder = publish_receipt(archive, receipt, settings={"visit": visit})
+    assert ExportedRun(archive, folder, receipt).observed == observed
 
 
 def test_items_have_time_and_place(plain: Exported, posed: Exported) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.flows.cli.main import main
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.staging import file_hash
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import sha256
 from tests.storage.small_archive import Small, rewrite, small_survey
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -22,7 +22,7 @@ def list_file(small: Small, lead: str) -> None:
     """Make a store list a file outside of it."""
     manifest = small.mosaic.path / "manifest.json"
     listed = json.loads(manifest.read_text())["files"]
-    rewrite(manifest, files=listed | {lead: {"sha256": "0" * 64, "size": len(SECRET)}})
+    rewrite(manifest, files=listed | {lead: [len(SECRET), "0" * 64]})
 
 
 def name_products(small: Small, lead: str) -> None:
@@ -32,7 +32,7 @@ def name_products(small: Small, lead: str) -> None:
     receipt["stages"] = [{"name": lead, "key": lead, "state": "ran", "manifest_sha256": "0" * 64}]
     text = json.dumps(receipt).encode()
     (small.run / "receipt.json").write_bytes(text)
-    entry = {"sha256": file_hash(small.run / "receipt.json"), "size": len(text)}
+    entry = [len(text), sha256(small.run / "receipt.json")]
     rests_on = {lead: "0" * 64, f"runs/{lead}": "0" * 64}
     rewrite(small.run / "manifest.json", files={"receipt.json": entry}, rests_on=rests_on)
 

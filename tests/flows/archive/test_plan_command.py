@@ -21,7 +21,7 @@ from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.terminal.figures import format_seconds
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, Flags, Survey
 from tests.flows.conftest import be_version, python
 
@@ -146,8 +146,8 @@ def test_damaged_plan_stops_survey(settings: Settings, archive: Path, survey_png
     """The survey stops there with one message."""
     (path,) = archive.glob("stages/score/*/plan.json")
     path.write_text(path.read_text().replace(*change))
-    fine = _plan(settings, archive)["capture_fine"]
-    assert (fine.state, "plan.json has changed" in fine.why) == ("blocked", True)
+    score = _plan(settings, archive)["score"]
+    assert (score.state, "plan.json has changed" in score.why) == ("blocked", True)
     with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*gc --damaged"):
         survey_png(archive)
 

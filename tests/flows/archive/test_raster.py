@@ -23,9 +23,9 @@ from spectralzoom.flows.tasks.patch_budget import ReadingCosts
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.mosaics import open_mosaic
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.blocks import block_means
 from tests.conftest import QUIET, RGB_NM, WeightsMaker, patchy_scene
 from tests.storage.readers.test_raster_tags import write

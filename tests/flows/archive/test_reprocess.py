@@ -20,12 +20,12 @@ from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.runs import Catalogue
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.flows.conftest import be_version, turned
 from tests.prior_work import without_effects
-from tests.storage.small_archive import flip
+from tests.storage.small_archive import flip, publish_receipt
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -104,11 +104,11 @@ def test_unchanged_fields_are_skipped(surveyed: Path, reprocess: Reprocess) -> N
 def test_new_weights_add_runs_and_keep_old_ones(archive: Path, other: Path, reprocess: Reprocess) -> None:
     """Coarse lines are cached, and the same command again skips all fields."""
     before = [path.name for path in Archive.open(archive).runs()]
-    coarse = {run.products["raw_coarse"] for run in Catalogue.read(archive).runs}
+    coarse = {run.products["raw_coarse"] for run in Catalogue.read(Archive(archive)).runs}
     rows = reprocess(archive, weights=other)
     assert [row["state"] for row in rows] == ["ran", "ran"]
     assert all(row["seconds"] > 0 for row in rows)
-    after = Catalogue.read(archive).runs
+    after = Catalogue.read(Archive(archive)).runs
     assert [run.folder.name for run in after] == before + [row["new"] for row in rows]
     assert {run.products["raw_coarse"] for run in after} == coarse
     assert [run.settings["budget"] for run in after[3:]] == [0.8, 0.7]
@@ -161,7 +161,7 @@ def test_a_failed_field_does_not_stop_the_others(archive: Path, other: Path, rep
 
 def test_fields_with_missing_stores_are_surveyed_again(archive: Path, reprocess: Reprocess) -> None:
     """A missing store leads to a new run; a damaged one is left to gc --damaged."""
-    newest = Catalogue.read(archive).runs[-1]
+    newest = Catalogue.read(Archive(archive)).runs[-1]
     store = archive / newest.products["class_map"].rpartition("/")[0]
     manifest = (store / "manifest.json").read_bytes()
     (store / "manifest.json").unlink()
@@ -182,18 +182,18 @@ def test_a_run_without_settings_is_reported(archive: Path, reprocess: Reprocess)
 
 def test_a_run_is_current_only_if_it_is_complete(archive: Path) -> None:
     """It needs a valid receipt; its settings are in the manifest, too."""
-    run = Catalogue.read(archive).runs[-1]
+    run = Catalogue.read(Archive(archive)).runs[-1]
     settings = reprocessing.asked_again(run, archive, None)
-    assert reprocessing.is_current(Catalogue.read(archive), run, settings)
+    assert reprocessing.is_current(Catalogue.read(Archive(archive)), run, settings)
     flip(run.folder / "receipt.json")
-    damaged = Catalogue.read(archive).runs[-1]
+    damaged = Catalogue.read(Archive(archive)).runs[-1]
     assert reprocessing.asked_again(damaged, archive, None) == settings
-    assert not reprocessing.is_current(Catalogue.read(archive), damaged, settings)
+    assert not reprocessing.is_current(Catalogue.read(Archive(archive)), damaged, settings)
 
 
 def test_fields_differ_by_scene_and_name(surveyed: Path, tmp_path: Path) -> None:
     """Each run without a scene is a field of its own; only the star is a wildcard."""
-    (one, _) = reprocessing.newest_runs(Catalogue.read(surveyed))
+    (one, _) = reprocessing.newest_runs(Catalogue.read(Archive(surveyed)))
     odd = dataclasses.replace(one, receipt={**one.receipt, "survey": "field[1]?.png"})
     for pattern in ("field[1]?.png", "*[1]*", "*"):
         assert reprocessing.is_called(odd, pattern)
@@ -201,11 +201,7 @@ def test_fields_differ_by_scene_and_name(surveyed: Path, tmp_path: Path) -> None
         assert not reprocessing.is_called(odd, pattern)
     archive = Archive.open(tmp_path)
     for scene in (None, None, "farm@2/seed=1", "farm@2/seed=2", "farm@2/seed=1"):
-        with archive.new_run("farm") as draft:
-            if scene is not None:
-                draft.write_file(
-                    "receipt.json", json.dumps({"survey": "farm", "scene": scene, "settings": {"seed": 1}})
-                )
-            draft.publish(survey="farm")
-    runs = Catalogue.read(tmp_path).runs
-    assert reprocessing.newest_runs(Catalogue.read(tmp_path)) == [runs[n] for n in (0, 1, 3, 4)]
+        receipt = "" if scene is None else {"survey": "farm", "scene": scene, "settings": {"seed": 1}}
+        publish_receipt(archive, receipt, survey="farm")
+    runs = Catalogue.read(Archive(tmp_path)).runs
+    assert reprocessing.newest_runs(Catalogue.read(Archive(tmp_path))) == [runs[n] for n in (0, 1, 3, 4)]

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from spectralzoom.flows.tasks.open_survey import STAGES
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead, class_map, problems
 
 NM = "460,500,550,600,620,640"

@@ -11,7 +11,8 @@ import pytest
 from spectralzoom.flows.archive.commands import contents
 from spectralzoom.flows.publish.receipt_table import saving_rows
 from spectralzoom.flows.publish.report import render_report
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage import store
+from spectralzoom.storage.store import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import Page, problems
 from tests.flows.publish.test_receipt import make_receipt, printed
@@ -37,13 +38,14 @@ def told(folder: Path) -> dict[str, Any]:
 def spooled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that gets the bytes of each spool when it is removed."""
     found: list[int] = []
-    drop = Archive.drop_spool
+    remove = store.remove
 
-    def drop_measured(self: Archive, key: str) -> None:
-        found.append(walked(self.root / "spool" / key))
-        drop(self, key)
+    def remove_measured(path: Path) -> None:
+        if path.parent.name == "spool":
+            found.append(walked(path))
+        remove(path)
 
-    monkeypatch.setattr(Archive, "drop_spool", drop_measured)
+    monkeypatch.setattr(store, "remove", remove_measured)
     return found
 
 

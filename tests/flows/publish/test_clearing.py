@@ -11,8 +11,8 @@ import pytest
 
 import spectralzoom
 from spectralzoom.flows.publish import publishing
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays import signal_cubes
+from spectralzoom.storage.store import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects

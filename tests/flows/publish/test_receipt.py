@@ -22,8 +22,8 @@ from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.terminal.figures import format_area
 from spectralzoom.pipeline.errors import ShapeError
-from spectralzoom.storage.archive.records import StageRecord
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.runs import StageRecord
+from spectralzoom.storage.whole_files import to_json
 from tests.flows.conftest import Page
 
 

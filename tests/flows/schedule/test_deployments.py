@@ -27,9 +27,9 @@ from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.tasks.local_server import local_server
 from spectralzoom.flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
 from spectralzoom.flows.tasks.prefect_tasks import Observer
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.records import read_run
 from spectralzoom.storage.parallel.pool import THREADS
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import Archive
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0

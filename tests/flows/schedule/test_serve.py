@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from spectralzoom.flows.cli.serve_command import load_fields, schedule_of, survey_deployment
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.staging import take_lock
+from spectralzoom.storage.store import Archive
+from spectralzoom.storage.whole_files import take_lock
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 

@@ -22,7 +22,7 @@ from spectralzoom.pipeline.geometry.scan import CostModel
 from spectralzoom.pipeline.ground.view import RigPose
 from spectralzoom.pipeline.simulator.render import EFFECTS
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, Optics, Rig, Sky
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json
 
 EXAMPLE = Path(__file__).parents[3] / "survey.example.toml"
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30, "tilt_deg": 40, "height_m": 12}

@@ -17,14 +17,14 @@ from spectralzoom.flows.tasks.stages.effects import choose_effects, chosen_effec
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.simulator.render import EFFECTS
 from spectralzoom.pipeline.simulator.scenes.scene import SceneRaster
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.store import Ref
 
-Decided = tuple[Path, StageRef]  # an archive, and the decision in it
+Decided = tuple[Path, Ref]  # an archive, and the decision in it
 ASKED = "rotation,vignetting,shot,read-noise"
 CAMERA = {"camera.samples": 160}  # as wide as the small picture: every further sample takes time
 
 
-def choose(run: CaptureRun) -> StageRef:
+def choose(run: CaptureRun) -> Ref:
     """Return the stage's store, made in the run's archive."""
     return choose_effects.produce(run.archive, choose_effects.wants(run))[0]
 

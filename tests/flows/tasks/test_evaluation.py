@@ -23,7 +23,7 @@ from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.flows.publish.test_receipt import make_receipt
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]

@@ -20,10 +20,10 @@ from spectralzoom.models.network.sizes import CELL_PX
 from spectralzoom.models.reading.regions import plan_regions
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.storage.archive.keys import StageRef
 from spectralzoom.storage.arrays.class_maps import ClassNames, create_class_map, create_probabilities
 from spectralzoom.storage.arrays.layout import consolidate_stores, open_group, read_array
 from spectralzoom.storage.parallel.pool import WorkerPool
+from spectralzoom.storage.store import Ref
 from tests.conftest import Flags, Survey
 
 Surveyed = tuple[SurveyRun, Path]
@@ -40,12 +40,12 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags
     return open_run(load_settings(None, flags_png(out, budget="0.8"))), out / "stages"
 
 
-def _store(stages: Path, stage: str) -> StageRef:
+def _store(stages: Path, stage: str) -> Ref:
     (path,) = (stages / stage).iterdir()
-    return StageRef(stage, path.name, path)
+    return Ref(stage, path.name, path)
 
 
-def _mosaics(stages: Path) -> list[StageRef]:
+def _mosaics(stages: Path) -> list[Ref]:
     """Return the mosaics of both passes, the coarse one first."""
     return [_store(stages, name) for name in ("rectify", "rectify_fine")]
 

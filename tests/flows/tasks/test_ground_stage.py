@@ -19,17 +19,16 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import PosedField
 from spectralzoom.pipeline.ground.map_grid import GroundGrid
 from spectralzoom.pipeline.ground.view import pixel_places
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
 from spectralzoom.storage.arrays import class_maps
 from spectralzoom.storage.arrays.georeference import AngularGrid
 from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.layout import open_group, read_array
+from spectralzoom.storage.store import Archive, Ref
 from tests.exported_run import POSE
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 
-Stores = tuple[StageRef, StageRef]
+Stores = tuple[Ref, Ref]
 SHAPE = (120, 160)
 FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)
 LEGEND = class_maps.ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
@@ -83,15 +82,15 @@ def stores(tmp_path: Path) -> Stores:
     values[:20, :20] = np.nan
     nm = np.array([460.0, 550.0, 640.0, 800.0])
     write_values(tmp_path / "mosaic" / "mosaic.zarr", values, nm, AngularGrid(1e-4, SHAPE, 1))
-    return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
+    return Ref("segment", "m", tmp_path / "map"), Ref("rectify", "r", tmp_path / "mosaic")
 
 
-def draw(run: Run, stores: Stores) -> StageRef:
+def draw(run: Run, stores: Stores) -> Ref:
     """Run the stage as an engine does and return its store."""
     return ground.produce(run.archive, ground.wants(run, *stores))[0]
 
 
-def image(ref: StageRef, name: str) -> np.ndarray:
+def image(ref: Ref, name: str) -> np.ndarray:
     """Read an image of a map on the ground."""
     return read_array(open_group(ref.path / STORE), name)
 
@@ -135,7 +134,7 @@ def test_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, tmp_path:
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
     write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
     believe(tmp_path / "later", np.zeros(SHAPE, np.float32), old.astype(np.uint8))
-    ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
+    ref = draw(run, (Ref("segment", "l", tmp_path / "later"), stores[1]))
     old_class = image(ref, "changed_from")
     seen, (row, column) = field_pixels(run, old_class.shape)
     np.testing.assert_array_equal(old_class[seen], old[row, column])

@@ -15,10 +15,10 @@ from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.rectify.placed import PixelGrid, place
 from spectralzoom.pipeline.rectify.region import MosaicWork, TileMaker, free_tiles, opened_tiles, plan_tiles
 from spectralzoom.pipeline.source import References
-from spectralzoom.storage.archive.keys import StageRef
 from spectralzoom.storage.arrays.cubes import SweepHeader
 from spectralzoom.storage.arrays.signal_cubes import SignalCube, open_signal_cubes
 from spectralzoom.storage.parallel.pool import WorkerPool
+from spectralzoom.storage.store import Ref
 from tests.storage.plain_mosaic import plain_writer, write_plain_sweep
 
 CAMERA = LineCamera()
@@ -45,7 +45,7 @@ def cubes(tmp_path_factory: pytest.TempPathFactory) -> list[SignalCube]:
 def recipe_of(cubes: list[SignalCube]) -> MosaicRecipe:
     """Return the recipe of a mosaic of both sweeps, by their folder."""
     folder = Path(str(cubes[0].group.store_path.store.root)).parent
-    return MosaicRecipe(StageRef("condense", "key", folder), CAMERA, GRID)
+    return MosaicRecipe(Ref("condense", "key", folder), CAMERA, GRID)
 
 
 def test_memory_limits_the_tiles_at_a_time(tmp_path: Path, cubes: list[SignalCube]) -> None:

@@ -29,7 +29,7 @@ from spectralzoom.models.reading.regions import plan_regions
 from spectralzoom.pipeline.errors import BudgetError, PipelineError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
-from spectralzoom.storage.archive.records import read_run
+from spectralzoom.storage.runs import read_run
 from tests.conftest import QUIET, Survey, WeightsMaker
 from tests.prior_work import without_effects
 

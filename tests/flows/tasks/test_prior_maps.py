@@ -26,8 +26,8 @@ from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.weights.files import add_reader, load_weights
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.records import read_run
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import Archive
 from tests.conftest import CLASSES, QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.prior_work import without_effects
@@ -92,7 +92,7 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
     assert "Captured and differing" in page
     store = out / later.receipt["products"]["class_probabilities"]
     manifest = json.loads((store.parent / "manifest.json").read_text())
-    assert Path(first.receipt["products"]["class_probabilities"]).parent.name in manifest["inputs"]
+    assert Path(first.receipt["products"]["class_probabilities"]).parent.as_posix() in manifest["inputs"]
     probabilities = xr.open_zarr(store, consolidated=False)
     assert probabilities.changed_from.shape == (96, 128)
 
@@ -243,6 +243,7 @@ def test_finding_a_prior_map_reads_the_newest_runs(visited: Path, twice: Any, mo
     for number in range(70):
         for name, source in (("north", later), ("south", first)):
             shutil.copytree(visited / "runs" / source.folder.name, visited / "runs" / f"20270101T{number:06d}-{name}")
+    monkeypatch.setattr("spectralzoom.storage.store.CLOCK_S", 1e9)  # so that 2027 is no future
     counted = Mock(wraps=read_run)
     monkeypatch.setattr(memory, "read_run", counted)
     assert found_prior(visited, "2026-06-20T10:00:00Z", "latest")[1] == 16.0

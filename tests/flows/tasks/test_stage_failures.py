@@ -23,7 +23,7 @@ from spectralzoom.flows.tasks import prefect_tasks
 from spectralzoom.flows.tasks.open_survey import STAGES
 from spectralzoom.flows.tasks.stage import Stage, Wanted
 from spectralzoom.pipeline.errors import ArchiveError, RigError
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.flows.conftest import Ended, class_map, newest_run, problems
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -203,7 +203,7 @@ def test_failed_reprocessing_resumes(server: str, walk: Walk, tmp_path: Path, mo
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     archive = Archive.open(out)
     (missing,) = archive.refs("segment")
-    archive.discard(missing)
+    archive.discard(missing.uri)
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "segment", failing("segment", refusal("segment")))
         state = reprocess(archive=str(out), return_state=True)

@@ -28,10 +28,9 @@ from spectralzoom.flows.tasks.stages.condense import SignalChoice, components_of
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.source import References
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.archive.records import read_run
 from spectralzoom.storage.arrays.cubes import open_raw_cube
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import Archive, Ref
 from tests.conftest import QUIET, Survey
 from tests.faults.small_survey import stored
 from tests.flows.conftest import problems
@@ -132,9 +131,7 @@ def test_processes_make_the_same_archive(
 @pytest.mark.parametrize("absent", [("condense_raster", "rectify"), ("rectify", "rectify_fine")])
 def test_store_names_in_receipts_are_unique(absent: tuple[str, ...]) -> None:
     """The exception is the mosaic of the first pass and that of both passes, so each case leaves out one of them."""
-    named = [
-        one.addresses(StageRef(one.product.name, "abc", Path())) for name, one in STAGES.items() if name not in absent
-    ]
+    named = [one.addresses(Ref(one.product.name, "abc", Path())) for name, one in STAGES.items() if name not in absent]
     assert all(named)
     assert len({name for one in named for name in one}) == sum(map(len, named))
 

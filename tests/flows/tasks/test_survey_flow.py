@@ -23,7 +23,7 @@ from spectralzoom.flows.tasks.local_server import ServerUnavailable
 from spectralzoom.flows.tasks.open_survey import Products
 from spectralzoom.flows.tasks.run import SurveyRun
 from spectralzoom.pipeline.errors import IncompleteStoreError
-from spectralzoom.storage.archive.keys import StageRef
+from spectralzoom.storage.store import Ref
 from tests.flows.conftest import act_instead, newest_run
 from tests.prior_work import with_effects
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 RASTER: dict[str, Any] = {"source": "raster", "budget": None}
 
 
-class UnmadeRef(StageRef):
+class UnmadeRef(Ref):
     """Address of a store that does not exist: it has no key."""
 
     uri = ""
@@ -56,14 +56,14 @@ class Noted:
         archive = SimpleNamespace(ref=UnmadeRef, is_there=lambda uri: True)
         self.run = SimpleNamespace(archive=archive, plan=SimpleNamespace(plain=self.uniform))
 
-    def stop_after(self, ref: StageRef, *stages: str) -> None:
+    def stop_after(self, ref: Ref, *stages: str) -> None:
         """Do not stop."""
 
-    def goes_back(self, request: StageRef) -> bool:
+    def goes_back(self, request: Ref) -> bool:
         """Return whether the plan asks for more lines."""
         return not self.uniform
 
-    def __call__(self, stage: str, *inputs: StageRef) -> StageRef:
+    def __call__(self, stage: str, *inputs: Ref) -> Ref:
         """Record the names of the stages that wrote the inputs."""
         self.steps[stage] = [ref.stage for ref in inputs]
         self.products[stage] = UnmadeRef(stage, "", Path())

@@ -32,10 +32,10 @@ from spectralzoom.pipeline.planning.coverage import on_scene
 from spectralzoom.pipeline.signal.components import Components
 from spectralzoom.pipeline.signal.subspace import with_shared
 from spectralzoom.pipeline.simulator.render import BY_NAME
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.class_maps import ClassMap, load_class_map
 from spectralzoom.storage.arrays.mosaics import open_mosaic
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.conftest import CLASSES, QUIET, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page, problems
 from tests.models.conftest import coarse_prediction

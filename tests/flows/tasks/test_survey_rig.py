@@ -23,10 +23,10 @@ from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 from spectralzoom.pipeline.rig.fakes import FakeCamera
 from spectralzoom.pipeline.rig.transports import DeviceGone
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.arrays.cubes import open_raw_cube
-from spectralzoom.storage.maintenance.verification import verify_everything
+from spectralzoom.storage.runs import verify_everything
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET
 
 FAKE = {"rig.mirror_driver": "fake", "rig.camera_driver": "fake"}

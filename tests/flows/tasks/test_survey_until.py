@@ -13,7 +13,7 @@ from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import SurveyStopped
-from spectralzoom.storage.archive.archive import Archive
+from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET
 from tests.flows.conftest import CommandLine
 

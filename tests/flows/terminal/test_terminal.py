@@ -19,7 +19,7 @@ from spectralzoom.flows.publish.report import render_markdown, render_report
 from spectralzoom.flows.terminal.figures import three_digits
 from spectralzoom.flows.terminal.progress import StageProgress, Terminal
 from spectralzoom.pipeline.errors import is_visible
-from spectralzoom.storage.archive.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json
 from tests.flows.publish.test_receipt import make_receipt
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"

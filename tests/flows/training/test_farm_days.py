@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,9 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.lineage import Catalogue
+from spectralzoom.storage.runs import Catalogue
+from spectralzoom.storage.store import Archive
+from tests.storage.small_archive import publish_receipt
 
 BANDS = (20, 60, 110, 160, 210, 250)
 
@@ -60,9 +60,7 @@ def test_night_is_refused() -> None:
 
 def _publish(archive: Archive, key: str, **settings: Any) -> str:
     receipt = {"survey": "farm", "scene": key, "settings": settings, "products": {"class_map": "stages/segment/aaaa/m"}}
-    with archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", json.dumps(receipt))
-        return draft.id
+    return publish_receipt(archive, receipt).name
 
 
 def test_the_default_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
@@ -74,8 +72,8 @@ def test_the_default_day_of_a_farm_is_one_field(tmp_path: Path) -> None:
         _publish(archive, key, scene="farm@2", day=172),
         _publish(archive, key.replace("172", "173"), scene="farm@2", day=173),
     ]
-    assert [run.folder.name for run in newest_runs(Catalogue.read(tmp_path))] == made[1:]
-    again = [asked_again(run, tmp_path, None) for run in Catalogue.read(tmp_path).runs]
+    assert [run.folder.name for run in newest_runs(Catalogue.read(Archive(tmp_path)))] == made[1:]
+    again = [asked_again(run, tmp_path, None) for run in Catalogue.read(Archive(tmp_path)).runs]
     assert [(one.scene, one.day) for one in again] == [("farm", None), (FARM_LAW, 172), (FARM_LAW, 173)]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, replace
 from functools import partial
@@ -20,13 +19,13 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.archive.archive import Archive
 from spectralzoom.storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from spectralzoom.storage.readers.recordings import RecordedWith, _middle_s, open_recording
+from spectralzoom.storage.store import Archive
 from tests.envi_files import write_recorded_files
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 from tests.storage.readers.test_envi_cubes import write_envi
-from tests.storage.small_archive import flip
+from tests.storage.small_archive import flip, publish_receipt
 
 COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
 
@@ -71,9 +70,7 @@ def test_recordings_open_from_folders_runs_and_archives(tmp_path: Path, archive:
     for number, sweep in enumerate((FULL, COARSE)):
         build = partial(write_raw, source=source, sweep=sweep)
         ref, _ = archive.produce("capture", build, version=1, params={"n": number})
-        with archive.new_run("field") as draft:
-            draft.write_file("receipt.json", json.dumps({"products": {"raw_coarse": ref.uri}}))
-        runs.append(draft.published)
+        runs.append(publish_receipt(archive, {"products": {"raw_coarse": ref.uri}}))
         cubes.append(open_raw_cube(ref.path / f"{sweep.name}.zarr"))
     full, coarse = cubes
     store = Path(str(full.group.store_path).removeprefix("file://")).parent
@@ -106,7 +103,7 @@ def test_a_lost_chunk_of_a_raw_cube_is_reported(tmp_path: Path, archive: Archive
         assert open_recording(folder, CAMERA).sweeps
     parts = (folder / "scan-0.zarr" / "dn" / "c").rglob("*")
     next(path for path in parts if path.name.isdigit() and path.is_file()).unlink()
-    with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its chunks" if copied else "it is missing"):
+    with pytest.raises(IncompleteStoreError, match=r"dn lacks 1 of its chunks" if copied else "is missing"):
         open_recording(folder, CAMERA)
 
 

@@ -11,12 +11,10 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from spectralzoom.flows.cli.main import main
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from spectralzoom.storage.archive.archive import Archive
-from spectralzoom.storage.archive.keys import StageRef
-from spectralzoom.storage.maintenance.garbage import clear_up
-from spectralzoom.storage.maintenance.verification import verify_everything
 from spectralzoom.storage.remote.bucket import Copied, pull, push
 from spectralzoom.storage.remote.objects import Objects, UnreachableError, answers_of, parse_place
+from spectralzoom.storage.runs import clear_up, verify_everything
+from spectralzoom.storage.store import Archive, Ref
 from tests.storage.small_archive import small_survey
 
 
@@ -132,7 +130,7 @@ def test_a_stopped_push_continues(
 def test_the_first_writer_of_a_store_wins(bucket: str, tmp_path: Path) -> None:
     """Two machines make one key with other bytes; their files are never mixed."""
 
-    def make(name: str) -> StageRef:
+    def make(name: str) -> Ref:
         machine = Archive.open(tmp_path / name)
 
         def build(part: Path) -> None:

@@ -1,1 +1,0 @@
-"""The archive: keys, manifests, staging, runs and lineage."""

@@ -1,1 +1,0 @@
-"""Verifying, repairing and clearing an archive."""

@@ -1,0 +1,239 @@
+"""Read and write the files of an archive, of exports and of settings: errors with advice, names, syncing, locks.
+
+A file or folder is written aside, under a name that ends in ``.part``, and gets its name only when it is complete.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import logging
+import math
+import os
+import secrets
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from spectralzoom.pipeline.errors import ArchiveError, PipelineError, disk_advice, visible
+
+PART = ".part"
+MOST_BYTES = 10_000_000  # settings are a page long
+_PREFIX = ".export-"
+PROBE_BYTES = 1 << 20  # a disk without room for so much is full
+
+log = logging.getLogger(__name__)
+
+
+@contextmanager
+def refusals(path: Path, doing: str, *, every: bool = False) -> Iterator[None]:
+    """Turn errors of files below ``path``, of a full or broken disk, or ``every`` OSError into one ArchiveError."""
+    try:
+        yield
+    except PipelineError:
+        raise
+    except OSError as error:
+        named = None if error.filename is None else Path(os.fsdecode(error.filename))
+        inside = every or (named is not None and (named.is_relative_to(path) or path.is_relative_to(named)))
+        advice = disk_advice(error)
+        if not inside and (advice is None or (named is not None and named.is_absolute())):
+            raise
+        if advice is None:
+            gone = isinstance(error, FileNotFoundError)
+            cure = "another process has removed it, run again" if gone else "see what stands there"
+            advice = f"{error.strerror or error}{'' if named is None else f' ({named})'}: {cure}"
+        raise ArchiveError(f"cannot {doing} {path}: {advice} (nothing published was changed)") from error
+
+
+def entries(folder: Path) -> list[Path]:
+    """Return the entries of a folder, sorted; none if it is gone or is a file."""
+    try:
+        return sorted(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def files_in(folder: Path) -> dict[str, os.stat_result]:
+    """Return all files below a folder by their names in it, without those that go meanwhile. Links are not followed."""
+    found: dict[str, os.stat_result] = {}
+    waiting = [] if folder.is_symlink() else [str(folder)]
+    while waiting:
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(waiting.pop()) as listed:
+            for one in listed:
+                if one.is_dir(follow_symlinks=False):
+                    waiting.append(one.path)
+                else:
+                    with suppress(FileNotFoundError):
+                        found[one.path[len(str(folder)) + 1 :]] = one.stat(follow_symlinks=False)
+    return found
+
+
+def bytes_in(folder: Path) -> int:
+    """Return the bytes of all files below a folder."""
+    return sum(one.st_size for one in files_in(folder).values())
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a path is a folder, and no link to one."""
+    return path.is_dir() and not path.is_symlink()
+
+
+def remove(path: Path) -> None:
+    """Remove a folder, file or link if it exists: first its name, in one step; what the disk keeps is left."""
+    away = path
+    with suppress(OSError):
+        if not path.name.endswith(PART) or is_folder(path):  # another process may be writing into it
+            away = aside(path)
+            path.rename(away)
+            sync(away.parent)  # or a power cut leaves the name, and not the files
+    shutil.rmtree(away, ignore_errors=True)
+    with suppress(OSError):
+        away.unlink()
+
+
+def aside(final: Path, ending: str = PART) -> Path:
+    """Return a new name beside ``final`` for a folder that is not published."""
+    return final.with_name(f"{final.name.split('.')[0]}.{secrets.token_hex(4)}{ending}")
+
+
+def sync(path: Path) -> None:
+    """Sync a file's content, or a folder's names, to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's content, in hex."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
+    """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
+
+    None where another holds it and ``wait`` is false; a ``shared`` lock excludes only others. A second release does
+    nothing. Raises OSError: the path cannot be locked.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    with ExitStack() as held:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        file = held.enter_context(os.fdopen(descriptor))  # its second close does nothing
+        try:
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not wait:
+                return None
+            log.info("waiting for another run that holds %s", path.stem)
+            fcntl.flock(descriptor, kind)
+        if not (path.exists() and os.path.samestat(os.fstat(descriptor), path.stat())):  # gc has removed it meanwhile
+            return take_lock(path, wait=wait, shared=shared)
+        held.pop_all()
+        return file.close
+
+
+# --- single files -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
+
+    Old and new files are never mixed: old files of all names but the first are removed before the first is replaced.
+    When the block fails, ``folder`` is unchanged. Raises ArchiveError: the folder is or lies below a file, or the disk
+    refuses.
+    """
+    with refusals(folder, "write to"):
+        make_folder(folder)
+        with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART, dir=folder) as aside:
+            with _disk_errors(Path(aside)):
+                yield Path(aside)
+            for name in names:
+                sync(Path(aside) / name)
+            for name in names[1:]:
+                (folder / name).unlink(missing_ok=True)
+            for name in names:
+                (Path(aside) / name).replace(folder / name)
+            sync(folder)
+
+
+@contextmanager
+def _disk_errors(folder: Path) -> Iterator[None]:
+    """Raise the disk's own OSError where a library such as GDAL reports a full disk as another error."""
+    try:
+        yield
+    except PipelineError:
+        raise
+    except Exception as error:
+        if not isinstance(error, OSError) or error.errno is None:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(PROBE_BYTES))
+        raise
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder to export to (ArchiveError: it is or lies below a file)."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
+
+
+def write_whole(path: Path, content: str) -> None:
+    """Write one text file aside and rename it into place."""
+    with written_aside(path.parent, [path.name]) as aside:
+        (aside / path.name).write_text(content, encoding="utf-8")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the leftovers of killed writers from a folder; no process may be writing there."""
+    for part in folder.glob(f"{_PREFIX}*{PART}"):
+        remove(part)
+
+
+def to_json(content: Mapping[str, object]) -> str:
+    """Return JSON text, two spaces a level, in the content's own order; numbers that are not finite become null.
+
+    Characters that would steer a terminal or reverse text are written as JSON escapes.
+    """
+    text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    return visible(text, lambda letter: json.dumps(letter)[1:-1]) + "\n"
+
+
+def _plain(value: object) -> object:
+    """Return plain lists, dictionaries and numbers; numpy's scalars by their ``item``."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file, with or without a byte order mark.
+
+    Raises FileNotFoundError: there is no such file. ValueError: it cannot be read as TOML.
+    """
+    try:
+        size = path.stat().st_size
+        if not path.is_file():  # a pipe would be waited for
+            raise ValueError("it is no plain file")
+        if size > MOST_BYTES:
+            raise ValueError(f"it has {size} bytes, settings have a few thousand")
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(str(error)) from error
+    except RecursionError:
+        raise ValueError("its lists or tables are nested too deeply") from None
