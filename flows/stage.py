@@ -144,7 +144,8 @@ class Row:
     ref: Ref  # in a dry run without a key where an input is missing
     state: Literal["ran", "cached", "to run", "blocked"]
     why: str = ""  # a stage is blocked
-    params: Mapping[str, Any] = field(default_factory=dict)
+    version: int = 0
+    params: Mapping[str, Any] = field(default_factory=dict)  # of a dry run
     wall_s: float | None = None
     cpu_s: float | None = None
     peak_rss_bytes: int | None = None
@@ -231,7 +232,7 @@ class Stores:
             raise
         spent_s = time.perf_counter() - wall_s
         size = self.archive.stored_bytes(ref)
-        row = Row(request.stage.name, ref, "cached", params=request.params)
+        row = Row(request.stage.name, ref, "cached")
         row = replace(row, bytes_in=sum(map(self.archive.stored_bytes, request.inputs)), bytes_out=size)
         if built:
             cpu_s = time.process_time() - cpu_s
@@ -244,15 +245,15 @@ class Stores:
     def _foreseen(self, request: Request) -> Ref:
         """Return the address that a store would have, without a key where one of its inputs is missing."""
         made = request.stage
-        row = Row(made.name, Ref(made.product, "", Path()), "to run")
+        row = Row(made.name, Ref(made.product, "", Path()), "to run", version=made.version, params=request.params)
         if all(ref.key and self.archive.is_known(ref) for ref in request.inputs):
             try:
                 ref = self.archive.ref(made.product, self._key(request))
                 there = self.archive.find(ref.stage, ref.key) is not None
                 if not there and self.archive.is_known(ref):
-                    self._cleared[ref] = partial(self._would_run, replace(row, ref=ref, params=request.params), request)
+                    self._cleared[ref] = partial(self._would_run, replace(row, ref=ref), request)
                     there = True
-                row = Row(made.name, ref, "cached" if there else "to run", params=request.params)
+                row = replace(row, ref=ref, state="cached" if there else "to run")
             except (PipelineError, OSError) as error:  # the survey would stop here
                 row = replace(row, state="blocked", why=str(error))
         if row.state == "to run":

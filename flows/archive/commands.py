@@ -1,4 +1,4 @@
-"""List, explain, verify and clear up archives: the verbs `ls`, `explain`, `verify` and `gc`."""
+"""List, verify and clear up archives: the verbs `ls`, `verify` and `gc`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.tree import Tree
 
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Switch
 from spectralzoom.flows.settings.load import OF_THE_PLAN
@@ -19,7 +18,7 @@ from spectralzoom.flows.tasks.scores import score_of
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
-from spectralzoom.storage.runs import Catalogue, Finding, Run, clear_up, find_product, verify_everything
+from spectralzoom.storage.runs import Catalogue, Finding, Run, clear_up, verify_everything
 from spectralzoom.storage.store import Archive, descendants
 from spectralzoom.storage.whole_files import to_json
 
@@ -31,19 +30,6 @@ MOST_ROWS = 20  # stores of a stage, removals
 def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
     """List the runs and stores of an archive with their scene, score and size."""
     put_out(contents(Archive.open(archive, create=False, write=False)), show_contents, as_json=as_json)
-    return DONE
-
-
-def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> int:
-    """Show the lineage of a product: its stages, their keys and inputs.
-
-    Parameters
-    ----------
-    product
-        Its address (stages/rectify/KEY), a key or its beginning, a run's name or `latest`, or a product's name in the
-        newest run (class_map, mosaic).
-    """
-    put_out(explanation(Archive.open(archive, create=False, write=False), product), show_explanation, as_json=as_json)
     return DONE
 
 
@@ -168,44 +154,6 @@ def _run_state(catalogue: Catalogue, run: Run) -> str:
     return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
 
 
-def explanation(archive: Archive, product: str) -> dict[str, Any]:
-    """Return the lineage of a product as nested tables.
-
-    Raises ArchiveError: there is no such product.
-    """
-    catalogue = Catalogue.read(archive)
-    found = find_product(catalogue, product)
-    if isinstance(found, Run):
-        shown: set[str] = set()
-        below = {one for uri in found.names & catalogue.stores.keys() for one in catalogue.stores[uri]["inputs"]}
-        trees = [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)]
-        told = {"problem": found.problem, "command": command(found.settings, archive.name)}
-        return {"archive": archive.name, "product": found.uri, **told, "lineage": trees}
-    runs = [run.uri for run in catalogue.named_by(found)]
-    return {"archive": archive.name, "product": found, "runs": runs, "lineage": [_tree(catalogue, found, set())]}
-
-
-def _tree(catalogue: Catalogue, uri: str, shown: set[str]) -> dict[str, Any]:
-    """Return a store and its inputs; the inputs of a store in ``shown`` are left out."""
-    store = catalogue.stores.get(uri)
-    if store is None:
-        return {"uri": uri, "problem": "is not there", "inputs": []}
-    node = {
-        "uri": uri,
-        "stage": uri.split("/")[1],
-        "key": uri.split("/")[2],
-        "version": str(store.get("version", "")),
-        "cleared": store["cleared"],
-        "called": sorted(catalogue.called(uri)),
-        "problem": store["problem"],
-        "inputs": [],
-    }
-    if uri in shown:
-        return node | {"see": "above"}
-    shown.add(uri)
-    return node | {"inputs": [_tree(catalogue, one, shown) for one in store["inputs"]]}
-
-
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     """Return problems, stores made of damaged ones, and the commands that remove them and make them again."""
     bad = [finding for finding in findings if finding.problem is not None]
@@ -313,40 +261,6 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
     if content["obstacle"] is not None:
         console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", soft_wrap=True)
     show_text(f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}", console)
-
-
-def show_explanation(content: dict[str, Any], console: Console) -> None:
-    """Print a product's lineage."""
-    for text in (content["product"], content.get("problem"), content.get("command")):
-        if text:
-            show_text(text, console)
-    for node in content["lineage"]:
-        console.print(_branch(node, None))
-    if "runs" in content:
-        named = ", ".join(content["runs"]) or "no run: gc --dry-run lists what it would remove"
-        show_text(f"named by {named}", console)
-
-
-def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
-    text = _format_node(node)
-    tree = Tree(text) if parent is None else parent.add(text)
-    for one in node["inputs"]:
-        _branch(one, tree)
-    return tree
-
-
-def _format_node(node: Mapping[str, Any]) -> str:
-    if "stage" not in node:
-        return f"[bold red]{escape(node['uri'])} {escape(node['problem'])}[/]"
-    name = f"[bold]{escape(node['stage'])}[/] {escape(node['key'][:SHORT_KEY])}"
-    called = [word for word in node["called"] if word != node["stage"]]
-    name += f" [dim]({escape(', '.join(called))})[/]" if called else ""
-    if node["problem"] is not None:
-        return f"{name} [bold red]damaged: {escape(node['problem'])}[/]"
-    if "see" in node:
-        return f"{name} [dim]{node['see']}[/]"
-    cleared = ", cleared away, made again if needed" if node["cleared"] else ""
-    return f"{name} version {escape(node['version'])}{cleared}"
 
 
 def show_verdict(content: dict[str, Any], console: Console) -> None:

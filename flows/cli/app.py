@@ -14,7 +14,7 @@ VERBS = {  # verb: module of its function, loaded on demand
     "rig check": "spectralzoom.flows.cli.rig_commands",
     "plan": "spectralzoom.flows.archive.plan_command",
     "ls": "spectralzoom.flows.archive.commands",
-    "explain": "spectralzoom.flows.archive.commands",
+    "explain": "spectralzoom.flows.archive.explain_command",
     "verify": "spectralzoom.flows.archive.commands",
     "gc": "spectralzoom.flows.archive.commands",
     "push": "spectralzoom.flows.archive.bucket_commands",
