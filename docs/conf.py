@@ -4,22 +4,9 @@ from __future__ import annotations
 
 from importlib import metadata
 
+from spectralzoom.flows import survey
 from spectralzoom.flows.settings.documents import settings_table
-from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
-from spectralzoom.flows.stages.condense import condense_coarse, condense_fine, condense_raster
-from spectralzoom.flows.stages.effects import choose_effects
-from spectralzoom.flows.stages.evaluate import evaluate
-from spectralzoom.flows.stages.ground import ground
-from spectralzoom.flows.stages.locate import locate
-from spectralzoom.flows.stages.rectify import rectify, rectify_fine
-from spectralzoom.flows.stages.register import register_coarse, register_fine
-from spectralzoom.flows.stages.score import score
-from spectralzoom.flows.stages.segment import segment
-
-STAGES = (
-    *(choose_effects, capture_coarse, condense_coarse, register_coarse, locate, rectify, condense_raster, score),
-    *(capture_fine, condense_fine, register_fine, rectify_fine, segment, ground, evaluate),
-)
+from spectralzoom.flows.stage import Stage
 
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")
@@ -44,6 +31,7 @@ napoleon_custom_sections = ["Raises", "Returns"]  # in words: napoleon wants eac
 # Docstrings name more than the reference lists, and types of numpy and xarray, whose pages are not at hand.
 nitpick_ignore_regex = [("py:.*", ".*")]
 
-head = "| stage | on terminals | stored as, version |\n|---|---|---|\n"  # rows are in the order of a survey
-rows = [f"| `{one.name}` | {one.title} | `stages/{one.product}`, {one.version} |\n" for one in STAGES]
+head = "| stage | on terminals | stored as, version |\n|---|---|---|\n"
+stages = [one for one in vars(survey).values() if isinstance(one, Stage)]
+rows = [f"| `{one.name}` | {one.title} | `stages/{one.product}`, {one.version} |\n" for one in stages]
 myst_substitutions = {"settings": settings_table(), "stages": head + "".join(rows)}

@@ -48,10 +48,6 @@ class Products:
         """Return the addresses of the stores, or of files in them, by their names in receipts."""
         return {name: ref.uri + (f"/{file}" if file else "") for name, ref, file in self._named() if ref is not None}
 
-    def stores(self) -> list[Ref]:
-        """Return every store once."""
-        return list(dict.fromkeys(ref for _, ref, _ in self._named() if ref is not None))
-
     def _named(self) -> Iterator[tuple[str, Ref | None, str]]:
         yield "effects", self.effects, EFFECTS
         if self.first is not None:

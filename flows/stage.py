@@ -177,6 +177,11 @@ class Stores:
         self._watch, self._log, self._finish = watch, log, finish
         self._cleared: dict[Ref, Callable[[], object]] = {}  # makes each again
 
+    @property
+    def refs(self) -> list[Ref]:
+        """Return the stores of all stages."""
+        return [row.ref for row in self.rows.values()]
+
     def has(self, ref: Ref) -> bool:
         """Return whether a store has its files; in a dry run some have not been made."""
         return bool(ref.key) and self.archive.is_there(ref.uri)
@@ -198,7 +203,9 @@ class Stores:
     def _found_or_made(self, request: Request) -> tuple[Ref, bool]:
         key = self._key(request)
         ref = self.archive.ref(request.stage.product, key)
-        if self.archive.find(ref.stage, key) is None and self.archive.is_known(ref):
+        if self.archive.find(ref.stage, key) is not None:
+            return ref, False
+        if self.archive.is_known(ref):
             self._cleared[ref] = partial(self._recorded, request, self._made)
             return ref, False
         return self._made(request)
@@ -206,10 +213,10 @@ class Stores:
     def _made(self, request: Request) -> tuple[Ref, bool]:
         made = request.stage
         spool = self.archive.root / "spool" / self._key(request)
+        for ref in request.inputs:
+            self.restore(ref)
 
         def build(folder: Path) -> None:
-            for ref in request.inputs:
-                self.restore(ref)
             request.build(Output(folder, partial(self._watch, made.title, "running"), spool))
             self._finish(folder)
             self.bytes_written += bytes_in(folder) + bytes_in(spool)

@@ -52,7 +52,7 @@ def publish(stores: Stores, plan: SurveyPlan, products: Products, *, started: da
         _show_artifact(plan.field.name, stores.archive.name, published)
         return RunRef(f"runs/{published.folder.name}", published.folder)
 
-    return task_in_flow("publish", stores.name, work, *products.stores())
+    return task_in_flow("publish", stores.name, work, *stores.refs)
 
 
 def clear_raw(stores: Stores, plan: SurveyPlan, products: Products, run: RunRef, *, note: Note) -> RunRef:

@@ -93,7 +93,7 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         (folder / REPORT).write_text(page, encoding="utf-8")
         return {"survey": receipt["survey"], "settings": receipt["settings"]}
 
-    folder = stores.archive.publish_run(plan.field.name, write, products.stores())
+    folder = stores.archive.publish_run(plan.field.name, write, stores.refs)
     return Published(receipt, folder)
 
 
@@ -304,6 +304,6 @@ def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: Fine
     return {
         "captured": captured,
         "written": stores.bytes_written,
-        "kept": sum(map(archive.size_of, archive.manifest_hashes(products.stores()).keys() - others)),
+        "kept": sum(map(archive.size_of, archive.manifest_hashes(stores.refs).keys() - others)),
         "reference": reference,
     }

@@ -29,11 +29,12 @@ from measure import Row
 from numpy.typing import NDArray
 from rich.console import Console
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks import scene as scenes
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.pipeline.geometry.grid import patch_pixels
 from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
@@ -140,8 +141,8 @@ def cells(seeds: Sequence[int] = SEEDS) -> Iterator[Cell]:
         seconds = 1 + SWATHS * (SETUP_S + LINES * exposure_ms * 1e-3 / light)
         scores = {way: [score(seed, share, light, SWATHS, seconds, way) for seed in seeds] for way in WAYS}
         with tempfile.TemporaryDirectory() as out:  # the planner's decision does not depend on the land
-            run = open_run(asked(0, light, SWATHS, seconds, PLANNER, out), planning=True)
-        yield Cell(light, share, seconds, scores, run.settings.zooms)
+            plan = plan_survey(open_field(asked(0, light, SWATHS, seconds, PLANNER, out), planning=True))
+        yield Cell(light, share, seconds, scores, plan.settings.zooms)
 
 
 def rows(picture: Path | None = None) -> list[Row]:

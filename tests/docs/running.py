@@ -6,8 +6,8 @@ The comment before a block, `<!-- test: WORDS -->`, changes how it is run:
                     farm that suffice for its weights
     parses          do not run: parse the words of every command, and check that targets and files exist
     bucket          s3://bucket/prefix is an archive on the S3 server of the tests
-    tree FLAGS      run in one process with a copy of the four folders, to which the page's files and changes were
-                    added; add the flags to the first command
+    tree FLAGS      run in one process with a copy of the source folders and tests, to which the page's files and
+                    changes were added; add the flags to the first command
 """
 
 from __future__ import annotations
@@ -79,13 +79,16 @@ class Reader:
         """Return a copy of the folders that a page may add to."""
         root = self.folder / "tree"
         if not root.exists():
-            for name in ("pipeline", "models", "storage", "flows", "spectralzoom"):
+            for name in ("pipeline", "models", "storage", "flows", "spectralzoom", "tests"):
                 # with bytecode, valid for files of the same dates
                 shutil.copytree(ROOT / name, root / name, symlinks=True)
+            shutil.copy(ROOT / "pyproject.toml", root)
         return root
 
     def _command(self, block: Block, command: str, word: str, rest: str) -> None:
         words = shlex.split(command.partition(" '>' ")[0])
+        if word == "tree" and words[0] == "pytest":
+            return
         check_words(words, block.place)
         if word == "parses":
             return
@@ -107,12 +110,15 @@ class Reader:
         return sorted(path.relative_to(self.folder).as_posix() for path in self.folder.glob(word)) or [word]
 
     def _elsewhere(self, block: Block, flags: str) -> None:
-        """Run the commands with the copy of the folders, in a separate process."""
-        first, *others = [shlex.split(command)[1:] for command in commands_of(block)]
+        """Run the commands with the copy of the folders, in a separate process; pytest runs in the copy."""
+        (program, *first), *others = map(shlex.split, commands_of(block))
         environment = {**os.environ, "PYTHONPATH": str(self.tree)}
-        command = [sys.executable, "-c", EACH, json.dumps([[*first, *shlex.split(flags)], *others])]
-        ended = subprocess.run(command, env=environment, cwd=self.folder, capture_output=True, text=True, check=False)
-        assert ended.returncode == 0, f"{block.place}: {ended.stderr[-2000:]}"
+        words = [[*first, *shlex.split(flags)], *(one[1:] for one in others)]
+        tests = program == "pytest"
+        command = [sys.executable, *(["-m", "pytest", *first] if tests else ["-c", EACH, json.dumps(words)])]
+        cwd = self.tree if tests else self.folder
+        ended = subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True, check=False)
+        assert ended.returncode == 0, f"{block.place}: {(ended.stdout + ended.stderr)[-2000:]}"
 
     def _python(self, block: Block) -> None:
         if block.file is not None:  # a new file in the copy of the folders

@@ -44,9 +44,9 @@ from tests.flows.tasks.test_uniform_scan import RECORD
 from tests.prior_work import without_effects
 from tests.storage.readers.test_recordings import write_envi_cube
 from tests.storage.small_archive import flip
+from tests.users.zone_sketches import sketch
 
 __all__ = ["command_line"]
-from tests.users.zone_sketches import sketch
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 FullScan = tuple[Path, Published, Path]  # archive, run, sweeps as files

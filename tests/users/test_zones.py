@@ -15,15 +15,15 @@ import rasterio
 import shapely
 from affine import Affine
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.load import load_settings, parse_settings
-from spectralzoom.flows.tasks.run import SurveyRun, open_run
 from spectralzoom.pipeline.errors import SettingsError, ZoneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import chosen_patches
-from spectralzoom.storage.store import Archive
 from tests.conftest import Survey
 from tests.prior_work import without_effects
 from tests.users.zone_sketches import sketch
@@ -43,7 +43,7 @@ def drawn(out: Path, published: Published) -> ClassMap:
     return load_class_map(out / published.receipt["products"]["class_map"])
 
 
-Opened = Callable[..., SurveyRun]
+Opened = Callable[..., SurveyPlan]
 
 
 def on_map(shape: shapely.Geometry) -> shapely.Geometry:
@@ -66,10 +66,10 @@ def scene(scene_files: Path) -> str:
 def opened(scene: str, weights: Path, tmp_path: Path) -> Opened:
     """Return a function that opens a survey of the small picture with given settings, without running it."""
 
-    def open_with(**given: Any) -> SurveyRun:
-        basic = {"scene": scene, "source": "sim", "weights": str(weights), "engine": "plain"}
+    def open_with(**given: Any) -> SurveyPlan:
+        basic = {"scene": scene, "source": "sim", "weights": str(weights), "out": str(tmp_path / "archive")}
         settings = parse_settings(basic | {name: value for name, value in given.items() if value is not None})
-        return open_run(settings, planning=True, archive=Archive(tmp_path, writes=False))
+        return plan_survey(open_field(settings, planning=True))
 
     return open_with
 
@@ -135,10 +135,10 @@ def test_patches_outside_or_in_a_hole_are_never_chosen(kept_to: tuple[Path, Publ
 def test_lines_outside_are_left_out(kept_to: tuple[Path, Published], opened: Opened, zones: dict[str, str]) -> None:
     """Coarse pass, full scan and the reference of the reading cover the area only, and cost less than the field's."""
     rest = {"camera": {"samples": 64}, "budget": 1.0}
-    run = opened(zones={name.partition(".")[2]: path for name, path in zones.items()}, **rest)
-    kept = run.plan
-    assert kept_to[1].receipt["savings"]["patches"]["full"] == len(run.kept_patches) < run.grid.every_patch().size
-    whole = opened(**rest).plan
+    plan = opened(zones={name.partition(".")[2]: path for name, path in zones.items()}, **rest)
+    kept, field = plan.passes, plan.field
+    assert kept_to[1].receipt["savings"]["patches"]["full"] == len(field.kept_patches) < field.grid.every_patch().size
+    whole = opened(**rest).passes
     assert sum(one.lines for one in kept.coarse) < sum(one.lines for one in whole.coarse)
     assert kept.full_s < whole.full_s
     assert kept_to[1].receipt["savings"]["capture_s"]["full"] == pytest.approx(kept.full_s)
@@ -207,14 +207,14 @@ def test_an_area_of_the_whole_field_changes_no_key(
 
 def test_polygons_in_any_crs_give_the_same_mask(opened: Opened, tmp_path: Path) -> None:
     """The far half of the field is given in metres, in degrees, in web Mercator and in LAEA (axes north, east)."""
-    place = opened(pose=POSE).zones.place
+    place = opened(pose=POSE).field.zones.place
     west, south, east, north = place.outline.bounds
     half = shapely.intersection(place.outline, shapely.box(west, (south + north) / 2, east, north))
     fine = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500)
     masks = []
     for name, crs in (("utm.gpkg", 32632), ("globe.geojson", 4326), ("web.shp", 3857), ("laea.gpkg", 3035)):
         path = sketch(tmp_path / name, {"half": fine.to_crs(crs).iloc[0]}, crs)
-        masks.append(opened(pose=POSE, zones={"area": path}).zones.kept)
+        masks.append(opened(pose=POSE, zones={"area": path}).field.zones.kept)
     assert 0.2 < masks[0].mean() < 0.8
     differ = [(mask != masks[0]).sum() for mask in masks]
     assert max(differ) <= 16  # of 12 288: datums differ by half a millimetre after a round trip, a pixel has 7

@@ -14,10 +14,10 @@ import pytest
 from rich.console import Console
 
 from spectralzoom.flows.archive.plan_command import plan_content, scan_table, show_plan
+from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.terminal.figures import format_seconds
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
@@ -26,8 +26,6 @@ from tests.conftest import QUIET, Flags, Survey
 from tests.flows.conftest import be_version, python
 
 pytestmark = pytest.mark.usefixtures("no_effects")
-
-WAITS = {"locate": "condense_coarse", "rectify": "locate", "score": "rectify", "capture_fine": "score"}
 
 
 @pytest.fixture(scope="module")
@@ -55,26 +53,24 @@ def _tree(root: Path) -> dict[str, tuple[int, int]]:
 
 
 def test_the_survey_follows_the_plan(settings: Settings, archive: Path, survey_png: Any) -> None:
-    """Cached and skipped stages are so in the survey, with the same key; planned and blocked stages run."""
+    """Cached stages are found by the survey, with the same key; the others run."""
     planned = _plan(settings, archive, resampling="nearest")
     receipt = survey_png(archive, resampling="nearest").receipt
     done = {stage["name"]: stage for stage in receipt["stages"]}
     assert list(planned) == list(done)
     for name, row in planned.items():
         assert row.key in (None, done[name]["key"]), name
-        if row.state != "blocked":  # a blocked store may prove to be cached
-            assert row.state == done[name]["state"].replace("ran", "to run"), name
+        assert row.state == done[name]["state"].replace("ran", "to run"), name
     assert all(row.state == "cached" for row in _plan(settings, archive, resampling="nearest").values())
 
 
 def test_a_plan_makes_no_archive(settings: Settings, tmp_path: Path) -> None:
-    """The first capture has a key and is to run; later stages wait for a store, by name."""
+    """All stages of two passes are to run; those that need a missing store have no key."""
     planned = _plan(settings, tmp_path / "none")
     assert not list(tmp_path.iterdir())
-    assert planned["choose_effects"].state == "to run"
-    assert planned["capture_coarse"].state == "to run"
-    assert planned["capture_coarse"].key is not None
-    assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
+    assert {row.state for row in planned.values()} == {"to run"}
+    assert [name for name, row in planned.items() if row.key is not None] == ["choose_effects"]
+    assert {"capture_coarse", "capture_fine", "rectify_fine", "segment", "evaluate"} <= set(planned)
 
 
 def test_a_plan_changes_no_file(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,10 +106,9 @@ def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, mo
     monkeypatch.setattr("spectralzoom.storage.readers.cube_sources.os.sysconf", memory.__getitem__)
     asked = replace(settings, scene="farm", size=(4096, 4096), labels=None, weights=None, out=str(tmp_path / "a"))
     found = plan_content(asked)
-    ahead = [row["stage"] for row in found["stages"] if row["state"] == "to run"]
-    assert ahead == ["choose_effects", "capture_coarse", "condense_coarse"]
+    assert {row["state"] for row in found["stages"]} == {"to run"}
     with pytest.raises(SettingsError, match="this machine has 1; take a smaller one") as refused:
-        open_run(asked)
+        open_field(asked)
     assert found["refused"] == str(refused.value)
     shown = io.StringIO()
     show_plan(found, Console(file=shown, width=200))
@@ -128,14 +123,14 @@ def test_a_plan_imports_no_heavy_library() -> None:
     assert not heavy & set(python(code).stdout.split())
 
 
-def test_a_damaged_store_blocks_later_stages(settings: Settings, archive: Path, tmp_path: Path) -> None:
+def test_a_damaged_store_blocks_its_stage(settings: Settings, archive: Path, tmp_path: Path) -> None:
     """The reason is the archive's own message; a file in place of an archive is refused."""
     store = Archive(archive).refs("rectify_fine")[0]
     (store.path / "lines.json").unlink()
     planned = _plan(settings, archive)
     assert planned["rectify_fine"].state == "blocked"
     assert "gc --damaged" in planned["rectify_fine"].why
-    assert planned["segment"].why == "waits for rectify_fine"
+    assert (planned["segment"].state, planned["segment"].key) == ("to run", None)
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
         _plan(settings, tmp_path / "file")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +14,6 @@ import pytest
 from rich.console import Console
 
 from spectralzoom.flows.archive import reprocess_command
-from spectralzoom.flows.archive import reprocess_command as reprocessing
 from spectralzoom.flows.archive.commands import verify
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
 from spectralzoom.flows.settings.survey_settings import Settings
@@ -172,36 +172,29 @@ def test_fields_with_missing_stores_are_surveyed_again(archive: Path, reprocess:
     assert reprocess.states(archive) == [("turned", "skipped"), ("scene", "ran")]
 
 
-def test_a_run_without_settings_is_reported(archive: Path, reprocess: Reprocess) -> None:
-    """Its manifest is damaged, so its settings are unknown; the other fields are processed."""
-    flip(Archive.open(archive).runs()[0] / "manifest.json", at=40)
-    rows = reprocess(archive, PARTLY)
-    assert sorted(row["state"] for row in rows) == ["failed", "skipped"]
-    assert any("cannot be read" in str(row["message"]) for row in rows)
-
-
-def test_a_run_is_current_only_if_it_is_complete(archive: Path) -> None:
-    """It needs a valid receipt; its settings are in the manifest, too."""
-    run = Catalogue.read(Archive(archive)).runs[-1]
-    settings = reprocessing.asked_again(run, archive, None)
-    assert reprocessing.is_current(Catalogue.read(Archive(archive)), run, settings)
-    flip(run.folder / "receipt.json")
-    damaged = Catalogue.read(Archive(archive)).runs[-1]
-    assert reprocessing.asked_again(damaged, archive, None) == settings
-    assert not reprocessing.is_current(Catalogue.read(Archive(archive)), damaged, settings)
+@pytest.mark.parametrize(
+    ("file", "words"), {"manifest.json": "settings of .* cannot be read", "receipt.json": "is gone"}.items()
+)
+def test_a_damaged_run_is_reported(archive: Path, reprocess: Reprocess, file: str, words: str) -> None:
+    """Without its manifest the settings are unknown, without its receipt the scene; other fields are processed."""
+    run = Archive.open(archive).runs()[-1]
+    flip(run / file, at=40)
+    rows = {row["old"]: row for row in reprocess(archive, PARTLY)}
+    assert re.search(words, rows.pop(run.name)["message"])
+    assert [row["state"] for row in rows.values()] == ["skipped", "skipped"]  # also the run before it
 
 
 def test_fields_differ_by_scene_and_name(surveyed: Path, tmp_path: Path) -> None:
     """Each run without a scene is a field of its own; only the star is a wildcard."""
-    (one, _) = reprocessing.newest_runs(Catalogue.read(Archive(surveyed)))
+    (one, _) = reprocess_command.newest_runs(Catalogue.read(Archive(surveyed)))
     odd = dataclasses.replace(one, receipt={**one.receipt, "survey": "field[1]?.png"})
     for pattern in ("field[1]?.png", "*[1]*", "*"):
-        assert reprocessing.is_called(odd, pattern)
+        assert reprocess_command.is_called(odd, pattern)
     for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
-        assert not reprocessing.is_called(odd, pattern)
+        assert not reprocess_command.is_called(odd, pattern)
     archive = Archive.open(tmp_path)
     for scene in (None, None, "farm@2/seed=1", "farm@2/seed=2", "farm@2/seed=1"):
         receipt = "" if scene is None else {"survey": "farm", "scene": scene, "settings": {"seed": 1}}
         publish_receipt(archive, receipt, survey="farm")
     runs = Catalogue.read(Archive(tmp_path)).runs
-    assert reprocessing.newest_runs(Catalogue.read(Archive(tmp_path))) == [runs[n] for n in (0, 1, 3, 4)]
+    assert reprocess_command.newest_runs(Catalogue.read(Archive(tmp_path))) == [runs[n] for n in (0, 1, 3, 4)]

@@ -26,7 +26,7 @@ def surveyed(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> Pa
     """Return an archive of a survey that was stopped before it cleared its raw lines; do not change it."""
     root = tmp_path_factory.mktemp("clearing") / "archive"
     with without_effects(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("spectralzoom.flows.survey.clear_raw", lambda plan, run: run)
+        patch.setattr("spectralzoom.flows.survey.clear_raw", lambda stores, plan, products, run, note: run)
         survey_png(root, accuracy=False)
     return root
 

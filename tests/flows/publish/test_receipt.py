@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import re
-from dataclasses import asdict
 from functools import reduce
 from operator import getitem
 
@@ -22,7 +21,6 @@ from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.terminal.figures import format_area
 from spectralzoom.pipeline.errors import ShapeError
-from spectralzoom.storage.runs import StageRecord
 from spectralzoom.storage.whole_files import to_json
 from tests.flows.conftest import Page
 
@@ -54,9 +52,10 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         **{"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.08, "within": True, "on": 1, "off": 0},
         **{"cost_s": 1.5, "exact_cost_s": 9.0, "saved_s": 7.5},
     }
+    costs = {"wall_s": wall, "cpu_s": wall, "peak_rss_bytes": 10**9, "bytes_in": 0, "bytes_out": 10**8}
     stages = [
-        StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest has times
-        StageRecord("rectify", "cd34", "cached"),
+        {"name": "capture", "key": "ab12", "state": "ran", **costs},
+        {"name": "rectify", "key": "cd34", "state": "cached", **dict.fromkeys(costs)},
     ]
     return build_receipt(
         survey="farm",
@@ -67,7 +66,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         finished=f"end {wall}",
         versions={"torch": "2.13.0"},
         settings=Settings().to_dict(),
-        stages=[asdict(one) for one in stages],
+        stages=stages,
         savings=savings,
         data_bytes={**{"captured": 2_000_000, "written": 7_000_000, "kept": 1_500_000}, "reference": 4_000_000},
         products={"quicklook": f"runs/{wall}/quicklook.png"},
