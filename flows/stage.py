@@ -219,11 +219,13 @@ class Stores:
         def build(folder: Path) -> None:
             request.build(Output(folder, partial(self._watch, made.title, "running"), spool))
             self._finish(folder)
-            self.bytes_written += bytes_in(folder) + bytes_in(spool)
+            self.bytes_written += bytes_in(spool)
 
-        return self.archive.produce(
+        ref, built = self.archive.produce(
             made.product, build, version=made.version, params=request.params, inputs=request.inputs
         )
+        self.bytes_written += self.archive.size_of(ref.uri) if built else 0
+        return ref, built
 
     def _recorded(self, request: Request, get: Callable[[Request], tuple[Ref, bool]]) -> Ref:
         """Return the store that ``get`` finds or makes, and record time and memory of its making."""

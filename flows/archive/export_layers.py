@@ -238,7 +238,7 @@ def _gain_layer(run: ExportedRun) -> Layer:
     stored = open_image(run.path("attention"), "score")
     class_map = run.store("class_map")
     assert class_map is not None
-    patch = int(run.archive.manifest(class_map)["params"]["grid"]["patch"])
+    patch = int(run.archive.manifest(class_map)["params"]["gains"]["frame"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")

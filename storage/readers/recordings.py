@@ -409,11 +409,12 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
     archive, run, _ = _run_with_cubes(*named)
     parts = run.products.get("mosaic", "").split("/")  # stages/STAGE/KEY/mosaic.zarr
     params = try_manifest(archive.ref(*parts[1:3]).path)[0]["params"] if len(parts) > 3 else {}
-    grid = params.get("grid", {})
+    frame = params.get("frame", {})
+    grid = frame.get("grid", {})
     if not {"height", "width"} <= set(grid):
         return RecordedRun(run, None, None)
     shape = int(grid["height"]), int(grid["width"])
-    return RecordedRun(run, shape, geobox_of_record(params, shape))
+    return RecordedRun(run, shape, geobox_of_record(frame, shape))
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:
