@@ -41,9 +41,9 @@ $(BIN)/.ok: pyproject.toml constraints.txt | $(BIN)/.pip $(if $(filter-out setup
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey $(SURVEY) --out $(ARCHIVE)
 
-# Runs a survey through a fake rig, and compares it with the simulated one. One minute.
+# Runs a survey through a fake rig, and compares it with the simulated one.
 survey-rig: $(BIN)/.ok-dev
-	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/flows/tasks/test_survey_rig.py -k lines_of_the_simulation
 
 # Property tests draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws new ones.
 # Tests start hundreds of processes, so they write bytecode even if the environment disables it.

@@ -165,7 +165,7 @@ class Stores:
         *,
         name: str = "",  # of the survey, for names of Prefect's tasks
         dry: bool = False,
-        watch: Callable[[str, str, float], None] = lambda title, state, done: None,
+        watch: Callable[[str, str, str, float], None] = lambda *_: None,  # name, title, state and progress (0..1)
         log: Callable[[str], None] = lambda text: None,
         finish: Callable[[Path], None] = lambda folder: None,  # called with the folder of each store that was built
     ) -> None:
@@ -217,7 +217,7 @@ class Stores:
             self.restore(ref)
 
         def build(folder: Path) -> None:
-            request.build(Output(folder, partial(self._watch, made.title, "running"), spool))
+            request.build(Output(folder, partial(self._watch, made.name, made.title, "running"), spool))
             self._finish(folder)
             self.bytes_written += bytes_in(spool)
 
@@ -229,25 +229,25 @@ class Stores:
 
     def _recorded(self, request: Request, get: Callable[[Request], tuple[Ref, bool]]) -> Ref:
         """Return the store that ``get`` finds or makes, and record time and memory of its making."""
-        title = request.stage.title
+        name, title = request.stage.name, request.stage.title
         with suppress(OSError):  # Linux: reset the peak
             Path("/proc/self/clear_refs").write_text("5")
         wall_s, cpu_s = time.perf_counter(), time.process_time()
-        self._watch(title, "running", 0.0)
+        self._watch(name, title, "running", 0.0)
         try:
             ref, built = get(request)
         except BaseException:
-            self._watch(title, "failed", 0.0)
+            self._watch(name, title, "failed", 0.0)
             raise
         spent_s = time.perf_counter() - wall_s
         size = self.archive.stored_bytes(ref)
-        row = Row(request.stage.name, ref, "cached")
+        row = Row(name, ref, "cached")
         row = replace(row, bytes_in=sum(map(self.archive.stored_bytes, request.inputs)), bytes_out=size)
         if built:
             cpu_s = time.process_time() - cpu_s
             row = replace(row, state="ran", wall_s=spent_s, cpu_s=cpu_s, peak_rss_bytes=peak_bytes())
         self.rows[row.name] = row
-        self._watch(title, row.state, 1.0)
+        self._watch(name, title, row.state, 1.0)
         self._log(f"{title}: {f'{spent_s:.1f} s' if built else 'found'}, {size / 1e6:.1f} MB, {ref.uri}")
         return ref
 

@@ -23,7 +23,7 @@ def tidy_up(folder: Path) -> None:
 class Observer:
     """Callbacks that report what a survey does."""
 
-    watch: Callable[[str, str, float], None] = lambda stage, state, done: None  # progress of a stage, 0..1
+    watch: Callable[[str, str, str, float], None] = lambda *_: None  # name, title, state and progress (0..1) of a stage
     note: Callable[[str], None] = lambda text: None  # assumptions and warnings
     say: Callable[[str], None] = lambda text: None  # state of a device before its first line
     log: Callable[[str], None] = lambda text: None  # one line for each finished stage

@@ -128,7 +128,7 @@ class StageProgress:
 
     def __init__(self, console: Console, titles: Mapping[str, str] | None = None) -> None:
         self.console = console
-        self.titles = titles or {}
+        self.titles = dict(titles or {})
         self._tasks: dict[str, TaskID] = {}
         self._printed: dict[str, float] = {}
         self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is
@@ -171,8 +171,9 @@ class StageProgress:
             time_left = "" if left is None else f", {format_seconds(left)} left"
             self.console.print(f"{title}: {done:.0%} {escape(text)}".rstrip() + time_left, soft_wrap=True)
 
-    def watch(self, stage: str, state: str, done: float) -> None:
-        """Show the progress of a running stage, or its end: ran, cached, skipped, failed."""
+    def watch(self, stage: str, title: str, state: str, done: float) -> None:
+        """Show the progress of a running stage by its title, or its end: ran, cached, failed."""
+        self.titles[stage] = title
         running = state == "running"
         self.show(stage, done, "" if running else state, ended=not running)
 

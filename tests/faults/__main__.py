@@ -26,7 +26,6 @@ PLACES = {
     "many_writers": "many_writers:rows",
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
-    "checksummed_flips": "checksummed_flips:rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 

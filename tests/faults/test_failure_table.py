@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import pytest
+import torch
 
-from tests.faults import checksummed_flips, disk_full, lost_lines, many_writers, mutated_files, small_survey
+from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
+from spectralzoom.models.weights.files import describe_weights, load_weights
+from spectralzoom.pipeline.errors import WeightsError
+from tests.faults import disk_full, lost_lines, many_writers, mutated_files, small_survey
 from tests.faults.cube_files import FORMATS
 from tests.faults.fault_table import HEADINGS, Row, run_table
 from tests.faults.small_survey import Subject, stored
@@ -61,12 +67,34 @@ def test_a_killed_capture_loses_no_line(tmp_path: Path) -> None:
     assert set(found.lost) == {0}
 
 
-def test_flipped_bits_in_weights_and_checkpoints_are_refused(tmp_path: Path) -> None:
-    """Each flip is refused in one message, or the file is read with its written values."""
-    found = checksummed_flips.flip_bits(150, tmp_path, seed=1)
-    assert found.wrong == []
-    assert found.tried == found.refused + found.same == 150
-    assert found.refused > 100
+def _weights(path: Path) -> object:
+    tensors = load_weights(path).segmenter.state_dict()
+    return describe_weights(path).key, {name: value.numpy().tobytes() for name, value in tensors.items()}
+
+
+def _checkpoint(path: Path) -> object:
+    facts, tensors = load_checkpoint(path, "run") or ({}, {})
+    return facts, {name: value.numpy().tobytes() for name, value in tensors.items()}
+
+
+@pytest.mark.parametrize("read", [_weights, _checkpoint])
+def test_flipped_bits_in_weights_and_checkpoints_are_refused(tmp_path: Path, weights: Path, read: Any) -> None:
+    """Each flip, half of them in the header, is refused in one message, or the file is read with its written values."""
+    path = tmp_path / "flipped.safetensors"
+    save_checkpoint(path, "run", {"course": {"step": 12, "seconds": 3.5}}, {"a": torch.randn(7, 5)})
+    whole = (weights if read is _weights else path).read_bytes()
+    path.write_bytes(whole)
+    written, chance, refused = read(path), Random(1), 0
+    for end in (8, *(8 + int.from_bytes(whole[:8], "little"), len(whole)) * 37):
+        flipped = bytearray(whole)
+        flipped[chance.randrange(end)] ^= 1 << chance.randrange(8)
+        path.write_bytes(flipped)
+        try:
+            assert read(path) == written
+        except WeightsError as error:
+            refused += 1
+            assert re.fullmatch(f"[^\n]*{path}[^\n]*", str(error))
+    assert refused > 50
 
 
 def test_mutated_headers_give_a_cube_or_one_error() -> None:

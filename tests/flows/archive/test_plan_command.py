@@ -21,7 +21,6 @@ from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.figures import format_seconds
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, Flags, Survey
 from tests.flows.conftest import be_version, python
 
@@ -123,28 +122,18 @@ def test_a_plan_imports_no_heavy_library() -> None:
     assert not heavy & set(python(code).stdout.split())
 
 
-def test_a_damaged_store_blocks_its_stage(settings: Settings, archive: Path, tmp_path: Path) -> None:
-    """The reason is the archive's own message; a file in place of an archive is refused."""
-    store = Archive(archive).refs("rectify_fine")[0]
-    (store.path / "lines.json").unlink()
+def test_a_damaged_store_blocks_its_stage(settings: Settings, archive: Path, tmp_path: Path, survey_png: Any) -> None:
+    """The reason is the archive's own message, with which a survey stops; a file in place of an archive is refused."""
+    (path,) = archive.glob("stages/score/*/plan.json")
+    path.write_text(path.read_text().replace("1", "2"))
     planned = _plan(settings, archive)
-    assert planned["rectify_fine"].state == "blocked"
-    assert "gc --damaged" in planned["rectify_fine"].why
-    assert (planned["segment"].state, planned["segment"].key) == ("to run", None)
+    assert (planned["score"].state, planned["segment"].state, planned["segment"].key) == ("blocked", "to run", None)
+    with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*gc --damaged") as stopped:
+        survey_png(archive)
+    assert planned["score"].why == str(stopped.value)
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
         _plan(settings, tmp_path / "file")
-
-
-@pytest.mark.parametrize("change", [('"', "x"), ("1", "2")], ids=["no JSON", "another number"])
-def test_damaged_plan_stops_survey(settings: Settings, archive: Path, survey_png: Any, change: tuple[str, str]) -> None:
-    """The survey stops there with one message."""
-    (path,) = archive.glob("stages/score/*/plan.json")
-    path.write_text(path.read_text().replace(*change))
-    score = _plan(settings, archive)["score"]
-    assert (score.state, "plan.json has changed" in score.why) == ("blocked", True)
-    with pytest.raises(IncompleteStoreError, match=r"plan\.json has changed.*gc --damaged"):
-        survey_png(archive)
 
 
 def test_a_raster_has_estimates(settings: Settings, tmp_path: Path) -> None:
