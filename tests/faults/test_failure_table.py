@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -79,12 +78,12 @@ def _checkpoint(path: Path) -> object:
 
 @pytest.mark.parametrize("read", [_weights, _checkpoint])
 def test_flipped_bits_in_weights_and_checkpoints_are_refused(tmp_path: Path, weights: Path, read: Any) -> None:
-    """Each flip, half of them in the header, is refused in one message, or the file is read with its written values."""
+    """Each flip, every other one in the header, is refused in one message, or reading gives the written values."""
     path = tmp_path / "flipped.safetensors"
     save_checkpoint(path, "run", {"course": {"step": 12, "seconds": 3.5}}, {"a": torch.randn(7, 5)})
     whole = (weights if read is _weights else path).read_bytes()
     path.write_bytes(whole)
-    written, chance, refused = read(path), Random(1), 0
+    written, chance, refused = read(path), Random(1), list[str]()
     for end in (8, *(8 + int.from_bytes(whole[:8], "little"), len(whole)) * 37):
         flipped = bytearray(whole)
         flipped[chance.randrange(end)] ^= 1 << chance.randrange(8)
@@ -92,9 +91,9 @@ def test_flipped_bits_in_weights_and_checkpoints_are_refused(tmp_path: Path, wei
         try:
             assert read(path) == written
         except WeightsError as error:
-            refused += 1
-            assert re.fullmatch(f"[^\n]*{path}[^\n]*", str(error))
-    assert refused > 50
+            refused.append(str(error))
+    assert len(refused) > 50
+    assert all(str(path) in words and "\n" not in words for words in refused)
 
 
 def test_mutated_headers_give_a_cube_or_one_error() -> None:
