@@ -29,7 +29,7 @@ PLACES = {  # function, its call before which a survey with a map is stopped, an
     "in the publication": ("spectralzoom.storage.store:publish", 1, signal.SIGKILL),
 }
 SECOND_PASS = {
-    "spectralzoom.storage.store:Archive.spool_folder": 2,
+    "spectralzoom.flows.stages.capture:SweepRecorder.take": 2,
     "spectralzoom.storage.arrays.spool:Spool.append": 20,
 }  # as PLACES
 KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`

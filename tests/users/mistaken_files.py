@@ -8,7 +8,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import rasterio
 import scipy.io
 import zarr
 from PIL import Image
@@ -36,7 +35,6 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
     for name in ("a field.png", "Rüben.png", "two\nlines.png"):
         shutil.copy(here / "field.png", here / name)
     Image.fromarray(picture[:1, :1]).save(here / "one_px.png")
-    Image.fromarray(np.full_like(picture, 90)).save(here / "constant.png")
     (here / "cut.png").write_bytes((here / "field.png").read_bytes()[:200])
     (here / "text.png").write_text("this is a text\n")
     (here / "field.jp2").write_bytes(b"\0\0\0\x0cjP  ")
@@ -56,9 +54,6 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
         "cube": cube,
         "band_first": np.moveaxis(cube, 2, 0),
         "float_labels": np.full(CUBE[:2], 0.5),
-        "negative": cube - 0.5,
-        "percent": cube * 100,
-        "scaled": (cube * 10000).astype(np.uint16),
         "holes": holes,
         "nothing": np.full(CUBE, np.nan),
         "filled": np.where(cube > 0.9, 1e30, cube),
@@ -80,17 +75,10 @@ def _containers(here: Path, cube: np.ndarray) -> None:
     scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
     scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})
     scipy.io.savemat(here / "two_cubes.mat", {"north": cube, "south": cube})
-    with h5py.File(here / "seven.mat", "w") as file:
-        file["cube"] = cube.T  # as MATLAB writes it
     (here / "cut.mat").write_bytes((here / "one_cube.mat").read_bytes()[:600])
-    header = "ENVI\nsamples = 16\nlines = 12\nbands = 5\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
-    (here / "alone.hdr").write_text(header)
-    (here / "micro.hdr").write_text(header + "wavelength = {0.46, 0.55, 0.64, 0.7, 0.8}\n")
-    cube.tofile(here / "micro.img")
-    with rasterio.open(
-        here / "geo.tif", "w", "GTiff", 16, 12, 5, "EPSG:25832", rasterio.Affine(1, 0, 5e5, 0, -1, 5e6), "float32"
-    ) as file:
-        file.write(np.moveaxis(cube, 2, 0))
+    (here / "alone.hdr").write_text(
+        "ENVI\nsamples = 16\nlines = 12\nbands = 5\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
+    )
     old = zarr.create_group(here / "old.zarr", zarr_format=2)
     old.create_array("0", data=cube)
     zarr.create_group(here / "hollow.zarr")

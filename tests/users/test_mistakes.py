@@ -142,19 +142,12 @@ WORKS = {  # address, wavelengths, shape (y, x, band), and the expected note
     "umlauts": ("Rüben.png", None, (24, 32, 3), ""),
     "line ends in a name": ("two\nlines.png", None, (24, 32, 3), ""),
     "one pixel": ("one_px.png", None, (1, 1, 3), ""),
-    "constant picture": ("constant.png", None, (24, 32, 3), ""),
-    "negative reflectance": ("negative.npy", NM, (12, 16, 5), ""),
-    "percent": ("percent.npy", NM, (12, 16, 5), ""),
-    "scaled whole numbers": ("scaled.npy", NM, (12, 16, 5), ""),
     "some NaN": ("holes.npy", NM, (12, 16, 5), "missing samples: 60 of 960"),
     "two axes": ("plane.npy", "550", (12, 16, 1), ""),
     "one cube beside vectors": ("one_cube.mat", NM, (12, 16, 5), r"array cube of the file, which also has wl \(1, 5\)"),
     "nm beside it": ("with_nm.mat", None, (12, 16, 5), "the array wavelengths, without a unit, read by their size"),
-    "MATLAB 7.3": ("seven.mat", NM, (12, 16, 5), ""),
     "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
     "Zarr v2 of another tool": ("old.zarr", NM, (12, 16, 5), "dims have no names"),
-    "micrometres in a header": ("micro.hdr", None, (12, 16, 5), "micrometre|micro"),
-    "GeoTIFF": ("geo.tif", NM, (12, 16, 5), ""),
 }
 
 

@@ -109,12 +109,16 @@ def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
 
 
 def test_the_class_map_covers_the_area_without_its_hole(kept_to: tuple[Path, Published]) -> None:
-    """Pixels there have a class and a confidence; all other pixels have neither."""
+    """Pixels there have a class, a confidence, an accuracy, and probabilities for the next visit; others have none."""
     found = drawn(*kept_to)
     classed = found.classes != UNLABELLED
     assert (classed != inside(AREA)).sum() <= 2 * AREA.length / 100  # on the border only, if at all
-    assert np.array_equal(classed, np.isfinite(found.confidence))
     assert not classed[inside(NO_GO)].any()
+    out, published = kept_to
+    values, age, _ = ProbabilityStore(out / published.receipt["products"]["class_probabilities"]).read()
+    for known in (found.confidence, values[..., 0], age):
+        assert np.array_equal(np.isfinite(known), classed)
+    assert published.receipt["accuracy"]["pixels"] == classed.sum()
 
 
 def test_patches_outside_or_in_a_hole_are_never_chosen(kept_to: tuple[Path, Published]) -> None:
@@ -144,11 +148,6 @@ def test_lines_outside_are_left_out(kept_to: tuple[Path, Published], opened: Ope
     assert kept_to[1].receipt["savings"]["capture_s"]["full"] == pytest.approx(kept.full_s)
 
 
-def test_accuracy_counts_the_pixels_of_the_area(kept_to: tuple[Path, Published]) -> None:
-    """The number of evaluated pixels is the number of pixels with a class."""
-    assert kept_to[1].receipt["accuracy"]["pixels"] == (drawn(*kept_to).classes != UNLABELLED).sum()
-
-
 def test_plots_are_listed_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> None:
     """Fractions, pixels and confidence are those of the map; a plot outside of the field has 0 pixels."""
     _, published = kept_to
@@ -166,15 +165,6 @@ def test_plots_are_listed_in_receipt_and_csv(kept_to: tuple[Path, Published]) ->
     assert (rows["away"]["pixels"], rows["away"]["confidence"]) == (0, None)
     assert "plots.csv" in published.receipt["products"]
     assert "north" in (published.folder / "report.html").read_text(encoding="utf-8")
-
-
-def test_excluded_pixels_have_no_class_probabilities(kept_to: tuple[Path, Published]) -> None:
-    """The prior map for the next visit has neither class nor age where the zones exclude pixels."""
-    out, published = kept_to
-    values, age, _ = ProbabilityStore(out / published.receipt["products"]["class_probabilities"]).read()
-    classed = drawn(*kept_to).classes != UNLABELLED
-    assert np.array_equal(np.isfinite(values[..., 0]), classed)
-    assert np.array_equal(np.isfinite(age), classed)
 
 
 def test_a_visit_with_zones_keeps_the_prior_map_outside_of_them(

@@ -65,30 +65,18 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     ]
 
 
-def test_a_first_visit_exports_no_changes(visited: list[Exported]) -> None:
-    """There is no image of changes."""
-    assert "changed_from" not in visited[0].answer["files"]
-
-
 def test_images_have_the_values_of_the_store(visited: list[Exported]) -> None:
-    """Old classes have names; their image is cloud-optimised."""
-    later = visited[1]
+    """Old classes have names and the grid of the class map; a first visit has none."""
+    first, later = visited
+    assert "changed_from" not in first.answer["files"]
     store = later.store("ground_map" if "ground_map" in later.receipt["products"] else "class_probabilities")
     assert is_cog(later.file("changed_from"))
     np.testing.assert_array_equal(later.image("changed_from"), store["changed_from"].values)
     assert (store["changed_from"].values != 255).any()
-    with rasterio.open(later.file("changed_from")) as file:
-        names = store.attrs["class_names"]
+    names = store.attrs["class_names"]
+    with rasterio.open(later.file("changed_from")) as file, rasterio.open(later.file("class_map")) as drawn:
         assert [file.tags(1)[f"CLASS_{number}"] for number in range(len(names))] == names
-
-
-def test_images_have_the_grid_of_the_class_map(visited: list[Exported]) -> None:
-    """CRS, transform and shape of the old classes are those of the class map."""
-    grids = []
-    for key in ("class_map", "changed_from"):
-        with rasterio.open(visited[1].file(key)) as file:
-            grids.append((file.crs, file.transform, file.shape))
-    assert grids[0] == grids[1]
+        assert (file.crs, file.transform, file.shape) == (drawn.crs, drawn.transform, drawn.shape)
 
 
 def test_receipt_and_page_have_the_hectares(visited: list[Exported]) -> None:

@@ -120,22 +120,6 @@ def test_new_weights_add_runs_and_keep_old_ones(archive: Path, other: Path, repr
     assert verify(archive) == DONE
 
 
-def test_a_run_that_gets_its_accuracy_remains_a_prior_map(
-    archive: Path, other: Path, reprocess: Reprocess, scene_files: Path, survey_png: Survey
-) -> None:
-    """Repeating a survey that was killed before its accuracy publishes no other run."""
-    first = Archive.open(archive).runs()[0]
-    asked: list[Settings] = []
-
-    def survey(settings: Settings, console: Console) -> Path:
-        asked.append(settings)
-        return first
-
-    survey_png(archive, scene=str(scene_files / "scene.png"), labels=None, budget="0.8", prior=first.name, visit="2")
-    reprocess(archive, survey=survey, weights=other)
-    assert asked[-1].prior == first.name
-
-
 def test_a_new_stage_version_runs_again(archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage and those after it run again; no line is captured again."""
     light = _captures(archive)

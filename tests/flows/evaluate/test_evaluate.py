@@ -39,7 +39,7 @@ TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=("entropy",))
 
 
 def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
-    """Rows hold the mean over the seeds and its spread; the folder holds evaluation.json alone."""
+    """Rows hold the mean over the seeds, its spread and costs; the folder holds evaluation.json alone."""
     request, content = judged
     keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
     policies = [(policy, fraction) for policy in ("entropy", "random") for fraction in (0.25, 0.5)]
@@ -52,14 +52,8 @@ def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
     assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
     assert len(row["by_seed"]) == 2
-
-
-def test_costs_are_relative_to_all_patches(judged: Judged):
-    """More patches cost more."""
-    _, content = judged
-    cost = {fraction: _row(content, "entropy", fraction)["cost"] for fraction in (0.25, 0.5)}
-    for column in ("patches", "multiply_adds"):
-        assert cost[0.25][column]["done"] < cost[0.5][column]["done"]
+    for column in ("patches", "multiply_adds"):  # more patches cost more
+        assert row["cost"][column]["done"] < _row(content, "entropy", 0.5)["cost"][column]["done"]
     assert _row(content, "all", 1.0)["cost"]["patches"]["ratio"] == 1.0
 
 

@@ -57,9 +57,13 @@ def raw_uris(archive: Archive) -> set[str]:
 
 
 def test_the_next_survey_clears_raw_lines(archive: Archive, survey_png: Survey) -> None:
-    """The archive is valid, with the same condensed lines; a reader of raw lines is referred to them."""
+    """The archive is valid, with the same condensed lines; a reader of raw lines is referred to them.
+
+    A survey that keeps them captures them again, and a later one that does not leaves them.
+    """
     before = {name: one.values for name, one in spectralzoom.open(archive.root).latest.lines.items()}
-    assert len(raw_uris(archive)) == 2
+    there = raw_uris(archive)
+    assert len(there) == 2
     survey_png(archive.root, accuracy=False)
     assert raw_uris(archive) == set()
     assert problems(archive.root) == []
@@ -68,22 +72,9 @@ def test_the_next_survey_clears_raw_lines(archive: Archive, survey_png: Survey) 
         np.testing.assert_array_equal(again.lines[name].values, values)
     with pytest.raises(spectralzoom.Error, match="`lines` has their signal"):
         _ = again.sweeps
-
-
-def test_raw_lines_stay_while_any_run_keeps_them(archive: Archive, survey_png: Survey) -> None:
-    """A later survey that does not keep them leaves them; cleared ones are captured again for a run that does."""
-    there = raw_uris(archive)
     for keep in ("raw", "signal"):
         survey_png(archive.root, keep=keep, accuracy=False)
         assert raw_uris(archive) == there
-
-
-def test_cleared_lines_are_captured_again_for_a_run_that_keeps_them(archive: Archive, survey_png: Survey) -> None:
-    """They have the same address, and the archive is valid."""
-    there = raw_uris(archive)
-    survey_png(archive.root, accuracy=False)
-    survey_png(archive.root, keep="raw", accuracy=False)
-    assert raw_uris(archive) == there
     assert problems(archive.root) == []
 
 

@@ -14,7 +14,6 @@ from spectralzoom.flows.publish.findings import changed_hectares
 from spectralzoom.flows.publish.receipt_table import finding_rows, format_score
 from spectralzoom.models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from spectralzoom.models.weights.files import MAP_SCORES, TRAINED_ON, _add_part, load_weights, save_weights, with_record
-from spectralzoom.pipeline.errors import WeightsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import NoPlace
 from spectralzoom.storage.arrays.class_maps import ClassMap
@@ -128,10 +127,3 @@ def test_maps_outside_of_the_calibration_have_no_expected_score(
     assert not unlike or receipt["unlike"]["fraction"] == 1
     beyond = any("outside of the training data" in note for note in receipt["settings"]["notes"])
     assert beyond == ("wavelengths" in flags)
-
-
-def test_a_malformed_score_table_is_refused(survey_png: Survey, weights: Path, tmp_path: Path):
-    """The message names the file and the cause."""
-    path = _judged(weights, tmp_path, SCORES.as_dict() | {"error": [[0.1]]})
-    with pytest.raises(WeightsError, match=r"cannot read .*judged\.safetensors: .*scans"):
-        survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1")
