@@ -29,7 +29,7 @@ LARGE = 64 << 20  # bytes: more than a survey needs
 KINDS = ("spool", "segment", "segment manifest", "run")  # of written files
 FULL = "disk is full"
 # Functions of this project that meet a full disk.
-WHERE = {"spool": "capture._capture", "manifest": "manifests.write_manifest"}
+WHERE = {"spool": "capture.take", "manifest": "store.write_manifest"}
 
 
 @dataclass
