@@ -26,10 +26,10 @@ SYNCED: dict[str, Any] = {"place": "spectralzoom.storage.store:sync", "call": 60
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
     "in the controls": ("spectralzoom.flows.stages.evaluate:mixed", 1, signal.SIGTERM),
     "before the publication": ("spectralzoom.flows.publish.publishing:publish_run", 1, signal.SIGKILL),
-    "in the publication": ("spectralzoom.storage.store:publish", 1, signal.SIGKILL),
+    "in the publication": ("spectralzoom.storage.store:Archive.manifest_hashes", 2, signal.SIGKILL),
 }
 SECOND_PASS = {
-    "spectralzoom.flows.stages.capture:SweepRecorder.take": 2,
+    "spectralzoom.storage.arrays.spool:Spool.open": 2,
     "spectralzoom.storage.arrays.spool:Spool.append": 20,
 }  # as PLACES
 KILLS = int(os.environ.get("KILLS", "0"))  # more moments, for `make soak`
