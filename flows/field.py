@@ -6,12 +6,11 @@ import zlib
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.frame import Bands, FieldFrame, FieldLabels
+from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView
 from spectralzoom.flows.settings.survey_settings import RECORDED, RIG, Settings
 from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
@@ -101,20 +100,15 @@ class Field:
         return None if self.outside else self.described.map_scores
 
     @property
-    def light_key(self) -> dict[str, Any]:
-        """Return the parameters of the captured light, without sweeps and effects."""
-        return light_key(self.settings, self.scene, self.source, self.name)
+    def view(self) -> FieldView:
+        """Return what the camera sees."""
+        return view_of(self.settings, self.scene, self.source, self.name)
 
     @property
     def frame(self) -> FieldFrame:
         """Return the frame of all images of the survey."""
         bands = self.scene.wavelength_nm, self.scene.fwhm_nm
         return FieldFrame(self.grid, self.camera.ifov_rad, *bands, self.scene.missing, self.scene.geobox)
-
-    @property
-    def bands(self) -> Bands:
-        """Return the bands of the scene."""
-        return Bands(self.scene.wavelength_nm, self.scene.fwhm_nm)
 
     @property
     def ground_grid(self) -> GroundGrid | None:
@@ -233,9 +227,9 @@ def _source(
     return SimulatedField(simulated)
 
 
-def light_key(settings: Settings, scene: RasterScene, source: FieldSource, name: str) -> dict[str, Any]:
-    """Return the parameters of the light of a field ``name``, without sweeps and effects."""
-    return {
+def view_of(settings: Settings, scene: RasterScene, source: FieldSource, name: str) -> FieldView:
+    """Return what the camera sees of a field ``name``."""
+    light = {
         "source": source.name,
         "scene": scene.key,
         "seed": noise_seed(settings),
@@ -243,6 +237,7 @@ def light_key(settings: Settings, scene: RasterScene, source: FieldSource, name:
         "visit": settings.visit,
         **source.key(name),
     }
+    return FieldView(settings.camera, scene.wavelength_nm, scene.fwhm_nm, light)
 
 
 def noise_seed(settings: Settings) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
+from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import georeference_record
 from spectralzoom.pipeline.once import Once
@@ -18,11 +20,13 @@ from spectralzoom.storage.store import array_digest
 
 
 @dataclass(frozen=True)
-class Bands:
-    """Bands of a camera, (band,) each."""
+class FieldView:
+    """What a camera sees of a field: the camera, its bands, and all that the light depends on but sweeps and effects."""
 
-    wavelength_nm: NDArray[np.float64]
+    camera: LineCamera
+    wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None
+    light: Mapping[str, Any]
 
 
 @dataclass(frozen=True)

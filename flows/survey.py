@@ -165,9 +165,7 @@ def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
         stores,
         effects,
         request=SweepRequest.of(plan.passes.coarse, field.camera, settings.cost),
-        light=field.light_key,
-        camera=field.camera,
-        bands=field.bands,
+        view=field.view,
         source=field.source,
         pool=settings.pool,
     )
@@ -209,9 +207,7 @@ def _second_pass(
         attention,
         effects,
         request=SweepRequest.of(sweeps, field.camera, settings.cost, after_s=plan.passes.coarse_s),
-        light=field.light_key,
-        camera=field.camera,
-        bands=field.bands,
+        view=field.view,
         source=field.source,
         pool=settings.pool,
     )

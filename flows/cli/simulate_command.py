@@ -10,8 +10,7 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.markup import escape
 
-from spectralzoom.flows.field import light_key, make_source
-from spectralzoom.flows.frame import Bands
+from spectralzoom.flows.field import make_source, view_of
 from spectralzoom.flows.publish.receipt_table import print_effects
 from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
 from spectralzoom.flows.settings.load import load_settings
@@ -115,9 +114,7 @@ def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequenc
         stores,
         effects,
         request=SweepRequest.of(sweeps, settings.camera, settings.cost),
-        light=light_key(settings, scene, source, settings.name or Path(scene.name).stem),
-        camera=settings.camera,
-        bands=Bands(scene.wavelength_nm, scene.fwhm_nm),
+        view=view_of(settings, scene, source, settings.name or Path(scene.name).stem),
         source=source,
         pool=settings.pool,
     )

@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from itertools import islice
-from typing import Any
 
 import numpy as np
 
-from spectralzoom.flows.frame import Bands
+from spectralzoom.flows.frame import FieldView
 from spectralzoom.flows.stage import Output, Unkeyed, stage
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
 from spectralzoom.flows.tasks.scene import FieldSource
@@ -50,14 +49,12 @@ def capture_coarse(
     effects: Ref | None,
     *,
     request: SweepRequest,
-    light: Mapping[str, Any],
-    camera: LineCamera,
-    bands: Bands,
+    view: FieldView,
     source: Unkeyed[FieldSource],
     pool: Unkeyed[WorkerPool],
 ) -> None:
-    """Capture the first pass, or the uniform scan; ``light`` identifies what the source shows."""
-    SweepRecorder(out, effects, light, camera, bands, pool).take(source, request)
+    """Capture the first pass, or the uniform scan; ``view`` identifies what the source shows."""
+    SweepRecorder(out, effects, view, pool).take(source, request)
 
 
 @stage("capture of requested lines", version=RAW_VERSION, product=RAW, retries=2, made_by=MADE_BY)
@@ -67,14 +64,12 @@ def capture_fine(
     effects: Ref | None,
     *,
     request: SweepRequest,
-    light: Mapping[str, Any],
-    camera: LineCamera,
-    bands: Bands,
+    view: FieldView,
     source: Unkeyed[FieldSource],
     pool: Unkeyed[WorkerPool],
 ) -> None:
     """Capture the second pass, which ``attention`` requests."""
-    SweepRecorder(out, effects, light, camera, bands, pool).take(source, request)
+    SweepRecorder(out, effects, view, pool).take(source, request)
 
 
 @dataclass(frozen=True)
@@ -83,15 +78,13 @@ class SweepRecorder:
 
     out: Output
     effects: Ref | None  # of a simulated source
-    light: Mapping[str, Any]
-    camera: LineCamera
-    bands: Bands
+    view: FieldView
     pool: WorkerPool
 
     def take(self, source: FieldSource, request: SweepRequest) -> None:
         """Capture the sweeps one after the other, and write the record of the source beside their cubes."""
         lines = sum(one.lines for one in request.sweeps)
-        found = SignalStatistics(len(self.bands.wavelength_nm), lines * self.camera.samples)
+        found = SignalStatistics(len(self.view.wavelength_nm), lines * self.view.camera.samples)
         before = 0
         self.out.report(0.0)  # before the first line, which takes a rig some time
         self.out.spool.mkdir(parents=True, exist_ok=True)
@@ -112,10 +105,10 @@ class SweepRecorder:
         """Write the lines of a sweep into spool and cube, one by one."""
         references = source.references(sweep)
         manifest = None if self.effects is None else load_manifest(self.effects)
-        bands = self.bands.wavelength_nm, self.bands.fwhm_nm
+        bands = self.view.wavelength_nm, self.view.fwhm_nm
         header = SweepHeader(sweep, references, *bands, source.name, simulation=manifest)
-        of_spool = {"sweep": asdict(sweep), "camera": asdict(self.camera), **self.light}
-        statistics = LineStatistics(found, sweep, references, self.camera)
+        of_spool = {"sweep": asdict(sweep), "camera": asdict(self.view.camera), **self.view.light}
+        statistics = LineStatistics(found, sweep, references, self.view.camera)
         with (
             Spool.open(self.out.spool, *references.dark.shape, header=of_spool, name=sweep.name) as spool,
             RawCubeWriter(self.out.path / f"{sweep.name}.zarr", header, statistics.add) as cube,
