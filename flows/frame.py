@@ -21,7 +21,7 @@ from spectralzoom.storage.store import array_digest
 
 @dataclass(frozen=True)
 class FieldView:
-    """What a camera sees of a field: the camera, its bands, and what the light depends on besides sweeps and effects."""
+    """What a camera sees of a field: its bands, and what the light depends on besides sweeps and effects."""
 
     camera: LineCamera
     wavelength_nm: NDArray[np.float64]  # (band,)
