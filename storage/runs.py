@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError, list_some
 from spectralzoom.storage.store import (
+    CAPTURED,
     LATEST,
     MANIFEST,
     RESTS_ON,
@@ -42,7 +43,7 @@ RECEIPT = "receipt.json"
 YEARS = range(1900, 2201)
 _DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
-LINES = re.compile(r"stages/(capture|condense(_fine)?)/.*")
+LINES = re.compile(rf"stages/({CAPTURED}|condense(_fine)?)/.*")
 DAY_S = 86400.0
 ONLY_COPY = "damaged, and not simulated: restore it from a copy; --raw-too removes it, to read its source again"
 IN_USE = "the archive is in use: run gc again when it is free"
@@ -364,18 +365,19 @@ def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str) -> bool:
 
 
 def _origin(known: Mapping[str, Mapping[str, Any]], uri: str) -> tuple[bool, Sequence[str]]:
-    """Return whether a store holds lines or pixels that were not simulated, and else its inputs.
+    """Return whether a store holds lines or pixels that were not simulated, and its inputs.
 
     Of a damaged or missing store the runs that name it say whether its lines were simulated, and which they were.
     """
+    stage = uri.split("/")[1]
     store = known.get(uri)
     if store is not None and store["problem"] is None:
-        is_original = LINES.fullmatch(uri) is not None and "source" in store["params"]
-        return is_original and store["params"]["source"] != "sim", () if is_original else store["inputs"]
-    if not LINES.fullmatch(uri):
-        return False, ()
+        light = _as(dict, store["params"].get("light"))
+        is_raster = stage == "rectify" and not store["inputs"]
+        return is_raster or (stage == CAPTURED and light.get("source") != "sim"), store["inputs"]
     runs = [one for one in known.values() if uri in one[RESTS_ON] and one["settings"]]
-    if runs and all(one["settings"].get("source") == "sim" for one in runs):
-        return False, ()
-    raw = [name for one in runs for name in one[RESTS_ON] if name.startswith("stages/capture/") and name != uri]
-    return uri.startswith("stages/capture/") or not raw, raw
+    sources = {one["settings"].get("source") for one in runs}
+    if stage == "rectify" or not LINES.fullmatch(uri):
+        return stage == "rectify" and "raster" in sources, ()
+    raw = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/") and name != uri]
+    return sources != {"sim"} and (stage == CAPTURED or not raw), raw
