@@ -29,10 +29,9 @@ from spectralzoom.storage.store import (
     descendants,
     file_problem,
     inputs_first,
-    is_ahead,
     is_name,
+    lies_ahead,
     listed_bytes,
-    past_runs,
     problems_of,
     try_manifest,
     uri_of,
@@ -117,8 +116,8 @@ class Run:
 
     @property
     def in_future(self) -> bool:
-        """Return whether it was published later than now, by a clock that was wrong then or is wrong now."""
-        return is_ahead(self.folder.name) or is_ahead(self.created)
+        """Return whether it was published later than now, by a clock that is or was wrong."""
+        return lies_ahead(self.folder.name, self.created)
 
 
 def _as(kind: Any, value: Any) -> Any:
@@ -150,7 +149,8 @@ class Catalogue(NamedTuple):
     def read(cls, archive: Archive) -> Catalogue:
         """Read every manifest and receipt of an archive once; damaged ones have a ``problem``."""
         stores = {uri: one for uri, one in archive.manifests().items() if uri.startswith("stages/")}
-        return cls(stores, sorted(map(read_run, archive.runs()), key=lambda run: (run.created, run.folder.name)))
+        runs = [run for run in map(read_run, archive.runs()) if run.problem is None or run.folder.exists()]
+        return cls(stores, sorted(runs, key=lambda run: (run.created, run.folder.name)))
 
     def named_by(self, uri: str) -> list[Run]:
         """Return the runs that rest on a store."""
@@ -173,8 +173,7 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text
     if runs := [run for run in catalogue.runs if name == run.folder.name]:
         return runs[-1]
-    folders = past_runs(run.folder for run in catalogue.runs)
-    past = [run for run in catalogue.runs if run.folder in folders]
+    past = [run for run in catalogue.runs if not lies_ahead(run.folder.name, run.created, warns=True)]
     if past and name == LATEST:
         return past[-1]
     if name != text:
@@ -289,7 +288,8 @@ def clear_up(
         gone: list[Removal] = []
         for number, removal in enumerate(plan.removals):
             progress(removal, number / len(plan.removals))
-            gone += [removal] if archive.discard(removal.uri) else []  # else another process holds it
+            drop = archive.drop_leftover if removal.what == "leftover" else archive.discard
+            gone += [removal] if drop(removal.uri) else []  # else another process holds it
         for lock in entries(archive.root / ".locks"):
             if "-" in lock.name:  # of stores and runs, which nothing makes meanwhile
                 lock.unlink(missing_ok=True)

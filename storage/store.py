@@ -61,7 +61,6 @@ SECOND = len("20261120T101701")  # of a run's name: when it was begun
 CLOCK_S = 2.0  # clocks of two machines differ by less
 CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_PART_OF = re.compile(r"(\.[0-9a-f]{8})?(\.old)?\.part$")
 _BUCKET = re.compile(r"(?i)[a-z][a-z0-9+]+:(?=/)")
 _CHUNK = re.compile(r".*\.zarr/.*/c[/.][0-9/.]+")  # of an array; each has a crc32c (arrays.layout)
 
@@ -164,11 +163,8 @@ def read_table(path: Path) -> dict[str, Any]:
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Sync every file of a folder, and write the manifest with their sizes and hashes beside ``facts``."""
-    files = {}
-    for name in sorted(files_in(folder)):
-        sync(folder / name)
-        files[name] = [(folder / name).stat().st_size, sha256(folder / name)]
+    """Write the manifest of a folder, with sizes and hashes of its files beside ``facts``."""
+    files = {name: [one.st_size, sha256(folder / name)] for name, one in sorted(files_in(folder).items())}
     created = datetime.now(UTC).isoformat(timespec="milliseconds")
     (folder / MANIFEST).write_text(manifest_text({"created": created, **facts, "files": files}))
 
@@ -385,10 +381,13 @@ class Archive:
         """
         ref = self.ref(stage, key)
         with refusals(self.root, "read the archive"):
-            if not os.path.lexists(ref.path):
-                return None
-            check_store(ref.path)
-            return None if is_cleared(ref.path) else ref
+            try:
+                if os.path.lexists(ref.path):
+                    check_store(ref.path)
+            except (IncompleteStoreError, ArchiveError):
+                if os.path.lexists(ref.path):  # else gc has removed it meanwhile
+                    raise
+            return ref if os.path.lexists(ref.path) and not is_cleared(ref.path) else None
 
     def locate(self, address: str) -> Path:
         """Return the path on this machine of a store, a run, or a file in one, by its address.
@@ -479,14 +478,22 @@ class Archive:
         return held
 
     def discard(self, uri: str) -> bool:
-        """Remove a store, a run or a leftover; False where another process holds it, or the disk refuses."""
+        """Remove a store or a run; False where another process holds it, or the disk refuses."""
         path = self.root / uri
         with self._locked(_lock_name(path), wait=False) as held:
-            if held and is_cleared(path) and path in self._cleared_leftovers():
+            if held:
+                remove(path)
+        return held and not os.path.lexists(path)
+
+    def drop_leftover(self, uri: str) -> bool:
+        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
+        path = self.root / uri
+        with self._locked(_lock_name(path), wait=False) as held:
+            if held and is_cleared(path):
                 _delete_cleared(path)
-            elif held and path.name.endswith(OLD) and not (whole := path.with_name(path.name.split(".")[0])).exists():
-                path.rename(whole)  # a cleared store that was to be replaced
-            elif held:
+            elif held and path.name.endswith(OLD) and not _published(path).exists():
+                path.rename(_published(path))  # a cleared store, which was to be replaced
+            elif held and (path.name.endswith(PART) or path.parent.name == "spool"):
                 remove(path)
         return held and (is_cleared(path) or not os.path.lexists(path))
 
@@ -502,44 +509,38 @@ class Archive:
     def reclaim(self) -> list[str]:
         """Remove what killed processes left in this folder; return the addresses."""
         with refusals(self.root, "clear up the archive", every=True):
-            return [uri for uri in self.leftovers() if self.discard(uri)]
+            return [uri for uri in self.leftovers() if self.drop_leftover(uri)]
 
     def leftovers(self) -> list[str]:
         """Return unfinished folders, spools of published captures, and cleared stores with files; not those in use."""
-        places = [
-            *entries(self.root / "runs"),
-            *(one for stage in entries(self.root / "stages") for one in entries(stage)),
-        ]
-        found = [one for one in places if one.name.endswith(PART)] + self._cleared_leftovers()
+        stores = self._folders("stages")
+        found = [one for one in stores if is_cleared(one) and files_in(one).keys() - {MANIFEST, CLEARED}]
+        found += [one for one in self._places() if one.name.endswith(PART)]
         for spool in entries(self.root / "spool"):
-            stores = [stage / spool.name for stage in entries(self.root / "stages")]
-            if any(try_manifest(one)[1] is None and not is_cleared(one) for one in stores):
-                found.append(spool)
+            made = [one for one in stores if one.name == spool.name]
+            found += [spool] if any(try_manifest(one)[1] is None and not is_cleared(one) for one in made) else []
         return [one.relative_to(self.root).as_posix() for one in sorted(found) if self._is_free(_lock_name(one))]
 
     def replaced(self) -> set[str]:
         """Return the addresses of cleared stores that a killed process was replacing; `reclaim` puts them back."""
-        inside = [one for stage in entries(self.root / "stages") for one in entries(stage) if one.name.endswith(OLD)]
-        return {f"stages/{one.parent.name}/{_PART_OF.sub('', one.name)}" for one in inside}
+        old = (_published(one) for one in self._places() if one.name.endswith(OLD))
+        return {one.relative_to(self.root).as_posix() for one in old}
 
     def strays(self) -> list[Path]:
         """Return what lies among stores and runs and is neither."""
-        stages = [one for one in entries(self.root / "stages") if is_folder(one)]
         loose = [one for one in entries(self.root / "stages") if not is_folder(one)]
-        inside = [one for folder in (*stages, self.root / "runs") for one in entries(folder)]
         known = {*self._folders("stages"), *self._folders("runs")}
-        return loose + [one for one in inside if one not in known and not one.name.endswith(PART)]
+        return loose + [one for one in self._places() if one not in known and not one.name.endswith(PART)]
 
-    def _cleared_leftovers(self) -> list[Path]:
-        """Return the cleared stores that still have files."""
-        return [
-            one for one in self._folders("stages") if is_cleared(one) and files_in(one).keys() - {MANIFEST, CLEARED}
-        ]
+    def _places(self) -> list[Path]:
+        """Return what lies where stores and runs do."""
+        above = [*filter(is_folder, entries(self.root / "stages")), self.root / "runs"]
+        return [one for folder in above for one in entries(folder)]
 
     def _folders(self, kind: str) -> list[Path]:
-        """Return the folders of ``stages`` or ``runs`` that are no leftovers, with or without a manifest."""
-        above = [self.root / kind] if kind == "runs" else [*filter(is_folder, entries(self.root / kind))]
-        return [one for folder in above for one in entries(folder) if is_name(one.name) and _leads_on(one)]
+        """Return the folders of ``stages`` or ``runs`` that are no leftovers, and links, which count as damaged."""
+        inside = [one for one in self._places() if kind in (one.parent.name, one.parents[1].name)]
+        return [one for one in inside if is_name(one.name) and (one.is_symlink() or one.is_dir())]
 
     def _is_free(self, lock: str) -> bool:
         path = self.root / ".locks" / f"{lock}.lock"
@@ -591,15 +592,17 @@ class Archive:
                     ages[path] = (path / MANIFEST).lstat().st_mtime_ns
         return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
 
-    def past_runs(self) -> list[Path]:
-        """Return the published runs but those that lie in the future, which a warning names."""
-        return past_runs(self.runs())
+    def past_runs(self) -> Iterator[Path]:
+        """Yield the published runs, newest first; those of the future are left out, with a warning."""
+        for folder in reversed(self.runs()):
+            if not lies_ahead(folder.name, try_manifest(folder)[0]["created"], warns=True):
+                yield folder
 
     def run_folder(self, name: str) -> Path:
         """Return the folder of a published run by name, address or ``latest``. Raises NoRunError."""
         called = name.rstrip("/").removeprefix("runs/")
-        folders = self.past_runs() if called == LATEST else self.runs()
-        folder = next((one for one in reversed(folders) if called in (one.name, LATEST)), None)
+        named = (one for one in self.runs() if one.name == called)
+        folder = next(self.past_runs() if called == LATEST else named, None)
         if folder is None:
             known = ", ".join(one.name for one in self.runs()[-5:])
             there = f"has no run {name!r}; its latest are {known}" if known else "has no run; survey into it first"
@@ -702,7 +705,7 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
                 sync(path)
             sync(final.parents[1])  # the parent may be new: without its own name what it holds is lost
             if not os.path.samestat(os.fstat(descriptor), part.stat()):
-                raise FileNotFoundError(errno.ENOENT, "another process has removed it", str(part))
+                raise ArchiveError(f"another process has removed {part}, which was being written; run again")
             if is_cleared(final):
                 final.rename(old)
             try:
@@ -729,15 +732,15 @@ def _delete_cleared(folder: Path) -> None:
             shutil.rmtree(path) if is_folder(path) else path.unlink(missing_ok=True)
 
 
-def _leads_on(path: Path) -> bool:
-    """Return whether a path is a folder, or a link, which counts as a damaged store and is never followed."""
-    return path.is_symlink() or path.is_dir()
+def _published(path: Path) -> Path:
+    """Return the path that a leftover was to get."""
+    return path.with_name(re.sub(r"(\.[0-9a-f]{8})?(\.old)?\.part$", "", path.name))
 
 
 def _lock_name(path: Path) -> str:
     """Return the name of the lock of a store, run, spool or leftover."""
     kind = CAPTURED if path.parent.name == "spool" else path.parent.name
-    return f"{kind}-{_PART_OF.sub('', path.name)}"
+    return f"{kind}-{_published(path).name}"
 
 
 def _check_writable(path: Path, *, create: bool) -> None:
@@ -768,20 +771,17 @@ def run_stem(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
 
 
-def past_runs(folders: Iterable[Path]) -> list[Path]:
-    """Return the runs that are not in the future, by names and manifests; a warning names the others."""
-    found: dict[bool, list[Path]] = {True: [], False: []}
-    for folder in folders:
-        found[is_ahead(folder.name) or is_ahead(try_manifest(folder)[0]["created"])].append(folder)
-    if ahead := [one.name for one in found[True]]:
-        log.warning("%s: in the future, and so not taken as the latest run; check the clock", list_some(ahead))
-    return found[False]
+def lies_ahead(name: str, created: str, *, warns: bool = False) -> bool:
+    """Return whether the time in a run's name or of its manifest is later than now, by a clock that is or was wrong."""
+    ahead = _is_ahead(name[:SECOND]) or _is_ahead(created)
+    if ahead and warns:
+        log.warning("%s lies in the future, and is not taken as the latest run; check the clock", name)
+    return ahead
 
 
-def is_ahead(text: str) -> bool:
-    """Return whether the time in a run's name, or of a manifest, is later than now."""
+def _is_ahead(text: str) -> bool:
     try:
-        moment = datetime.fromisoformat(text if "+" in text else text[:SECOND])
+        moment = datetime.fromisoformat(text)
         return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S
     except ValueError:
         return False

@@ -429,7 +429,7 @@ def _named_run(address: str | Path) -> tuple[str, str | None] | None:
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
     """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
     archive = Archive.open(address, create=False, write=False)
-    for folder in reversed(archive.past_runs()) if name is None else [archive.run_folder(name)]:
+    for folder in archive.past_runs() if name is None else [archive.run_folder(name)]:
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
