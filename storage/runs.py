@@ -60,21 +60,6 @@ def moment_of(text: object) -> datetime | None:
 
 
 @dataclass(frozen=True)
-class StageRecord:
-    """One stage of a run; figures of a stage that was read from the archive are None."""
-
-    name: str
-    key: str
-    state: Literal["ran", "cached"]
-    wall_s: float | None = None
-    cpu_s: float | None = None
-    peak_rss_bytes: int | None = None
-    bytes_in: int | None = None
-    bytes_out: int | None = None
-    manifest_sha256: str | None = None  # of the store that the stage left
-
-
-@dataclass(frozen=True)
 class Run:
     """One run; a damaged ``receipt`` is empty."""
 
@@ -167,7 +152,8 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
 
     Raises NoRunError: nothing has this name; ArchiveError: more than one product has it, or it is not allowed.
     """
-    parts = text.rstrip("/").split("/")
+    text = text.rstrip("/")
+    parts = text.split("/")
     if not all(map(is_name, parts)):
         raise ArchiveError(f"{text!r} cannot be a name in an archive; use letters, digits, '_', '-' and '.'")
     name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text

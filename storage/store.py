@@ -162,6 +162,9 @@ def read_table(path: Path) -> dict[str, Any]:
 # --- manifests --------------------------------------------------------------------------------------------------------
 
 
+_EMPTY: Mapping[str, Any] = {"files": {}, "params": {}, "inputs": [], RESTS_ON: {}, "settings": {}, "created": ""}
+
+
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     """Write the manifest of a folder, with sizes and hashes of its files beside ``facts``."""
     files = {name: [one.st_size, sha256(folder / name)] for name, one in sorted(files_in(folder).items())}
@@ -187,9 +190,8 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from None
     if seal != hashlib.sha256(sealed.encode()).hexdigest():
         raise ValueError("it has changed since it was published: its seal does not fit")
-    kinds = {"files": dict, "params": dict, "inputs": list, RESTS_ON: dict, "settings": dict, "created": str}
-    for name, kind in kinds.items():
-        if not isinstance(content.setdefault(name, kind()), kind):
+    for name, empty in _EMPTY.items():
+        if not isinstance(content.setdefault(name, empty), type(empty)):
             raise ValueError(f"its {name} are of another type than expected")
     for name, entry in content["files"].items():
         if not name or name.startswith("/") or "\0" in name or ".." in PurePosixPath(name).parts:
@@ -204,18 +206,19 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     """Return the content of a folder's manifest and None, or an empty manifest and the problem."""
-    empty = {"files": {}, "params": {}, "inputs": [], RESTS_ON: {}, "settings": {}, "created": ""}
     path = folder / MANIFEST
     try:
         if folder.is_symlink():
-            return empty, "it is a link, expected a folder"
+            return dict(_EMPTY), "it is a link, expected a folder"
         if not stat.S_ISREG(path.lstat().st_mode):
-            return empty, f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
+            return dict(_EMPTY), f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
         return parse_manifest(path.read_bytes()), None
     except FileNotFoundError:
-        return empty, f"{MANIFEST} is missing"
+        return dict(_EMPTY), f"{MANIFEST} is missing"
     except (OSError, ValueError) as error:
-        return empty, f"{MANIFEST} is damaged: {(error.strerror if isinstance(error, OSError) else None) or error}"
+        return dict(
+            _EMPTY
+        ), f"{MANIFEST} is damaged: {(error.strerror if isinstance(error, OSError) else None) or error}"
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -224,14 +227,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if problem is not None:
         raise damage(folder, problem)
     return content
-
-
-def manifest_sha256(folder: Path) -> str:
-    """Return the SHA-256 of a folder's manifest. Raises IncompleteStoreError: there is none."""
-    try:
-        return sha256(folder / MANIFEST)
-    except OSError as error:
-        raise damage(folder, f"{MANIFEST} cannot be read: {error.strerror}") from error
 
 
 def is_cleared(folder: Path) -> bool:
@@ -247,13 +242,10 @@ def file_problem(path: Path, size: int, digest: str | None) -> str | None:
             return "is no file of its own, but a link, folder or pipe"
         if about.st_size != size:
             return f"has {about.st_size} bytes, expected {size}"
-        if digest is not None and sha256(path) != digest:
-            return "has changed since it was published (its SHA-256 differs)"
-    except FileNotFoundError:
-        return "is missing"
+        changed = digest is not None and sha256(path) != digest
+        return "has changed since it was published (its SHA-256 differs)" if changed else None
     except OSError as error:
-        return f"cannot be read: {error.strerror}"
-    return None
+        return "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
 
 
 def problems_of(folder: Path, *, every_byte: bool) -> Iterator[str]:
@@ -316,10 +308,8 @@ def _root_of(folder: Path) -> Path:
 class Archive:
     """A folder of stores and runs; it may be copied as it is, by rsync or to a bucket, at any time."""
 
-    def __init__(self, root: Path, *, writes: bool = True) -> None:
+    def __init__(self, root: Path) -> None:
         self.root = root
-        self.writes = writes
-        self.spooled_bytes = 0  # of the spools that were removed
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
@@ -334,12 +324,12 @@ class Archive:
                 "spectralzoom pull copies one from s3://bucket/prefix, and push copies it there"
             )
         with refusals(path, "use the archive", every=True):
-            if path.exists() and not path.is_dir():
-                cure = "choose another folder" if create else "check the name"
-                raise ArchiveError(f"{root} is a file, expected a folder for the archive; {cure}")
-            for part in ("stages", "runs", "spool", ".locks"):
-                if (path / part).is_symlink() or ((path / part).exists() and not (path / part).is_dir()):
-                    raise ArchiveError(f"{path / part} is a file or a link, expected a folder; move it away")
+            for part in (path, *(path / name for name in ("stages", "runs", "spool", ".locks"))):
+                if (part.exists() and not part.is_dir()) or (part.is_symlink() and part != path):
+                    kind = "a link" if part.is_symlink() else "a file"
+                    raise ArchiveError(
+                        f"{part} is {kind}, expected a folder for the archive; choose another, or move it"
+                    )
             if not (path / "stages").is_dir():
                 if not create:
                     state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
@@ -349,7 +339,7 @@ class Archive:
                 sync(path.parent)
             if write:
                 _check_writable(path, create=create)
-        return cls(path, writes=write)
+        return cls(path)
 
     @property
     def name(self) -> str:
@@ -411,7 +401,7 @@ class Archive:
 
     def is_known(self, ref: Ref) -> bool:
         """Return whether a store was published here, even if its files were cleared away."""
-        return (self.root / ref.uri).is_dir()
+        return ref.path.is_dir()
 
     def produce(
         self, stage: str, build: Build, *, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()
@@ -441,17 +431,8 @@ class Archive:
             if self.find(stage, ref.key) is not None:  # another process was first
                 return ref, False
             built = publish(ref.path, build_of_inputs)
-            spool = self.root / "spool" / ref.key
-            self.spooled_bytes += bytes_in(spool)
-            remove(spool)
+            remove(self.root / "spool" / ref.key)
         return ref, built
-
-    def spool_folder(self, key: str) -> Path:
-        """Return a folder for lines of the store under construction; it outlives the process until `produce` ends."""
-        folder = self.root / "spool" / self.ref("capture", key).key
-        with refusals(self.root, "write to the archive"):
-            folder.mkdir(parents=True, exist_ok=True)
-        return folder
 
     def adopt(self, uri: str, fetch: Callable[[Path], None]) -> bool:
         """Publish a copy that ``fetch`` writes with its manifest; return False where it is here already."""
@@ -489,13 +470,14 @@ class Archive:
         """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
         path = self.root / uri
         with self._locked(_lock_name(path), wait=False) as held:
-            if held and is_cleared(path):
-                _delete_cleared(path)
-            elif held and path.name.endswith(OLD) and not _published(path).exists():
+            if held and path.name.endswith(OLD) and not _published(path).exists():
                 path.rename(_published(path))  # a cleared store, which was to be replaced
             elif held and (path.name.endswith(PART) or path.parent.name == "spool"):
                 remove(path)
-        return held and (is_cleared(path) or not os.path.lexists(path))
+            elif held and is_cleared(path):
+                _delete_cleared(path)
+                return True
+        return held and not os.path.lexists(path)
 
     @contextmanager
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
@@ -640,7 +622,7 @@ class Archive:
         waiting = [ref.uri for ref in refs]
         while waiting:
             if (uri := waiting.pop()) not in found and (self.root / uri).is_dir():
-                found[uri] = manifest_sha256(self.root / uri)
+                found[uri] = sha256(self.root / uri / MANIFEST)
                 waiting += try_manifest(self.root / uri)[0]["inputs"]
         return dict(sorted(found.items()))
 
@@ -654,36 +636,26 @@ Manifests = Mapping[str, Mapping[str, Any]]
 
 
 def ancestors(known: Manifests, uris: Iterable[str]) -> list[str]:
-    """Return all inputs of these stores, direct and indirect, without themselves, the nearest first."""
-    found = list(uris)
-    begun = len(found)
-    for uri in found:  # which grows
-        found += [one for one in dict.fromkeys(known.get(uri, {}).get("inputs", ())) if one not in found]
-    return found[begun:]
+    """Return all inputs of these stores, direct and indirect, the nearest first, without these stores."""
+    found = dict.fromkeys(uris)
+    waiting = begun = list(found)
+    while waiting:
+        inputs = dict.fromkeys(one for uri in waiting for one in known.get(uri, {}).get("inputs", ()))
+        waiting = [one for one in inputs if one not in found]
+        found |= dict.fromkeys(waiting)
+    return list(found)[len(begun) :]
 
 
 def descendants(known: Manifests, uris: Iterable[str]) -> list[str]:
-    """Return all stores that were made of these, directly or not, without themselves, inputs first."""
-    found = begun = set(uris)
-    ordered = inputs_first(known, known)
-    while new := {uri for uri in ordered if uri not in found and not found.isdisjoint(known[uri]["inputs"])}:
-        found = found | new
-    return [uri for uri in ordered if uri in found - begun and uri.startswith("stages/")]
+    """Return all stores that were made of these, directly or not, inputs first, without these stores."""
+    begun = set(uris)
+    stores = (uri for uri in known if uri.startswith("stages/") and uri not in begun)
+    return inputs_first(known, (uri for uri in stores if not begun.isdisjoint(ancestors(known, [uri]))))
 
 
 def inputs_first(known: Manifests, uris: Iterable[str]) -> list[str]:
     """Return these stores with inputs before the stores made of them."""
-    wanted = set(uris)
-    ordered, seen = dict[str, None](), set[str]()
-    waiting = [(uri, False) for uri in sorted(wanted, reverse=True)]
-    while waiting:
-        uri, is_next = waiting.pop()
-        if is_next:
-            ordered[uri] = None
-        elif uri not in seen:
-            seen.add(uri)
-            waiting += [(uri, True), *((one, False) for one in known.get(uri, {}).get("inputs", ()))]
-    return [uri for uri in ordered if uri in wanted]
+    return sorted(uris, key=lambda uri: (len(ancestors(known, [uri])), uri))
 
 
 def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> bool:
@@ -773,15 +745,11 @@ def run_stem(name: str) -> str:
 
 def lies_ahead(name: str, created: str, *, warns: bool = False) -> bool:
     """Return whether the time in a run's name or of its manifest is later than now, by a clock that is or was wrong."""
-    ahead = _is_ahead(name[:SECOND]) or _is_ahead(created)
-    if ahead and warns:
-        log.warning("%s lies in the future, and is not taken as the latest run; check the clock", name)
-    return ahead
-
-
-def _is_ahead(text: str) -> bool:
-    try:
-        moment = datetime.fromisoformat(text)
-        return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S
-    except ValueError:
-        return False
+    for text in (name[:SECOND], created):
+        with suppress(ValueError):
+            moment = datetime.fromisoformat(text)
+            if moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S:
+                if warns:
+                    log.warning("%s lies in the future, and is not taken as the latest run; check the clock", name)
+                return True
+    return False

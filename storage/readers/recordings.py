@@ -52,15 +52,8 @@ from spectralzoom.storage.readers.recorded_files import (
 )
 from spectralzoom.storage.readers.zarr_files import lost_chunks
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
-from spectralzoom.storage.store import (
-    MANIFEST,
-    Archive,
-    array_digest,
-    check_store,
-    is_archive,
-    manifest_sha256,
-    try_manifest,
-)
+from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
+from spectralzoom.storage.whole_files import sha256
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"
@@ -169,7 +162,7 @@ def open_recording(
         for cube in cubes
     )
     light = tuple(
-        f"{path.name} {manifest_sha256(path.parent)}"
+        f"{path.name} {sha256(path.parent / MANIFEST)}"
         if (path.parent / MANIFEST).is_file()
         else " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
         for path in stores
