@@ -205,23 +205,23 @@ def verify_everything(
     """
     known = archive.manifests()
     total, done = sum(map(listed_bytes, known.values())) or 1, 0
-    needed = {one: f"{uri} was made of it" for uri, manifest in known.items() for one in manifest["inputs"]}
-    needed |= {one: f"{uri} names it" for uri, manifest in known.items() for one in manifest[RESTS_ON]}
+    needed = {one: (uri, "was made of it") for uri, manifest in known.items() for one in manifest["inputs"]}
+    named = {one: (uri, "names it") for uri, manifest in known.items() for one in manifest[RESTS_ON]}
     found: list[Finding] = []
     for uri, manifest in known.items():
         progress(uri, done / total)
         done += listed_bytes(manifest)
         with refusals(archive.root, "read the archive", every=True):
             problems = list(problems_of(archive.root / uri, every_byte=True))
-        if (archive.root / uri).exists() or uri in needed:  # else gc has removed it since
+        if (archive.root / uri).exists() or uri in named:  # else gc has removed it since
             found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     what = "expected a folder with a manifest; take it out of the archive"
     found += [Finding(one.relative_to(archive.root).as_posix(), what, "stray") for one in archive.strays()]
     there = known.keys() | archive.replaced()
-    gone = [
-        Finding(uri, f"is not there, but {by}", "missing") for uri, by in sorted(needed.items()) if uri not in there
-    ]
-    return found + gone
+    for uri, (by, why) in sorted((needed | named).items()):
+        if uri not in there and (archive.root / by).exists():  # else gc has removed both since
+            found.append(Finding(uri, f"is not there, but {by} {why}", "missing"))
+    return found
 
 
 # --- clearing up ------------------------------------------------------------------------------------------------------

@@ -58,6 +58,7 @@ RESTS_ON = "rests_on"  # of a run's manifest: address of every store below it ->
 LATEST = "latest"
 KEY_LENGTH = 20
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
+REPLACED_S = 0.02  # in which a store is given another store's place
 CLOCK_S = 2.0  # clocks of two machines differ by less
 CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -214,7 +215,7 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
             return dict(_EMPTY), f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
         return parse_manifest(path.read_bytes()), None
     except FileNotFoundError:
-        return dict(_EMPTY), f"{MANIFEST} is missing"
+        return dict(_EMPTY), f"{MANIFEST} is missing" if folder.is_dir() else "it is not there"
     except (OSError, ValueError) as error:
         return dict(
             _EMPTY
@@ -248,35 +249,41 @@ def file_problem(path: Path, size: int, digest: str | None) -> str | None:
         return "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
 
 
-def problems_of(folder: Path, *, every_byte: bool) -> Iterator[str]:
-    """Yield the differences of a published folder from its manifest, file by file.
+def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
+    """Return the differences of a published folder from its manifest, file by file.
 
-    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only.
+    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only. What differs is looked at
+    twice, as another process may have cleared or replaced it meanwhile.
     """
+    if _differences(folder, every_byte):
+        time.sleep(REPLACED_S)
+        return _differences(folder, every_byte)
+    return []
+
+
+def _differences(folder: Path, every_byte: bool) -> list[str]:
     manifest, problem = try_manifest(folder)
-    if problem is not None:
-        yield problem
-    elif not is_cleared(folder):
-        there, found = files_in(folder), []
-        for name, (size, digest) in manifest["files"].items():
-            own = None if _CHUNK.fullmatch(name) and not every_byte else digest
-            problem = file_problem(folder / name, size, own) if name in there else "is missing"
-            found += [f"{name} {problem}"] if problem else []
-        for name in sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else ():
-            found.append(f"{name} is not in the manifest: take it out of the archive")
-        changed = found and (is_cleared(folder) or try_manifest(folder)[0] != manifest)  # meanwhile, or made anew
-        yield from problems_of(folder, every_byte=every_byte) if changed else found
+    if problem is not None or is_cleared(folder):
+        return [problem] if problem is not None else []
+    there = files_in(folder)
+    found = []
+    for name, (size, digest) in manifest["files"].items():
+        own = None if _CHUNK.fullmatch(name) and not every_byte else digest
+        problem = file_problem(folder / name, size, own) if name in there else "is missing"
+        found += [f"{name} {problem}"] if problem else []
+    extra = sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else []
+    return found + [f"{name} is not in the manifest: take it out of the archive" for name in extra]
 
 
 def check_store(folder: Path, *, every_byte: bool = False) -> None:
     """Compare a published folder with its manifest.
 
-    Raises IncompleteStoreError: a file is missing or differs; ArchiveError: a link leads out of the archive.
+    Raises IncompleteStoreError: it is missing, or a file differs; ArchiveError: it is no folder of the archive.
     """
-    if not (folder.is_symlink() or folder.is_dir()):
-        raise ArchiveError(f"{folder} is {'a file' if folder.exists() else 'not there'}, expected a folder; see why")
-    if not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve()):
-        raise ArchiveError(f"{folder} is reached by a link that leads out of the archive; put the folder in its place")
+    if folder.is_file() or (
+        not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve())
+    ):
+        raise ArchiveError(f"{folder} is a file, or a link leads out of the archive to it; expected a folder there")
     for problem in problems_of(folder, every_byte=every_byte):
         raise damage(folder, problem)
 
@@ -374,10 +381,10 @@ class Archive:
             try:
                 if os.path.lexists(ref.path):
                     check_store(ref.path)
-            except (IncompleteStoreError, ArchiveError):
+            except IncompleteStoreError:
                 if os.path.lexists(ref.path):  # else gc has removed it meanwhile
                     raise
-            return ref if os.path.lexists(ref.path) and not is_cleared(ref.path) else None
+            return ref if ref.path.is_dir() and not is_cleared(ref.path) else None
 
     def locate(self, address: str) -> Path:
         """Return the path on this machine of a store, a run, or a file in one, by its address.
@@ -453,9 +460,7 @@ class Archive:
         ):
             if held:
                 read_manifest(final)
-                (final / CLEARED).touch()
-                sync(final)
-                _delete_cleared(final)
+                _delete_files(final, mark=True)
         return held
 
     def discard(self, uri: str) -> bool:
@@ -475,7 +480,7 @@ class Archive:
             elif held and (path.name.endswith(PART) or path.parent.name == "spool"):
                 remove(path)
             elif held and is_cleared(path):
-                _delete_cleared(path)
+                _delete_files(path)
                 return True
         return held and not os.path.lexists(path)
 
@@ -697,11 +702,22 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
         remove(part)
 
 
-def _delete_cleared(folder: Path) -> None:
-    """Delete the files of a store that is marked as cleared."""
-    for path in entries(folder):
-        if path.name not in (MANIFEST, CLEARED):
-            shutil.rmtree(path) if is_folder(path) else path.unlink(missing_ok=True)
+def _delete_files(folder: Path, *, mark: bool = False) -> None:
+    """Delete the files of a store that is marked as cleared, or ``mark`` it first; never those of its successor."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        if mark:
+            os.close(os.open(CLEARED, os.O_CREAT | os.O_WRONLY, 0o644, dir_fd=descriptor))
+            os.fsync(descriptor)
+        names = [one.name for one in os.scandir(descriptor)]
+        for name in set(names) - {MANIFEST, CLEARED} if CLEARED in names else ():
+            with suppress(FileNotFoundError):
+                try:
+                    os.unlink(name, dir_fd=descriptor)
+                except IsADirectoryError:
+                    shutil.rmtree(name, dir_fd=descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _published(path: Path) -> Path:
