@@ -358,12 +358,19 @@ def _origin(known: Mapping[str, Mapping[str, Any]], uri: str) -> tuple[bool, Seq
     stage = uri.split("/")[1]
     store = known.get(uri)
     if store is not None and store["problem"] is None:
-        light = _as(dict, store["params"].get("light"))
         is_raster = stage == "rectify" and not store["inputs"]
-        return is_raster or (stage == CAPTURED and light.get("source") != "sim"), store["inputs"]
+        return is_raster or (stage == CAPTURED and _source_in(store["params"]) != "sim"), store["inputs"]
     runs = [one for one in known.values() if uri in one[RESTS_ON] and one["settings"]]
     sources = {one["settings"].get("source") for one in runs}
     if stage == "rectify" or not LINES.fullmatch(uri):
         return stage == "rectify" and "raster" in sources, ()
     raw = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/") and name != uri]
     return sources != {"sim"} and (stage == CAPTURED or not raw), raw
+
+
+def _source_in(params: Mapping[str, Any]) -> str | None:
+    """Return the source of captured light, wherever parameters have it."""
+    if isinstance(params.get("source"), str):
+        return str(params["source"])
+    inner = (_source_in(one) for one in params.values() if isinstance(one, dict))
+    return next((one for one in inner if one is not None), None)
