@@ -22,10 +22,10 @@ import logging
 import math
 import os
 import re
-import secrets
 import shlex
 import shutil
 import stat
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -210,16 +210,18 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     path = folder / MANIFEST
     try:
         if folder.is_symlink():
-            return dict(_EMPTY), "it is a link, expected a folder"
-        if not stat.S_ISREG(path.lstat().st_mode):
-            return dict(_EMPTY), f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
-        return parse_manifest(path.read_bytes()), None
+            problem = "it is a link, expected a folder"
+        elif not stat.S_ISREG(path.lstat().st_mode):  # a pipe would be waited for
+            problem = f"{MANIFEST} is damaged: it is no file of its own"
+        else:
+            return parse_manifest(path.read_bytes()), None
     except FileNotFoundError:
-        return dict(_EMPTY), f"{MANIFEST} is missing" if folder.is_dir() else "it is not there"
-    except (OSError, ValueError) as error:
-        return dict(
-            _EMPTY
-        ), f"{MANIFEST} is damaged: {(error.strerror if isinstance(error, OSError) else None) or error}"
+        problem = f"{MANIFEST} is missing" if folder.is_dir() else "it is not there"
+    except OSError as error:
+        problem = f"{MANIFEST} cannot be read: {error.strerror}"
+    except ValueError as error:
+        problem = f"{MANIFEST} is damaged: {error}"
+    return dict(_EMPTY), problem
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -235,10 +237,10 @@ def is_cleared(folder: Path) -> bool:
     return os.path.lexists(folder / CLEARED)
 
 
-def file_problem(path: Path, size: int, digest: str | None) -> str | None:
+def file_problem(path: Path, size: int, digest: str | None, about: os.stat_result | None = None) -> str | None:
     """Return the difference of a file from size and SHA-256, as text behind its name; None without one."""
     try:
-        about = path.lstat()
+        about = about or path.lstat()
         if not stat.S_ISREG(about.st_mode):
             return "is no file of its own, but a link, folder or pipe"
         if about.st_size != size:
@@ -265,11 +267,10 @@ def _differences(folder: Path, every_byte: bool) -> list[str]:
     manifest, problem = try_manifest(folder)
     if problem is not None or is_cleared(folder):
         return [problem] if problem is not None else []
-    there = files_in(folder)
-    found = []
+    there, found = files_in(folder), []
     for name, (size, digest) in manifest["files"].items():
         own = None if _CHUNK.fullmatch(name) and not every_byte else digest
-        problem = file_problem(folder / name, size, own) if name in there else "is missing"
+        problem = file_problem(folder / name, size, own, there[name]) if name in there else "is missing"
         found += [f"{name} {problem}"] if problem else []
     extra = sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else []
     return found + [f"{name} is not in the manifest: take it out of the archive" for name in extra]
@@ -732,16 +733,13 @@ def _lock_name(path: Path) -> str:
 
 
 def _check_writable(path: Path, *, create: bool) -> None:
-    """Write a small file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
-    probe = path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
+    """Write a nameless file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
     try:
-        probe.write_bytes(b"written to see whether this can be written to")
+        with tempfile.TemporaryFile(dir=path, buffering=0) as probe:
+            probe.write(b"written to see whether this can be written to")
     except OSError as error:
         if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-    finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:

@@ -151,16 +151,17 @@ def test_a_failed_stage_leaves_nothing(archive: Archive) -> None:
 
 
 def test_leftovers_of_dead_processes_are_reclaimed(archive: Archive) -> None:
-    """Folders, a file and a link with such names are ignored and removed; what a link leads to stays."""
+    """Folders, a file, a link and a pipe with such names are ignored and removed; what a link leads to stays."""
     ref = produce(archive, two_files)
     for name in (f"{ref.key}.0123abcd.part", "dead.part"):
         (ref.path.with_name(name) / "inner").mkdir(parents=True)
     ref.path.with_name("file.part").write_text("x")
     ref.path.with_name("link.part").symlink_to(ref.path)
+    os.mkfifo(ref.path.with_name("pipe.part"))
     (archive.root / "spool" / ref.key).mkdir(parents=True)
     (archive.root / "spool" / "underway").mkdir()
     assert archive.refs() == [ref]
-    assert len(archive.reclaim()) == 5
+    assert len(archive.reclaim()) == 6
     assert [path.name for path in archive.root.glob("*/*/*")] == [ref.key]
     assert [path.name for path in archive.root.glob("spool/*")] == ["underway"]
     assert problems(archive) == []
@@ -266,7 +267,7 @@ def test_an_unwritable_disk_is_refused(
     tmp_path: Path, number: int, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Opening writes a probe file, so that no survey begins on a disk that cannot store it; gc makes room."""
-    monkeypatch.setattr(Path, "write_bytes", Mock(side_effect=OSError(number, os.strerror(number))))
+    monkeypatch.setattr("tempfile.TemporaryFile", Mock(side_effect=OSError(number, os.strerror(number))))
     with pytest.raises(ArchiveError, match=words):
         Archive.open(tmp_path)
     if number == errno.ENOSPC:
