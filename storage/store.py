@@ -303,11 +303,8 @@ def damage(folder: Path, problem: str) -> IncompleteStoreError:
 def _root_of(folder: Path) -> Path:
     """Return the archive of a store or run; the folder above where it was copied out of its archive."""
     above = folder.absolute().parents
-    return (
-        above[2]
-        if len(above) > 2 and above[1].name == "stages"
-        else above[min(len(above) - 1, int(above[0].name == "runs"))]
-    )
+    is_store = len(above) > 2 and above[1].name == "stages"
+    return above[2 if is_store else 1 if above[0].name == "runs" else 0]
 
 
 # --- the archive ------------------------------------------------------------------------------------------------------
