@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError, list_some
 from spectralzoom.storage.store import (
+    CAPTURED,
     LATEST,
     MANIFEST,
     RESTS_ON,
@@ -28,10 +29,9 @@ from spectralzoom.storage.store import (
     descendants,
     file_problem,
     inputs_first,
-    is_ahead,
     is_name,
+    lies_ahead,
     listed_bytes,
-    past_runs,
     problems_of,
     try_manifest,
     uri_of,
@@ -42,7 +42,7 @@ RECEIPT = "receipt.json"
 YEARS = range(1900, 2201)
 _DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
-LINES = re.compile(r"stages/(capture|condense(_fine)?)/.*")
+LINES = re.compile(rf"stages/({CAPTURED}|condense(_fine)?)/.*")
 DAY_S = 86400.0
 ONLY_COPY = "damaged, and not simulated: restore it from a copy; --raw-too removes it, to read its source again"
 IN_USE = "the archive is in use: run gc again when it is free"
@@ -57,21 +57,6 @@ def moment_of(text: object) -> datetime | None:
             found = datetime.fromisoformat(some)
             return found.replace(tzinfo=found.tzinfo or UTC) if found.year in YEARS else None
     return None
-
-
-@dataclass(frozen=True)
-class StageRecord:
-    """One stage of a run; figures of a stage that was read from the archive are None."""
-
-    name: str
-    key: str
-    state: Literal["ran", "cached"]
-    wall_s: float | None = None
-    cpu_s: float | None = None
-    peak_rss_bytes: int | None = None
-    bytes_in: int | None = None
-    bytes_out: int | None = None
-    manifest_sha256: str | None = None  # of the store that the stage left
 
 
 @dataclass(frozen=True)
@@ -116,8 +101,8 @@ class Run:
 
     @property
     def in_future(self) -> bool:
-        """Return whether it was published later than now, by a clock that was wrong then or is wrong now."""
-        return is_ahead(self.folder.name) or is_ahead(self.created)
+        """Return whether it was published later than now, by a clock that is or was wrong."""
+        return lies_ahead(self.folder.name, self.created)
 
 
 def _as(kind: Any, value: Any) -> Any:
@@ -149,7 +134,8 @@ class Catalogue(NamedTuple):
     def read(cls, archive: Archive) -> Catalogue:
         """Read every manifest and receipt of an archive once; damaged ones have a ``problem``."""
         stores = {uri: one for uri, one in archive.manifests().items() if uri.startswith("stages/")}
-        return cls(stores, sorted(map(read_run, archive.runs()), key=lambda run: (run.created, run.folder.name)))
+        runs = [run for run in map(read_run, archive.runs()) if run.problem is None or run.folder.exists()]
+        return cls(stores, sorted(runs, key=lambda run: (run.created, run.folder.name)))
 
     def named_by(self, uri: str) -> list[Run]:
         """Return the runs that rest on a store."""
@@ -166,14 +152,14 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
 
     Raises NoRunError: nothing has this name; ArchiveError: more than one product has it, or it is not allowed.
     """
-    parts = text.rstrip("/").split("/")
+    text = text.rstrip("/")
+    parts = text.split("/")
     if not all(map(is_name, parts)):
         raise ArchiveError(f"{text!r} cannot be a name in an archive; use letters, digits, '_', '-' and '.'")
     name = parts[1] if parts[0] == "runs" and len(parts) > 1 else text
     if runs := [run for run in catalogue.runs if name == run.folder.name]:
         return runs[-1]
-    folders = past_runs(run.folder for run in catalogue.runs)
-    past = [run for run in catalogue.runs if run.folder in folders]
+    past = [run for run in catalogue.runs if not lies_ahead(run.folder.name, run.created, warns=True)]
     if past and name == LATEST:
         return past[-1]
     if name != text:
@@ -219,23 +205,23 @@ def verify_everything(
     """
     known = archive.manifests()
     total, done = sum(map(listed_bytes, known.values())) or 1, 0
-    needed = {one: f"{uri} was made of it" for uri, manifest in known.items() for one in manifest["inputs"]}
-    needed |= {one: f"{uri} names it" for uri, manifest in known.items() for one in manifest[RESTS_ON]}
+    needed = {one: (uri, "was made of it") for uri, manifest in known.items() for one in manifest["inputs"]}
+    named = {one: (uri, "names it") for uri, manifest in known.items() for one in manifest[RESTS_ON]}
     found: list[Finding] = []
     for uri, manifest in known.items():
         progress(uri, done / total)
         done += listed_bytes(manifest)
         with refusals(archive.root, "read the archive", every=True):
             problems = list(problems_of(archive.root / uri, every_byte=True))
-        if (archive.root / uri).exists() or uri in needed:  # else gc has removed it since
+        if (archive.root / uri).exists() or uri in named:  # else gc has removed it since
             found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     what = "expected a folder with a manifest; take it out of the archive"
     found += [Finding(one.relative_to(archive.root).as_posix(), what, "stray") for one in archive.strays()]
     there = known.keys() | archive.replaced()
-    gone = [
-        Finding(uri, f"is not there, but {by}", "missing") for uri, by in sorted(needed.items()) if uri not in there
-    ]
-    return found + gone
+    for uri, (by, why) in sorted((needed | named).items()):
+        if uri not in there and (archive.root / by).exists():  # else gc has removed both since
+            found.append(Finding(uri, f"is not there, but {by} {why}", "missing"))
+    return found
 
 
 # --- clearing up ------------------------------------------------------------------------------------------------------
@@ -288,7 +274,8 @@ def clear_up(
         gone: list[Removal] = []
         for number, removal in enumerate(plan.removals):
             progress(removal, number / len(plan.removals))
-            gone += [removal] if archive.discard(removal.uri) else []  # else another process holds it
+            drop = archive.drop_leftover if removal.what == "leftover" else archive.discard
+            gone += [removal] if drop(removal.uri) else []  # else another process holds it
         for lock in entries(archive.root / ".locks"):
             if "-" in lock.name:  # of stores and runs, which nothing makes meanwhile
                 lock.unlink(missing_ok=True)
@@ -364,18 +351,26 @@ def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str) -> bool:
 
 
 def _origin(known: Mapping[str, Mapping[str, Any]], uri: str) -> tuple[bool, Sequence[str]]:
-    """Return whether a store holds lines or pixels that were not simulated, and else its inputs.
+    """Return whether a store holds lines or pixels that were not simulated, and its inputs.
 
     Of a damaged or missing store the runs that name it say whether its lines were simulated, and which they were.
     """
+    stage = uri.split("/")[1]
     store = known.get(uri)
     if store is not None and store["problem"] is None:
-        is_original = LINES.fullmatch(uri) is not None and "source" in store["params"]
-        return is_original and store["params"]["source"] != "sim", () if is_original else store["inputs"]
-    if not LINES.fullmatch(uri):
-        return False, ()
+        is_raster = stage == "rectify" and not store["inputs"]
+        return is_raster or (stage == CAPTURED and _source_in(store["params"]) != "sim"), store["inputs"]
     runs = [one for one in known.values() if uri in one[RESTS_ON] and one["settings"]]
-    if runs and all(one["settings"].get("source") == "sim" for one in runs):
-        return False, ()
-    raw = [name for one in runs for name in one[RESTS_ON] if name.startswith("stages/capture/") and name != uri]
-    return uri.startswith("stages/capture/") or not raw, raw
+    sources = {one["settings"].get("source") for one in runs}
+    if stage == "rectify" or not LINES.fullmatch(uri):
+        return stage == "rectify" and "raster" in sources, ()
+    raw = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/") and name != uri]
+    return sources != {"sim"} and (stage == CAPTURED or not raw), raw
+
+
+def _source_in(params: Mapping[str, Any]) -> str | None:
+    """Return the source of captured light, wherever parameters have it."""
+    if isinstance(params.get("source"), str):
+        return str(params["source"])
+    inner = (_source_in(one) for one in params.values() if isinstance(one, dict))
+    return next((one for one in inner if one is not None), None)

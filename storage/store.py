@@ -22,10 +22,10 @@ import logging
 import math
 import os
 import re
-import secrets
 import shlex
 import shutil
 import stat
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -58,10 +58,10 @@ RESTS_ON = "rests_on"  # of a run's manifest: address of every store below it ->
 LATEST = "latest"
 KEY_LENGTH = 20
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
+REPLACED_S = 0.02  # in which a store is given another store's place
 CLOCK_S = 2.0  # clocks of two machines differ by less
 CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
-_PART_OF = re.compile(r"(\.[0-9a-f]{8})?(\.old)?\.part$")
 _BUCKET = re.compile(r"(?i)[a-z][a-z0-9+]+:(?=/)")
 _CHUNK = re.compile(r".*\.zarr/.*/c[/.][0-9/.]+")  # of an array; each has a crc32c (arrays.layout)
 
@@ -163,12 +163,12 @@ def read_table(path: Path) -> dict[str, Any]:
 # --- manifests --------------------------------------------------------------------------------------------------------
 
 
+_EMPTY: Mapping[str, Any] = {"files": {}, "params": {}, "inputs": [], RESTS_ON: {}, "settings": {}, "created": ""}
+
+
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Sync every file of a folder, and write the manifest with their sizes and hashes beside ``facts``."""
-    files = {}
-    for name in sorted(files_in(folder)):
-        sync(folder / name)
-        files[name] = [(folder / name).stat().st_size, sha256(folder / name)]
+    """Write the manifest of a folder, with sizes and hashes of its files beside ``facts``."""
+    files = {name: [one.st_size, sha256(folder / name)] for name, one in sorted(files_in(folder).items())}
     created = datetime.now(UTC).isoformat(timespec="milliseconds")
     (folder / MANIFEST).write_text(manifest_text({"created": created, **facts, "files": files}))
 
@@ -191,9 +191,8 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from None
     if seal != hashlib.sha256(sealed.encode()).hexdigest():
         raise ValueError("it has changed since it was published: its seal does not fit")
-    kinds = {"files": dict, "params": dict, "inputs": list, RESTS_ON: dict, "settings": dict, "created": str}
-    for name, kind in kinds.items():
-        if not isinstance(content.setdefault(name, kind()), kind):
+    for name, empty in _EMPTY.items():
+        if not isinstance(content.setdefault(name, empty), type(empty)):
             raise ValueError(f"its {name} are of another type than expected")
     for name, entry in content["files"].items():
         if not name or name.startswith("/") or "\0" in name or ".." in PurePosixPath(name).parts:
@@ -208,18 +207,21 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
 
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     """Return the content of a folder's manifest and None, or an empty manifest and the problem."""
-    empty = {"files": {}, "params": {}, "inputs": [], RESTS_ON: {}, "settings": {}, "created": ""}
     path = folder / MANIFEST
     try:
         if folder.is_symlink():
-            return empty, "it is a link, expected a folder"
-        if not stat.S_ISREG(path.lstat().st_mode):
-            return empty, f"{MANIFEST} is damaged: it is no file of its own"  # a pipe would be waited for
-        return parse_manifest(path.read_bytes()), None
+            problem = "it is a link, expected a folder"
+        elif not stat.S_ISREG(path.lstat().st_mode):  # a pipe would be waited for
+            problem = f"{MANIFEST} is damaged: it is no file of its own"
+        else:
+            return parse_manifest(path.read_bytes()), None
     except FileNotFoundError:
-        return empty, f"{MANIFEST} is missing"
-    except (OSError, ValueError) as error:
-        return empty, f"{MANIFEST} is damaged: {(error.strerror if isinstance(error, OSError) else None) or error}"
+        problem = f"{MANIFEST} is missing" if folder.is_dir() else "it is not there"
+    except OSError as error:
+        problem = f"{MANIFEST} cannot be read: {error.strerror}"
+    except ValueError as error:
+        problem = f"{MANIFEST} is damaged: {error}"
+    return dict(_EMPTY), problem
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -230,65 +232,59 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return content
 
 
-def manifest_sha256(folder: Path) -> str:
-    """Return the SHA-256 of a folder's manifest. Raises IncompleteStoreError: there is none."""
-    try:
-        return sha256(folder / MANIFEST)
-    except OSError as error:
-        raise damage(folder, f"{MANIFEST} cannot be read: {error.strerror}") from error
-
-
 def is_cleared(folder: Path) -> bool:
     """Return whether a store's files were deleted, or are being deleted."""
     return os.path.lexists(folder / CLEARED)
 
 
-def file_problem(path: Path, size: int, digest: str | None) -> str | None:
+def file_problem(path: Path, size: int, digest: str | None, about: os.stat_result | None = None) -> str | None:
     """Return the difference of a file from size and SHA-256, as text behind its name; None without one."""
     try:
-        about = path.lstat()
+        about = about or path.lstat()
         if not stat.S_ISREG(about.st_mode):
             return "is no file of its own, but a link, folder or pipe"
         if about.st_size != size:
             return f"has {about.st_size} bytes, expected {size}"
-        if digest is not None and sha256(path) != digest:
-            return "has changed since it was published (its SHA-256 differs)"
-    except FileNotFoundError:
-        return "is missing"
+        changed = digest is not None and sha256(path) != digest
+        return "has changed since it was published (its SHA-256 differs)" if changed else None
     except OSError as error:
-        return f"cannot be read: {error.strerror}"
-    return None
+        return "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
 
 
-def problems_of(folder: Path, *, every_byte: bool) -> Iterator[str]:
-    """Yield the differences of a published folder from its manifest, file by file.
+def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
+    """Return the differences of a published folder from its manifest, file by file.
 
-    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only.
+    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only. What differs is looked at
+    twice, as another process may have cleared or replaced it meanwhile.
     """
+    if _differences(folder, every_byte):
+        time.sleep(REPLACED_S)
+        return _differences(folder, every_byte)
+    return []
+
+
+def _differences(folder: Path, every_byte: bool) -> list[str]:
     manifest, problem = try_manifest(folder)
-    if problem is not None:
-        yield problem
-    elif not is_cleared(folder):
-        there, found = files_in(folder), []
-        for name, (size, digest) in manifest["files"].items():
-            own = None if _CHUNK.fullmatch(name) and not every_byte else digest
-            problem = file_problem(folder / name, size, own) if name in there else "is missing"
-            found += [f"{name} {problem}"] if problem else []
-        for name in sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else ():
-            found.append(f"{name} is not in the manifest: take it out of the archive")
-        changed = found and (is_cleared(folder) or try_manifest(folder)[0] != manifest)  # meanwhile, or made anew
-        yield from problems_of(folder, every_byte=every_byte) if changed else found
+    if problem is not None or is_cleared(folder):
+        return [problem] if problem is not None else []
+    there, found = files_in(folder), []
+    for name, (size, digest) in manifest["files"].items():
+        own = None if _CHUNK.fullmatch(name) and not every_byte else digest
+        problem = file_problem(folder / name, size, own, there[name]) if name in there else "is missing"
+        found += [f"{name} {problem}"] if problem else []
+    extra = sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else []
+    return found + [f"{name} is not in the manifest: take it out of the archive" for name in extra]
 
 
 def check_store(folder: Path, *, every_byte: bool = False) -> None:
     """Compare a published folder with its manifest.
 
-    Raises IncompleteStoreError: a file is missing or differs; ArchiveError: a link leads out of the archive.
+    Raises IncompleteStoreError: it is missing, or a file differs; ArchiveError: it is no folder of the archive.
     """
-    if not (folder.is_symlink() or folder.is_dir()):
-        raise ArchiveError(f"{folder} is {'a file' if folder.exists() else 'not there'}, expected a folder; see why")
-    if not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve()):
-        raise ArchiveError(f"{folder} is reached by a link that leads out of the archive; put the folder in its place")
+    if folder.is_file() or (
+        not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve())
+    ):
+        raise ArchiveError(f"{folder} is a file, or a link leads out of the archive to it; expected a folder there")
     for problem in problems_of(folder, every_byte=every_byte):
         raise damage(folder, problem)
 
@@ -307,11 +303,8 @@ def damage(folder: Path, problem: str) -> IncompleteStoreError:
 def _root_of(folder: Path) -> Path:
     """Return the archive of a store or run; the folder above where it was copied out of its archive."""
     above = folder.absolute().parents
-    return (
-        above[2]
-        if len(above) > 2 and above[1].name == "stages"
-        else above[min(len(above) - 1, int(above[0].name == "runs"))]
-    )
+    is_store = len(above) > 2 and above[1].name == "stages"
+    return above[2 if is_store else 1 if above[0].name == "runs" else 0]
 
 
 # --- the archive ------------------------------------------------------------------------------------------------------
@@ -320,10 +313,8 @@ def _root_of(folder: Path) -> Path:
 class Archive:
     """A folder of stores and runs; it may be copied as it is, by rsync or to a bucket, at any time."""
 
-    def __init__(self, root: Path, *, writes: bool = True) -> None:
+    def __init__(self, root: Path) -> None:
         self.root = root
-        self.writes = writes
-        self.spooled_bytes = 0  # of the spools that were removed
 
     @classmethod
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
@@ -338,12 +329,12 @@ class Archive:
                 "spectralzoom pull copies one from s3://bucket/prefix, and push copies it there"
             )
         with refusals(path, "use the archive", every=True):
-            if path.exists() and not path.is_dir():
-                cure = "choose another folder" if create else "check the name"
-                raise ArchiveError(f"{root} is a file, expected a folder for the archive; {cure}")
-            for part in ("stages", "runs", "spool", ".locks"):
-                if (path / part).is_symlink() or ((path / part).exists() and not (path / part).is_dir()):
-                    raise ArchiveError(f"{path / part} is a file or a link, expected a folder; move it away")
+            for part in (path, *(path / name for name in ("stages", "runs", "spool", ".locks"))):
+                if (part.exists() and not part.is_dir()) or (part.is_symlink() and part != path):
+                    kind = "a link" if part.is_symlink() else "a file"
+                    raise ArchiveError(
+                        f"{part} is {kind}, expected a folder for the archive; choose another, or move it"
+                    )
             if not (path / "stages").is_dir():
                 if not create:
                     state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
@@ -353,7 +344,7 @@ class Archive:
                 sync(path.parent)
             if write:
                 _check_writable(path, create=create)
-        return cls(path, writes=write)
+        return cls(path)
 
     @property
     def name(self) -> str:
@@ -385,10 +376,13 @@ class Archive:
         """
         ref = self.ref(stage, key)
         with refusals(self.root, "read the archive"):
-            if not os.path.lexists(ref.path):
-                return None
-            check_store(ref.path)
-            return None if is_cleared(ref.path) else ref
+            try:
+                if os.path.lexists(ref.path):
+                    check_store(ref.path)
+            except IncompleteStoreError:
+                if os.path.lexists(ref.path):  # else gc has removed it meanwhile
+                    raise
+            return ref if ref.path.is_dir() and not is_cleared(ref.path) else None
 
     def locate(self, address: str) -> Path:
         """Return the path on this machine of a store, a run, or a file in one, by its address.
@@ -412,7 +406,7 @@ class Archive:
 
     def is_known(self, ref: Ref) -> bool:
         """Return whether a store was published here, even if its files were cleared away."""
-        return (self.root / ref.uri).is_dir()
+        return ref.path.is_dir()
 
     def produce(
         self, stage: str, build: Build, *, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()
@@ -429,11 +423,12 @@ class Archive:
 
         def build_of_inputs(folder: Path) -> Mapping[str, Any]:
             paths = [self.root / one.uri for one in inputs]
-            before = [try_manifest(path) for path in paths]
+            before = [None if is_cleared(path) else try_manifest(path) for path in paths]
             try:
                 build(folder)
             finally:  # a cleared array reads as nodata, or fails
-                if any(map(is_cleared, paths)) or [try_manifest(path) for path in paths] != before:
+                same = (old in (None, try_manifest(path)) for path, old in zip(paths, before, strict=True))
+                if any(map(is_cleared, paths)) or not all(same):
                     raise ArchiveError(f"another survey has cleared an input of {stage} meanwhile; repeat the command")
             return facts
 
@@ -441,17 +436,8 @@ class Archive:
             if self.find(stage, ref.key) is not None:  # another process was first
                 return ref, False
             built = publish(ref.path, build_of_inputs)
-            spool = self.root / "spool" / ref.key
-            self.spooled_bytes += bytes_in(spool)
-            remove(spool)
+            remove(self.root / "spool" / ref.key)
         return ref, built
-
-    def spool_folder(self, key: str) -> Path:
-        """Return a folder for lines of the store under construction; it outlives the process until `produce` ends."""
-        folder = self.root / "spool" / self.ref("capture", key).key
-        with refusals(self.root, "write to the archive"):
-            folder.mkdir(parents=True, exist_ok=True)
-        return folder
 
     def adopt(self, uri: str, fetch: Callable[[Path], None]) -> bool:
         """Publish a copy that ``fetch`` writes with its manifest; return False where it is here already."""
@@ -472,22 +458,29 @@ class Archive:
         ):
             if held:
                 read_manifest(final)
-                (final / CLEARED).touch()
-                sync(final)
-                _delete_cleared(final)
+                _delete_files(final, mark=True)
         return held
 
     def discard(self, uri: str) -> bool:
-        """Remove a store, a run or a leftover; False where another process holds it, or the disk refuses."""
+        """Remove a store or a run; False where another process holds it, or the disk refuses."""
         path = self.root / uri
         with self._locked(_lock_name(path), wait=False) as held:
-            if held and is_cleared(path) and path in self._cleared_leftovers():
-                _delete_cleared(path)
-            elif held and path.name.endswith(OLD) and not (whole := path.with_name(path.name.split(".")[0])).exists():
-                path.rename(whole)  # a cleared store that was to be replaced
-            elif held:
+            if held:
                 remove(path)
-        return held and (is_cleared(path) or not os.path.lexists(path))
+        return held and not os.path.lexists(path)
+
+    def drop_leftover(self, uri: str) -> bool:
+        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
+        path = self.root / uri
+        with self._locked(_lock_name(path), wait=False) as held:
+            if held and path.name.endswith(OLD) and not _published(path).exists():
+                path.rename(_published(path))  # a cleared store, which was to be replaced
+            elif held and (path.name.endswith(PART) or path.parent.name == "spool"):
+                remove(path)
+            elif held and is_cleared(path):
+                _delete_files(path)
+                return True
+        return held and not os.path.lexists(path)
 
     @contextmanager
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
@@ -501,44 +494,38 @@ class Archive:
     def reclaim(self) -> list[str]:
         """Remove what killed processes left in this folder; return the addresses."""
         with refusals(self.root, "clear up the archive", every=True):
-            return [uri for uri in self.leftovers() if self.discard(uri)]
+            return [uri for uri in self.leftovers() if self.drop_leftover(uri)]
 
     def leftovers(self) -> list[str]:
         """Return unfinished folders, spools of published captures, and cleared stores with files; not those in use."""
-        places = [
-            *entries(self.root / "runs"),
-            *(one for stage in entries(self.root / "stages") for one in entries(stage)),
-        ]
-        found = [one for one in places if one.name.endswith(PART)] + self._cleared_leftovers()
+        stores = self._folders("stages")
+        found = [one for one in stores if is_cleared(one) and files_in(one).keys() - {MANIFEST, CLEARED}]
+        found += [one for one in self._places() if one.name.endswith(PART)]
         for spool in entries(self.root / "spool"):
-            stores = [stage / spool.name for stage in entries(self.root / "stages")]
-            if any(try_manifest(one)[1] is None and not is_cleared(one) for one in stores):
-                found.append(spool)
+            made = [one for one in stores if one.name == spool.name]
+            found += [spool] if any(try_manifest(one)[1] is None and not is_cleared(one) for one in made) else []
         return [one.relative_to(self.root).as_posix() for one in sorted(found) if self._is_free(_lock_name(one))]
 
     def replaced(self) -> set[str]:
         """Return the addresses of cleared stores that a killed process was replacing; `reclaim` puts them back."""
-        inside = [one for stage in entries(self.root / "stages") for one in entries(stage) if one.name.endswith(OLD)]
-        return {f"stages/{one.parent.name}/{_PART_OF.sub('', one.name)}" for one in inside}
+        old = (_published(one) for one in self._places() if one.name.endswith(OLD))
+        return {one.relative_to(self.root).as_posix() for one in old}
 
     def strays(self) -> list[Path]:
         """Return what lies among stores and runs and is neither."""
-        stages = [one for one in entries(self.root / "stages") if is_folder(one)]
         loose = [one for one in entries(self.root / "stages") if not is_folder(one)]
-        inside = [one for folder in (*stages, self.root / "runs") for one in entries(folder)]
         known = {*self._folders("stages"), *self._folders("runs")}
-        return loose + [one for one in inside if one not in known and not one.name.endswith(PART)]
+        return loose + [one for one in self._places() if one not in known and not one.name.endswith(PART)]
 
-    def _cleared_leftovers(self) -> list[Path]:
-        """Return the cleared stores that still have files."""
-        return [
-            one for one in self._folders("stages") if is_cleared(one) and files_in(one).keys() - {MANIFEST, CLEARED}
-        ]
+    def _places(self) -> list[Path]:
+        """Return what lies where stores and runs do."""
+        above = [*filter(is_folder, entries(self.root / "stages")), self.root / "runs"]
+        return [one for folder in above for one in entries(folder)]
 
     def _folders(self, kind: str) -> list[Path]:
-        """Return the folders of ``stages`` or ``runs`` that are no leftovers, with or without a manifest."""
-        above = [self.root / kind] if kind == "runs" else [*filter(is_folder, entries(self.root / kind))]
-        return [one for folder in above for one in entries(folder) if is_name(one.name) and _leads_on(one)]
+        """Return the folders of ``stages`` or ``runs`` that are no leftovers, and links, which count as damaged."""
+        inside = [one for one in self._places() if kind in (one.parent.name, one.parents[1].name)]
+        return [one for one in inside if is_name(one.name) and (one.is_symlink() or one.is_dir())]
 
     def _is_free(self, lock: str) -> bool:
         path = self.root / ".locks" / f"{lock}.lock"
@@ -590,15 +577,17 @@ class Archive:
                     ages[path] = (path / MANIFEST).lstat().st_mtime_ns
         return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
 
-    def past_runs(self) -> list[Path]:
-        """Return the published runs but those that lie in the future, which a warning names."""
-        return past_runs(self.runs())
+    def past_runs(self) -> Iterator[Path]:
+        """Yield the published runs, newest first; those of the future are left out, with a warning."""
+        for folder in reversed(self.runs()):
+            if not lies_ahead(folder.name, try_manifest(folder)[0]["created"], warns=True):
+                yield folder
 
     def run_folder(self, name: str) -> Path:
         """Return the folder of a published run by name, address or ``latest``. Raises NoRunError."""
         called = name.rstrip("/").removeprefix("runs/")
-        folders = self.past_runs() if called == LATEST else self.runs()
-        folder = next((one for one in reversed(folders) if called in (one.name, LATEST)), None)
+        named = (one for one in self.runs() if one.name == called)
+        folder = next(self.past_runs() if called == LATEST else named, None)
         if folder is None:
             known = ", ".join(one.name for one in self.runs()[-5:])
             there = f"has no run {name!r}; its latest are {known}" if known else "has no run; survey into it first"
@@ -636,7 +625,7 @@ class Archive:
         waiting = [ref.uri for ref in refs]
         while waiting:
             if (uri := waiting.pop()) not in found and (self.root / uri).is_dir():
-                found[uri] = manifest_sha256(self.root / uri)
+                found[uri] = sha256(self.root / uri / MANIFEST)
                 waiting += try_manifest(self.root / uri)[0]["inputs"]
         return dict(sorted(found.items()))
 
@@ -650,36 +639,26 @@ Manifests = Mapping[str, Mapping[str, Any]]
 
 
 def ancestors(known: Manifests, uris: Iterable[str]) -> list[str]:
-    """Return all inputs of these stores, direct and indirect, without themselves, the nearest first."""
-    found = list(uris)
-    begun = len(found)
-    for uri in found:  # which grows
-        found += [one for one in dict.fromkeys(known.get(uri, {}).get("inputs", ())) if one not in found]
-    return found[begun:]
+    """Return all inputs of these stores, direct and indirect, the nearest first, without these stores."""
+    found = dict.fromkeys(uris)
+    waiting = begun = list(found)
+    while waiting:
+        inputs = dict.fromkeys(one for uri in waiting for one in known.get(uri, {}).get("inputs", ()))
+        waiting = [one for one in inputs if one not in found]
+        found |= dict.fromkeys(waiting)
+    return list(found)[len(begun) :]
 
 
 def descendants(known: Manifests, uris: Iterable[str]) -> list[str]:
-    """Return all stores that were made of these, directly or not, without themselves, inputs first."""
-    found = begun = set(uris)
-    ordered = inputs_first(known, known)
-    while new := {uri for uri in ordered if uri not in found and not found.isdisjoint(known[uri]["inputs"])}:
-        found = found | new
-    return [uri for uri in ordered if uri in found - begun and uri.startswith("stages/")]
+    """Return all stores that were made of these, directly or not, inputs first, without these stores."""
+    begun = set(uris)
+    stores = (uri for uri in known if uri.startswith("stages/") and uri not in begun)
+    return inputs_first(known, (uri for uri in stores if not begun.isdisjoint(ancestors(known, [uri]))))
 
 
 def inputs_first(known: Manifests, uris: Iterable[str]) -> list[str]:
     """Return these stores with inputs before the stores made of them."""
-    wanted = set(uris)
-    ordered, seen = dict[str, None](), set[str]()
-    waiting = [(uri, False) for uri in sorted(wanted, reverse=True)]
-    while waiting:
-        uri, is_next = waiting.pop()
-        if is_next:
-            ordered[uri] = None
-        elif uri not in seen:
-            seen.add(uri)
-            waiting += [(uri, True), *((one, False) for one in known.get(uri, {}).get("inputs", ()))]
-    return [uri for uri in ordered if uri in wanted]
+    return sorted(uris, key=lambda uri: (len(ancestors(known, [uri])), uri))
 
 
 def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> bool:
@@ -701,7 +680,7 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
                 sync(path)
             sync(final.parents[1])  # the parent may be new: without its own name what it holds is lost
             if not os.path.samestat(os.fstat(descriptor), part.stat()):
-                raise FileNotFoundError(errno.ENOENT, "another process has removed it", str(part))
+                raise ArchiveError(f"another process has removed {part}, which was being written; run again")
             if is_cleared(final):
                 final.rename(old)
             try:
@@ -721,35 +700,43 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
         remove(part)
 
 
-def _delete_cleared(folder: Path) -> None:
-    """Delete the files of a store that is marked as cleared."""
-    for path in entries(folder):
-        if path.name not in (MANIFEST, CLEARED):
-            shutil.rmtree(path) if is_folder(path) else path.unlink(missing_ok=True)
+def _delete_files(folder: Path, *, mark: bool = False) -> None:
+    """Delete the files of a store that is marked as cleared, or ``mark`` it first; never those of its successor."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        if mark:
+            os.close(os.open(CLEARED, os.O_CREAT | os.O_WRONLY, 0o644, dir_fd=descriptor))
+            os.fsync(descriptor)
+        names = [one.name for one in os.scandir(descriptor)]
+        for name in set(names) - {MANIFEST, CLEARED} if CLEARED in names else ():
+            with suppress(FileNotFoundError):
+                try:
+                    os.unlink(name, dir_fd=descriptor)
+                except IsADirectoryError:
+                    shutil.rmtree(name, dir_fd=descriptor)
+    finally:
+        os.close(descriptor)
 
 
-def _leads_on(path: Path) -> bool:
-    """Return whether a path is a folder, or a link, which counts as a damaged store and is never followed."""
-    return path.is_symlink() or path.is_dir()
+def _published(path: Path) -> Path:
+    """Return the path that a leftover was to get."""
+    return path.with_name(re.sub(r"(\.[0-9a-f]{8})?(\.old)?\.part$", "", path.name))
 
 
 def _lock_name(path: Path) -> str:
     """Return the name of the lock of a store, run, spool or leftover."""
     kind = CAPTURED if path.parent.name == "spool" else path.parent.name
-    return f"{kind}-{_PART_OF.sub('', path.name)}"
+    return f"{kind}-{_published(path).name}"
 
 
 def _check_writable(path: Path, *, create: bool) -> None:
-    """Write a small file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
-    probe = path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
+    """Write a nameless file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
     try:
-        probe.write_bytes(b"written to see whether this can be written to")
+        with tempfile.TemporaryFile(dir=path, buffering=0) as probe:
+            probe.write(b"written to see whether this can be written to")
     except OSError as error:
         if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-    finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:
@@ -767,20 +754,13 @@ def run_stem(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
 
 
-def past_runs(folders: Iterable[Path]) -> list[Path]:
-    """Return the runs that are not in the future, by names and manifests; a warning names the others."""
-    found: dict[bool, list[Path]] = {True: [], False: []}
-    for folder in folders:
-        found[is_ahead(folder.name) or is_ahead(try_manifest(folder)[0]["created"])].append(folder)
-    if ahead := [one.name for one in found[True]]:
-        log.warning("%s: in the future, and so not taken as the latest run; check the clock", list_some(ahead))
-    return found[False]
-
-
-def is_ahead(text: str) -> bool:
-    """Return whether the time in a run's name, or of a manifest, is later than now."""
-    try:
-        moment = datetime.fromisoformat(text if "+" in text else text[:SECOND])
-        return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S
-    except ValueError:
-        return False
+def lies_ahead(name: str, created: str, *, warns: bool = False) -> bool:
+    """Return whether the time in a run's name or of its manifest is later than now, by a clock that is or was wrong."""
+    for text in (name[:SECOND], created):
+        with suppress(ValueError):
+            moment = datetime.fromisoformat(text)
+            if moment.replace(tzinfo=moment.tzinfo or UTC).timestamp() > time.time() + CLOCK_S:
+                if warns:
+                    log.warning("%s lies in the future, and is not taken as the latest run; check the clock", name)
+                return True
+    return False

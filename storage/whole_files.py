@@ -91,9 +91,11 @@ def remove(path: Path) -> None:
             away = aside(path)
             path.rename(away)
             sync(away.parent)  # or a power cut leaves the name, and not the files
-    shutil.rmtree(away, ignore_errors=True)
-    with suppress(OSError):
-        away.unlink()
+    if is_folder(away):
+        shutil.rmtree(away, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            away.unlink()
 
 
 def aside(final: Path, ending: str = PART) -> Path:

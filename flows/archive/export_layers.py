@@ -30,7 +30,7 @@ from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
 from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import LATEST, Archive, Ref, uri_of
+from spectralzoom.storage.store import LATEST, Archive, Ref, damage, uri_of
 
 
 @Parameter(name="*")
@@ -159,7 +159,7 @@ def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     folder = archive.run_folder(name or LATEST)
     run = read_run(folder)
     if run.problem is not None:
-        raise IncompleteStoreError(f"{folder} is damaged: {run.problem}; run verify on the archive")
+        raise damage(folder, run.problem)
     try:
         receipt = check_receipt(run.receipt)
     except ShapeError as error:

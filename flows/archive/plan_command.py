@@ -59,7 +59,7 @@ def dry_run(settings: Settings) -> tuple[SurveyPlan, Stores]:
     from spectralzoom.flows.survey import run_stages  # Prefect takes a second
 
     found = plan_survey(open_field(settings, planning=True))
-    archive = Archive(Path(settings.out).absolute(), writes=False)  # where there is none yet
+    archive = Archive(Path(settings.out).absolute())  # where there is none yet
     if is_archive(settings.out):
         archive = Archive.open(settings.out, create=False, write=False)
     stores = Stores(archive, dry=True)

@@ -52,15 +52,8 @@ from spectralzoom.storage.readers.recorded_files import (
 )
 from spectralzoom.storage.readers.zarr_files import lost_chunks
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
-from spectralzoom.storage.store import (
-    MANIFEST,
-    Archive,
-    array_digest,
-    check_store,
-    is_archive,
-    manifest_sha256,
-    try_manifest,
-)
+from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
+from spectralzoom.storage.whole_files import sha256
 
 SAME_PERIOD = 0.01
 RESTORED = "the raw lines were deleted: these are restored from the stored signal"
@@ -169,7 +162,7 @@ def open_recording(
         for cube in cubes
     )
     light = tuple(
-        f"{path.name} {manifest_sha256(path.parent)}"
+        f"{path.name} {sha256(path.parent / MANIFEST)}"
         if (path.parent / MANIFEST).is_file()
         else " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
         for path in stores
@@ -429,7 +422,7 @@ def _named_run(address: str | Path) -> tuple[str, str | None] | None:
 def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
     """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
     archive = Archive.open(address, create=False, write=False)
-    for folder in reversed(archive.past_runs()) if name is None else [archive.run_folder(name)]:
+    for folder in archive.past_runs() if name is None else [archive.run_folder(name)]:
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:

@@ -9,7 +9,6 @@ compared with its hash before it is sent, and after it is fetched.
 from __future__ import annotations
 
 import hashlib
-import logging
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
@@ -25,14 +24,13 @@ from spectralzoom.storage.store import (
     RESTS_ON,
     Archive,
     check_store,
-    is_ahead,
     is_cleared,
+    lies_ahead,
     parse_manifest,
     uri_of,
 )
 
 Report = Callable[[str, float], None]  # address, and the fraction that is done
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -139,10 +137,7 @@ def _of_run(objects: Objects, run: str, there: Collection[str]) -> list[str]:
 def _is_ahead(uri: str, objects: Objects) -> bool:
     """Return whether a run lies in the future, which a warning says."""
     text = objects.read(f"{uri}/{MANIFEST}")
-    ahead = text is None or is_ahead(uri.removeprefix("runs/")) or is_ahead(_manifest(uri, text)["created"])
-    if ahead:
-        log.warning("%s lies in the future, and so is not taken as the latest run; check the clock", uri)
-    return ahead
+    return text is None or lies_ahead(uri.removeprefix("runs/"), _manifest(uri, text)["created"], warns=True)
 
 
 def _conflicts(objects: Objects, archive: Archive, both: Iterable[str]) -> list[str]:

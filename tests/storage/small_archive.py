@@ -33,7 +33,7 @@ def small_survey(
 ) -> Small:
     """Make (or find) the stores of one survey, and a run that rests on them where ``named``."""
     light = {"scene": "farm", "seed": seed, "source": "sim" if simulated else "rig"}
-    raw = make_store(archive, "capture", light, [])
+    raw = make_store(archive, "capture", {"light": light}, [])
     mosaic = make_store(archive, "rectify", {"grid": {"height": 8, "width": 8}, "kernel": kernel}, [raw])
     drawn = make_store(archive, "segment", {"weights": "w0"}, [mosaic, raw])
     if not named:
