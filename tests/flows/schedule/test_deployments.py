@@ -10,24 +10,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import copy_context
-from dataclasses import replace
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import Queue
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 import yaml
 
 from spectralzoom.flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
-from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.tasks.local_server import local_server
-from spectralzoom.flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
-from spectralzoom.flows.tasks.prefect_tasks import Observer
-from spectralzoom.storage.parallel.pool import THREADS
+from spectralzoom.flows.tasks.rig_field import RIG_LIMIT, RigHold
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
 
@@ -122,28 +116,24 @@ def test_serve_ends_the_runs_of_a_killed_serve(north: Any, monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("scheduling")
-def test_two_fields_due_at_once_use_the_rig_in_turn(tmp_path: Path) -> None:
+def test_two_fields_due_at_once_use_the_rig_in_turn() -> None:
     """Prefect's limit makes the second wait; the rig's own lock would refuse it."""
     from prefect import flow
 
-    usual = load_settings(None, {"scene": "farm"})
-    rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
-    run: Any = SimpleNamespace(settings=rig, archive=Archive.open(tmp_path / "archive"), name="x")
     held: list[tuple[float, float]] = []
     inside = threading.Barrier(2)
 
     @flow(persist_result=False)
     def scan_pass() -> None:
-        plan = OpenSurvey(run, Observer())
-        capture: Any = SimpleNamespace(wants=Mock(), find=lambda *_: None)
+        hold = RigHold(f"/dev/ttyTURNS{os.getpid()}")
         inside.wait(PATIENCE_S)
-        with plan.at_work():
-            plan.hold_rig(capture)
+        with hold.released(lambda text: None):
+            for _ in range(2):  # captures of one survey
+                hold.take()
             began = time.monotonic()
             time.sleep(0.5)
             held.append((began, time.monotonic()))
 
-    assert rig.pool == THREADS
     with client() as asked:
         asked.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
     threads = [threading.Thread(target=copy_context().run, args=(scan_pass,)) for _ in range(2)]

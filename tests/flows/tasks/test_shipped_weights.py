@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
 from spectralzoom.flows.tradeoff import coarse_of_sweeps
 from spectralzoom.models.evaluation.metrics import mean_iou
@@ -60,7 +61,7 @@ def test_seconds_below_every_scan_are_refused(tmp_path: Path) -> None:
     """The message has the minimum; no archive is made."""
     asked = load_settings(None, {"seconds": "0.5", "size": "640x512", "out": str(tmp_path / "a")})
     with pytest.raises(BudgetError, match=r"--seconds 0.5; the least is .*every 8th line"):
-        open_run(asked)
+        plan_survey(open_field(asked))
     assert not (tmp_path / "a").exists()
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import zarr
 
-import spectralzoom.flows.tasks.prefect_tasks
-import spectralzoom.flows.tasks.rig_field
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.tasks.rig_field import rig_to_oneself
 from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 from spectralzoom.pipeline.rig.fakes import FakeCamera
@@ -121,7 +121,7 @@ def test_a_mounting_that_cannot_reach_the_field_is_refused(tmp_path: Path) -> No
     """The mirror's range ends before the field does; the error comes before anything moves."""
     beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
     with pytest.raises(PoseError, match=r"as mounted \(offset 0.5; 0.5\), .* outside the unit disk"):
-        open_run(fake_settings(tmp_path, **beside), planning=True)
+        plan_survey(open_field(fake_settings(tmp_path, **beside), planning=True))
 
 
 def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, watch: Watch) -> None:
@@ -150,7 +150,7 @@ def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, watch:
 def test_a_rig_on_hardware_is_for_one_survey(tmp_path: Path) -> None:
     """Stored lines need no rig, and a fake mirror no lock. A real mirror is used by one survey at a time."""
     settings = fake_settings(tmp_path, **{"rig.port": f"/dev/tty{tmp_path.name}"})
-    with spectralzoom.flows.tasks.rig_field.rig_to_oneself(settings.rig.port):  # by another survey
+    with rig_to_oneself(settings.rig.port):  # by another survey
         run_survey(settings, QUIET)
         real = replace(settings, visit="second", rig=replace(settings.rig, mirror_driver=""))
         with pytest.raises(RigError, match="in use by another survey"):

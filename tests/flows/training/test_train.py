@@ -17,8 +17,8 @@ from rich.console import Console
 
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.cli.model_verbs import TrainFlags
+from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.training import figures, train_scenes
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
@@ -197,7 +197,7 @@ def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
     for number in ("001", "002"):
         scene = folder / "images" / f"{number}_image.png"
         flags = {"scene": str(scene), "source": "sim", "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
-        notes[number] = " ".join(open_run(load_settings(None, flags)).notes)
+        notes[number] = " ".join(open_field(load_settings(None, flags)).notes)
     assert "a training scene" in notes["001"]
     assert "a training scene" not in notes["002"]
 
@@ -221,9 +221,9 @@ def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
     train_weights(_masked(tmp_path, slice(10), out))
     flags = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800], "source": "sim", "budget": 1}
     flags |= {"scene": str(tmp_path / "cube.npy"), "weights": str(out)}
-    run = open_run(load_settings(None, flags | {"out": str(tmp_path / "a")}))
-    assert (run.labels[:10] == 255).all()
-    assert (run.labels[10:] != 255).all()
+    labels = open_field(load_settings(None, flags | {"out": str(tmp_path / "a")})).labels.read()
+    assert (labels[:10] == 255).all()
+    assert (labels[10:] != 255).all()
 
 
 @pytest.mark.parametrize(
@@ -244,7 +244,7 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
     train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
     np.save(tmp_path / "other.npy", factor * values[..., : len(bands)])
     asked = {"scene": str(tmp_path / "other.npy"), "wavelengths": bands, "source": "raster", "weights": str(out)}
-    notes = " ".join(open_run(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
+    notes = " ".join(open_field(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
     assert re.search(note, notes)
     assert bool(note) == ("of the training" in notes)
 
