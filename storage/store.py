@@ -429,11 +429,12 @@ class Archive:
 
         def build_of_inputs(folder: Path) -> Mapping[str, Any]:
             paths = [self.root / one.uri for one in inputs]
-            before = [try_manifest(path) for path in paths]
+            before = [None if is_cleared(path) else try_manifest(path) for path in paths]
             try:
                 build(folder)
             finally:  # a cleared array reads as nodata, or fails
-                if any(map(is_cleared, paths)) or [try_manifest(path) for path in paths] != before:
+                same = (old in (None, try_manifest(path)) for path, old in zip(paths, before, strict=True))
+                if any(map(is_cleared, paths)) or not all(same):
                     raise ArchiveError(f"another survey has cleared an input of {stage} meanwhile; repeat the command")
             return facts
 
