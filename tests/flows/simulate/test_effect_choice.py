@@ -82,7 +82,6 @@ def test_a_stored_choice_reads_no_scene(scene_files: Path, decided: Decided, mon
         {"tol": "0.2"},
         {"tol": "0.1dn"},
         {"effects": "auto"},
-        {"seed": "1"},
         {"camera.exposure_ms": "50"},
         {"optics.smile_nm": 0.5},
         {"sky.started": "2026-06-01T12:00:00Z"},
@@ -90,7 +89,7 @@ def test_a_stored_choice_reads_no_scene(scene_files: Path, decided: Decided, mon
     ids=str,
 )
 def test_the_key_follows_the_inputs_of_the_choice(scene_files: Path, decided: Decided, flags: dict[str, Any]) -> None:
-    """Inputs are the tolerance with its unit, the requested effects, seed, camera, optics and sky."""
+    """Inputs are the tolerance with its unit, the requested effects, camera, optics and sky."""
     same, other = (choose(decided[0], settings_of(scene_files, **given), dry=True) for given in ({}, flags))
     assert same == decided[1] != other
 
