@@ -135,20 +135,15 @@ def test_changes_come_from_the_nearest_pixel(inputs: Inputs, tmp_path: Path) -> 
     assert (old_class[~seen] == UNLABELLED).all()
 
 
-def test_a_first_visit_has_no_changes(drawn: Path) -> None:
-    """The store has no variable for changes."""
-    with xr.open_zarr(drawn / STORE, consolidated=False) as content:
-        assert "changed_from" not in content
-
-
 def test_the_store_has_areas_pose_and_crs(drawn: Path) -> None:
-    """Areas are sums of footprints; plain xarray reads pose, pixel counts and CRS."""
+    """Areas are sums of footprints; plain xarray reads pose, pixel counts and CRS; a first visit has no changes."""
     areas = load_ground_map(drawn / STORE).areas
     exact = GRID.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
     assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
     with xr.open_zarr(drawn / STORE, consolidated=False) as content:
+        assert "changed_from" not in content
         assert content.attrs["proj:code"] == "EPSG:32632"
         assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
         assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}

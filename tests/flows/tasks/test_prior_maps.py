@@ -99,11 +99,9 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
 
 def test_a_survey_uses_no_prior_map_by_default(visited: Path, survey_png: Survey) -> None:
     """Its map is that of a first visit, so the stage is cached."""
-    published = survey_png(visited, **RASTER, visit=LATER)
-    assert "prior_map" not in published.receipt
-    fresh = survey_png(visited, **RASTER, visit=FIRST)
-    (row,) = (stage for stage in fresh.receipt["stages"] if stage["name"] == "segment")
-    assert row["state"] == "cached"
+    receipt = survey_png(visited, **RASTER, visit=LATER).receipt
+    assert "prior_map" not in receipt
+    assert "cached" in [stage["state"] for stage in receipt["stages"] if stage["name"] == "segment"]
 
 
 @pytest.mark.parametrize(

@@ -62,23 +62,14 @@ def broken(error: Exception) -> Callable[[], None]:
     return fail
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Result of a failed stage: the end of the command, the keys of the stores, and the problems in the archive."""
-
-    ended: Ended
-    keys: frozenset[str]
-    problems: list[Any]
-
-
 @dataclass
 class Walk:
     """Archive with a survey that was repeated until every stage had failed once, and then completed."""
 
     undisturbed: Path
     out: Path
-    keys: dict[str, str]  # of each stage that makes a store, of the undisturbed survey
-    trials: dict[str, Trial]
+    keys: dict[str, str]  # of each stage, of the undisturbed survey
+    trials: dict[str, tuple[Ended, set[str], list[str]]]  # by the stage that fails: its end, stores and problems
     builds: Counter[str]
     last: dict[str, str]  # states of the completed run
 
@@ -90,7 +81,7 @@ def walk(
     """Repeat one command while each stage fails in turn, one with a bug, the others with errors; return the result."""
     folder = tmp_path_factory.mktemp("failures")
     receipt = surveyed_png(folder / "undisturbed").receipt
-    keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
+    keys = {stage["name"]: stage["key"] for stage in receipt["stages"]}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, Counter(), {})
     files = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]
     flags = ["--source", "sim", "--engine", "plain", "--budget", "0.8"]
@@ -103,8 +94,8 @@ def walk(
             with pytest.MonkeyPatch.context() as once:
                 act_instead(once, stage, altered(stage, broken(KeyError("north") if stage == BUG else refusal(stage))))
                 ended = command(words)
-            stores = frozenset(ref.key for ref in Archive.open(found.out).refs())
-            found.trials[stage] = Trial(ended, stores, problems(found.out))
+            stores = {ref.key for ref in Archive.open(found.out).refs()}
+            found.trials[stage] = ended, stores, problems(found.out)
         receipt = survey_png(found.out).receipt
         found.last.update({stage["name"]: stage["state"] for stage in receipt["stages"]})
     return found
@@ -121,13 +112,12 @@ def command(words: list[Any]) -> Ended:
 @pytest.mark.parametrize("stage", OF_THIS)
 def test_a_failed_stage_gives_one_message(stage: str, walk: Walk) -> None:
     """It is the error, or for a bug the file with the traceback; the archive has the stores of earlier stages."""
-    before = OF_THIS[: OF_THIS.index(stage)]
-    trial = walk.trials[stage]
-    assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
-    assert "Traceback" not in trial.ended.err
-    assert trial.problems == []
-    assert trial.keys == {walk.keys[name] for name in before if name in walk.keys}
-    told, _, file = trial.ended.errors[0].partition("please report ")
+    ended, stores, damaged = walk.trials[stage]
+    assert (ended.code, ended.out, len(ended.errors)) == (1, "", 1)
+    assert "Traceback" not in ended.err
+    assert damaged == []
+    assert stores == {walk.keys[name] for name in OF_THIS[: OF_THIS.index(stage)]}
+    told, _, file = ended.errors[0].partition("please report ")
     if stage == BUG:
         assert told == "KeyError: 'north'; this is a defect of SpectralZoom: "
         assert "in fail" in Path(file).read_text()

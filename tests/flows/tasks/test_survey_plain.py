@@ -36,7 +36,7 @@ from spectralzoom.storage.arrays.mosaics import open_mosaic
 from spectralzoom.storage.runs import verify_everything
 from spectralzoom.storage.store import Archive
 from tests.conftest import CLASSES, QUIET, RGB_NM, patchy_scene, random_weights
-from tests.flows.conftest import FEW_BANDS, Page, problems
+from tests.flows.conftest import FEW_BANDS, Page
 from tests.models.conftest import coarse_prediction
 from tests.receipts import comparable
 
@@ -152,14 +152,6 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     assert [finding.problem for finding in verify_everything(archive)] == [None] * (len(STAGES) + 2)
     cleared = ("spool/*", "stages/capture/*/*.zarr", "stages/rectify/*/*")  # raw lines, mosaic of the first pass
     assert {path.name for some in cleared for path in tmp_path.glob(some)} == {"manifest.json", "cleared"}
-
-
-def test_a_first_mosaic_of_another_run_is_kept(survey_png: Any, tmp_path: Path) -> None:
-    """A survey of the first pass alone publishes it; a longer survey in the same archive does not clear it."""
-    alone = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
-    survey_png(tmp_path)
-    assert np.isfinite(alone.open("mosaic")["scores"].values).all()
-    assert problems(tmp_path) == []
 
 
 @pytest.mark.usefixtures("no_effects")

@@ -39,12 +39,13 @@ from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
+NUMBERS = ("001", "002", "003", "004")  # of frames
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with four frames of 16 x 16 px and two classes."""
-    return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), ("001", "002", "003", "004"))
+    return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), NUMBERS)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path:
 
 def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
     """It has the ranges of the training data, and the calibration by validation scenes."""
-    field = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004"))
+    field = write_field(tmp_path / "field", (32, 32), NUMBERS)
     record = train_weights(_request(field, out, validation=1))
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
@@ -328,6 +329,7 @@ def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
+        ({}, "training scenes"),  # others of the same names
         ({"hold_out": ("003",)}, "training scenes"),
         ({"validation": 2}, "training scenes"),
         ({"columns": 2}, "bands"),
@@ -335,19 +337,12 @@ def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
     ],
 )
 def test_continued_training_refuses_changed_input(
-    folder: Path, out: Path, first: tuple[Path, Any], changed: dict[str, Any], what: str
+    tmp_path: Path, out: Path, first: tuple[Path, Any], changed: dict[str, Any], what: str
 ) -> None:
-    """One message names the difference: missing training scenes, other bands or other network sizes."""
+    """One message names the difference: training scenes, of which the content counts, bands or network sizes."""
+    field = write_field(tmp_path / "field", (16, 16), NUMBERS, seed=0 if changed else 9)
     with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
-        train_weights(_request(folder, out, **{"validation": 1, "start": first[0], **changed}))
-
-
-def test_continued_training_refuses_other_scenes_of_the_same_names(folder: Path, out: Path, tmp_path: Path) -> None:
-    """Content identifies scenes; else validation could use scenes of the first training."""
-    train_weights(_request(folder, out, validation=0))
-    other = write_field(tmp_path / "field", (16, 16), ("001", "002", "003", "004"), seed=9)
-    with pytest.raises(SettingsError, match="other training scenes"):
-        train_weights(_request(other, tmp_path / "b.safetensors", validation=0, start=out))
+        train_weights(_request(field, out, **{"validation": 1, "start": first[0], **changed}))
 
 
 @pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])
