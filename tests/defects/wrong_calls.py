@@ -10,9 +10,8 @@ from spectralzoom.storage.store import Ref
 
 
 def call(stores: Stores, signal: Ref, camera: LineCamera, grid: SceneGrid) -> None:
-    """Call it as it is; with a renamed argument, one too few, another type and another input."""
+    """Call it as it is; with a renamed argument, one too few, and one too many."""
     locate(stores, signal, camera=camera, grid=grid)
     locate(stores, signal, lens=camera, grid=grid)  # type: ignore[call-arg]
     locate(stores, signal, camera=camera)  # type: ignore[call-arg]
-    locate(stores, signal, camera=grid, grid=grid)  # type: ignore[arg-type]
-    locate(stores, camera, camera=camera, grid=grid)  # type: ignore[arg-type]
+    locate(stores, signal, None, signal, camera=camera, grid=grid)  # type: ignore[call-arg]

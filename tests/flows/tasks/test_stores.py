@@ -118,13 +118,14 @@ def test_processes_make_the_same_archive(
         assert found["classes"].values.shape == (96, 128)
 
 
-def test_a_receipt_names_every_store_once() -> None:
+def test_a_receipt_names_every_store() -> None:
     """The mosaic of the first pass has its name where there is no second pass."""
-    names = ("raw", "signal", "mosaic", "seams", "places")
-    passes = [Pass(*(Ref(f"{name}-{number}", "k", Path()) for name in names)) for number in range(2)]
+    kinds = ("raw", "signal", "mosaic", "seams", "places")
+    first, second = (Pass(*(Ref(f"{kind}-{number}", "k", Path()) for kind in kinds)) for number in range(2))
     rest = {name: Ref(name, "k", Path()) for name in ("attention", "class_map", "effects", "ground", "accuracy")}
-    for second in (None, passes[1]):
-        found = Products(mosaic=(second or passes[0]).mosaic, first=passes[0], second=second, **rest)
-        shown = {uri_of(address) for address in found.addresses().values()}
-        assert found.addresses()["mosaic"].startswith(found.mosaic.uri)
-        assert shown == {ref.uri for ref in found.stores()} - ({passes[0].mosaic.uri} if second else set())
+    for later, given in ((None, [first]), (second, [first, second])):
+        found = Products(mosaic=given[-1].mosaic, first=first, second=later, **rest).addresses()
+        stores = {ref.uri for one in given for name, ref in vars(one).items() if name != "places" or one is first}
+        hidden = set() if later is None else {first.mosaic.uri}
+        assert {uri_of(address) for address in found.values()} == stores - hidden | {ref.uri for ref in rest.values()}
+        assert uri_of(found["mosaic"]) == given[-1].mosaic.uri
