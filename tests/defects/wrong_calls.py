@@ -10,8 +10,7 @@ from spectralzoom.storage.store import Ref
 
 
 def call(stores: Stores, signal: Ref, camera: LineCamera, grid: SceneGrid) -> None:
-    """Call it as it is; with a renamed argument, one too few, and one too many."""
+    """Call it as it is; with a renamed argument, and one too few."""
     locate(stores, signal, camera=camera, grid=grid)
     locate(stores, signal, lens=camera, grid=grid)  # type: ignore[call-arg]
     locate(stores, signal, camera=camera)  # type: ignore[call-arg]
-    locate(stores, signal, None, signal, camera=camera, grid=grid)  # type: ignore[call-arg]

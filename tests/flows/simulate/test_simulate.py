@@ -98,17 +98,10 @@ def test_an_interrupted_scan_resumes_at_its_line(
     np.testing.assert_array_equal(*(cube["dn"].values for cube in cubes))
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--effects", "smear,turbulance"], "--effects: unknown effect 'turbulance'; did you mean 'turbulence'"),
-        (["--workers", "0"], "--workers must be"),
-        (["--size", "64x64"], "size is for built-in scenes"),
-    ],
-)
-def test_bad_flag_refused(command_line: Any, scene_files: Path, tmp_path: Path, flags: list[str], message: str) -> None:
+def test_bad_flag_refused(command_line: Any, scene_files: Path, tmp_path: Path) -> None:
     """There is one message, the exit code is 2, and no archive is made."""
-    command_line("simulate", scene_files / "scene.png", "-o", tmp_path / "none", *flags).refused(2, message)
+    ended = command_line("simulate", scene_files / "scene.png", "-o", tmp_path / "none", "--size", "64x64")
+    ended.refused(2, "size is for built-in scenes")
     assert not (tmp_path / "none").exists()
 
 

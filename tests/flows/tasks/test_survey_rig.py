@@ -145,7 +145,6 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, weights: Path) -> N
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
     "axes": ({"rig.mirror_axes": "x,x"}, r"'rig.mirror_axes' must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
     "memory": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* at most 8191 pairs"),
     "size": ({"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"}, r"give its size"),
