@@ -20,7 +20,7 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.rectify.registration.illumination import LightRatio
 from spectralzoom.pipeline.rectify.sweep_paths import sweep_paths
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
-from spectralzoom.storage.store import Ref, write_table
+from spectralzoom.storage.store import Archive, write_table
 from tests.flows.publish.test_receipt import make_receipt
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
@@ -49,8 +49,8 @@ def test_a_false_class_is_listed_with_its_pixels() -> None:
 def test_the_offset_of_a_map_is_that_of_the_reference_sweep(tmp_path: Path) -> None:
     """Without registration the offset is zero."""
     errors = PointingErrors(9.0, 4)
-    write_table(tmp_path / "registration.json", {"reference": "coarse-3"})
-    off = evaluation.map_offset(errors, Ref("register", "key", tmp_path))
+    build = lambda path: write_table(path / "registration.json", {"reference": "coarse-3"})  # noqa: E731
+    off = evaluation.map_offset(errors, Archive.open(tmp_path).produce("register", build, version=1, params={})[0])
     np.testing.assert_array_equal(off, errors.offset("coarse-3"))
     assert (evaluation.map_offset(errors, None) == 0).all()
 
