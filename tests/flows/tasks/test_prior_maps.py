@@ -54,11 +54,6 @@ def visited(twice: tuple[Path, Any, Any], tmp_path: Path) -> Path:
     return Path(shutil.copytree(twice[0], tmp_path / "archive"))
 
 
-def class_map(out: Path, published: Any) -> np.ndarray:
-    """Return the classes of a run's map."""
-    return np.asarray(xr.open_zarr(out / published.receipt["products"]["class_map"], consolidated=False).classes.values)
-
-
 def words_of(out: Path, survey_png: Survey, **flags: Any) -> tuple[str, Any]:
     """Return the terminal output of a survey, joined into one line, and the run."""
     text = io.StringIO()
@@ -75,7 +70,8 @@ def test_a_first_visit_has_no_prior_map(twice: tuple[Path, Any, Any]) -> None:
     probabilities = xr.open_zarr(out / first.receipt["products"]["class_probabilities"], consolidated=False)
     assert float(probabilities.age.max()) == 0.0
     assert "changed_from" not in probabilities
-    agree = np.nan_to_num(probabilities.log_probability.values, nan=-9).argmax(axis=-1) == class_map(out, first)
+    drawn = xr.open_zarr(out / first.receipt["products"]["class_map"], consolidated=False).classes.values
+    agree = np.nan_to_num(probabilities.log_probability.values, nan=-9).argmax(axis=-1) == drawn
     assert agree.mean() > 0.95  # except for classes closer than one step, which these weights often give
 
 
