@@ -67,7 +67,7 @@ class Stage(Generic[P]):
         given = [ref for value in every.values() for ref in (value if isinstance(value, tuple) else (value,))]
         inputs = [ref for ref in given if isinstance(ref, Ref)]
         left_out = unkeyed_names(self.build)
-        named = inspect.getfullargspec(self.build).kwonlyargs
+        named = (name for name, one in call.signature.parameters.items() if one.kind is one.KEYWORD_ONLY)
         params = {name: every[name] for name in named if name not in left_out}
         request = Request(self, inputs, params, lambda out: self.build(out, *args, **facts))
         return task_in_flow(self.name, stores.name, partial(stores.get, request), *inputs, retries=self.retries)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,32 +20,13 @@ from spectralzoom.storage.arrays.layout import (
     write_image,
     write_small,
 )
-from spectralzoom.storage.store import KEY_LENGTH
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 
 
-def path_digest(
-    position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
-) -> str:
-    """Return 20 hex digits of everything that a sweep's scan paths depend on: its usable lines and their positions.
-
-    Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.scan_paths.make_scan_paths`.
-    Positions of unusable lines do not count; a correction of zero is none. Camera, binning, step and grid are
-    parameters of the stage.
-    """
-    lines = np.asarray(position, np.float64)
-    flags = np.ones(len(lines), np.bool_) if usable is None else np.asarray(usable, np.bool_)
-    moved = np.zeros_like(lines) if shift is None else np.asarray(shift, np.float64)
-    digest = hashlib.sha256(flags.tobytes())
-    for values in (lines, moved):
-        digest.update(np.ascontiguousarray(values[flags] + 0.0, "<f8").tobytes())  # + 0.0: -0 and 0 are one place
-    return digest.hexdigest()[:KEY_LENGTH]
-
-
-def write_geolocation(path: Path, tables: Tables, facts: Mapping[str, Any] | None = None) -> None:
-    """Store the scan paths and tie tables of sweeps, by name; ``facts`` are attributes: camera, grid, tolerance."""
-    root = create_group(path, "lookup", {**(facts or {}), "sweeps": list(tables)})
+def write_geolocation(path: Path, tables: Tables) -> None:
+    """Store the scan paths and tie tables of sweeps, by name."""
+    root = create_group(path, "lookup", {"sweeps": list(tables)})
     for number, (name, scan_paths) in enumerate(tables.items()):
         sweep = root.create_group(f"sweep_{number}", attributes={"sweep": name, "scan_paths": len(scan_paths)})
         for at, (scan_path, table) in enumerate(scan_paths):

@@ -168,7 +168,7 @@ def be_version(patch: pytest.MonkeyPatch, product: str, version: int) -> None:
     """Make all stages of a product write another version of it."""
     for name, stage in stages().items():
         if stage.product == product:
-            patch.setattr(f"spectralzoom.flows.survey.{name}", replace(stage, version=version))
+            act_instead(patch, name, replace(stage, version=version))
 
 
 @pytest.fixture

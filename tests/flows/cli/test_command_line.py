@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
 from functools import reduce
-from typing import Any
 
 import pytest
 
@@ -15,7 +13,6 @@ from spectralzoom.flows.cli import main as cli
 from spectralzoom.flows.cli.app import GOES_ON, VERBS, build_app
 from spectralzoom.flows.settings.flags import IN_TABLES
 from spectralzoom.flows.settings.load import SURVEY, TABLES
-from spectralzoom.flows.terminal.progress import print_json
 from tests.flows.conftest import python
 
 ONE_THREAD = """
@@ -83,13 +80,6 @@ def test_a_misspelt_word_gives_one_line(words: list[str], message: str, capsys: 
         cli.main(words)
     assert ended.value.code == 2
     assert capsys.readouterr().err == f"error: {message}\n"
-
-
-def test_printed_json_is_valid(capsys: pytest.CaptureFixture[str]) -> None:
-    """NaN and infinity become null."""
-    content: dict[str, Any] = {"a": float("nan"), "b": [1.5, float("inf")], "name": "ü"}
-    print_json(content)
-    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"a": None, "b": [1.5, None], "name": "ü"}
 
 
 def test_closed_streams_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

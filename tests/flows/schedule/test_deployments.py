@@ -9,13 +9,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextvars import copy_context
-from dataclasses import replace
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from queue import Queue
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -23,11 +20,9 @@ import pytest
 import yaml
 
 from spectralzoom.flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.tasks import rig_field
 from spectralzoom.flows.tasks.local_server import local_server
-from spectralzoom.flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
-from spectralzoom.flows.tasks.prefect_tasks import Observer
-from spectralzoom.storage.parallel.pool import THREADS
+from spectralzoom.flows.tasks.rig_field import RIG_LIMIT, RigHold
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
 
@@ -121,38 +116,27 @@ def test_serve_ends_the_runs_of_a_killed_serve(north: Any, monkeypatch: pytest.M
         assert asked.read_flow_run(after).state.is_pending()
 
 
-@pytest.mark.usefixtures("scheduling")
-def test_two_fields_due_at_once_use_the_rig_in_turn(tmp_path: Path) -> None:
-    """Prefect's limit makes the second wait; the rig's own lock would refuse it."""
+def test_a_survey_waits_for_the_rig_of_another_one(scheduling: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect's limit makes it wait, where the rig's own lock would refuse it; it is taken once for all captures."""
     from prefect import flow
 
-    usual = load_settings(None, {"scene": "farm"})
-    rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
-    run: Any = SimpleNamespace(settings=rig, archive=Archive.open(tmp_path / "archive"), name="x")
-    held: list[tuple[float, float]] = []
-    inside = threading.Barrier(2)
-
-    @flow(persist_result=False)
-    def scan_pass() -> None:
-        plan = OpenSurvey(run, Observer())
-        capture: Any = SimpleNamespace(wants=Mock(), find=lambda *_: None)
-        inside.wait(PATIENCE_S)
-        with plan.at_work():
-            plan.hold_rig(capture)
-            began = time.monotonic()
-            time.sleep(0.5)
-            held.append((began, time.monotonic()))
-
-    assert rig.pool == THREADS
+    monkeypatch.setattr(rig_field, "TRY_S", 1)
+    hold, slot = RigHold(f"/dev/ttyTURNS{os.getpid()}"), {"names": [RIG_LIMIT], "slots": 1}
     with client() as asked:
         asked.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-    threads = [threading.Thread(target=copy_context().run, args=(scan_pass,)) for _ in range(2)]
-    for one in threads:
-        one.start()
-    for one in threads:
-        one.join(PATIENCE_S)
-    (_, ended), (began, _) = sorted(held)
-    assert ended <= began
+        asked.increment_concurrency_slots(**slot, mode="concurrency")
+        note = Mock(side_effect=lambda text: asked.release_concurrency_slots(**slot, occupancy_seconds=1.0))
+
+        @flow(persist_result=False)
+        def captures() -> list[int]:
+            with hold.released(note):
+                hold.take()
+                hold.take()
+                return [asked.read_global_concurrency_limit_by_name(RIG_LIMIT).active_slots]
+
+        assert captures() == [1]
+        assert asked.read_global_concurrency_limit_by_name(RIG_LIMIT).active_slots == 0
+    assert [words.args[0].split(":")[0] for words in note.call_args_list] == ["waits for the rig"]
 
 
 def wait_for(name: str) -> None:

@@ -5,49 +5,23 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from spectralzoom.flows.tasks import rig_field
-from spectralzoom.flows.tasks.rig_field import rig_to_oneself
+from spectralzoom.flows.tasks.rig_field import RigHold, rig_to_oneself
 from spectralzoom.pipeline.errors import RigError
 
-ROOT = Path(__file__).parents[3]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine use two rigs
-TAKES = """
+HOLDS = """
 import sys
 from spectralzoom.flows.tasks.rig_field import rig_to_oneself
-try:
-    with rig_to_oneself(sys.argv[1]):
-        print(True, flush=True)
-        sys.stdin.read()
-except OSError:
-    print(False, flush=True)
+with rig_to_oneself(sys.argv[1]):
+    print(flush=True)
     sys.stdin.read()
 """
-
-
-@contextmanager
-def takers(folder: Path, count: int) -> Iterator[list[tuple[subprocess.Popen[str], bool]]]:
-    """Yield processes that try to take the rig in turn, each with another TMPDIR and HOME."""
-    tried: list[tuple[subprocess.Popen[str], bool]] = []
-    try:
-        for number in range(count):
-            temporary = folder / f"tmp-{number}"
-            temporary.mkdir(mode=0o777)
-            environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), "HOME": str(temporary)}
-            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-            process = subprocess.Popen([sys.executable, "-c", TAKES, PORT], env=environment, text=True, **pipes)
-            tried.append((process, process.stdout.readline() == "True\n"))
-        yield tried
-    finally:
-        for process, _ in tried:
-            process.kill()
-            process.communicate()
 
 
 def assert_held(port: str) -> None:
@@ -56,16 +30,30 @@ def assert_held(port: str) -> None:
         pass
 
 
-def test_one_of_three_processes_holds_the_rig(tmp_path: Path) -> None:
-    """Each has another TMPDIR; the rig is free once its holder is killed."""
-    with takers(tmp_path, 3) as tried:
-        assert [took for _, took in tried] == [True, False, False]
+def test_a_killed_holder_frees_the_rig(tmp_path: Path) -> None:
+    """Until then it holds it also for processes with another TMPDIR and HOME."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    environment |= {"TMPDIR": str(tmp_path), "HOME": str(tmp_path)}
+    command = [sys.executable, "-c", HOLDS, PORT]
+    with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"\n"
         assert_held(PORT)
-        first = tried[0][0]
-        first.kill()
-        first.wait()
+        holder.kill()
+    with rig_to_oneself(PORT):
+        assert_held(PORT)
+
+
+def test_a_survey_holds_the_rig_from_its_first_capture_to_its_end() -> None:
+    """Stored captures need no rig; later ones find it held by their own survey."""
+    hold = RigHold(PORT)
+    with hold.released(lambda text: None):
         with rig_to_oneself(PORT):
             assert_held(PORT)
+        for _ in range(2):
+            hold.take()
+            assert_held(PORT)
+    with rig_to_oneself(PORT):
+        pass
 
 
 def test_a_lock_belongs_to_the_port(tmp_path: Path) -> None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
 from spectralzoom.flows.evaluate.frames import EvaluateRequest
-from spectralzoom.flows.tasks.run import SurveyRun
+from spectralzoom.flows.tasks.field_work import WeightsFile
 from spectralzoom.flows.tasks.survey_model import shipped_weights
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
+from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.storage.store import text_of
 from tests.conftest import Survey
 
 REFUSED = "--device mps: torch can use none on this machine; there is .*: give that, or auto"
@@ -41,8 +43,8 @@ def test_trainings_and_evaluations_refuse_an_absent_device(tmp_path: Path) -> No
 
 
 def test_a_map_of_another_device_is_another_store() -> None:
-    """Its last bits may differ; the key of a map from the processor names no device."""
-    described = SimpleNamespace(key="w")
-    runs = [SimpleNamespace(settings=SimpleNamespace(device=name), described=described) for name in ("cpu", "cuda")]
-    keys = [SurveyRun.model_key.fget(run) for run in runs]  # type: ignore[attr-defined]
-    assert keys == [{"weights": "w"}, {"weights": "w", "device": "cuda"}]
+    """Its last bits may differ; another file of the same weights gives the same map."""
+    path = shipped_weights()
+    here, there = (WeightsFile.of(path, describe_weights(path), device) for device in ("cpu", "cuda"))
+    assert text_of(here) != text_of(there)
+    assert text_of(replace(here, path=Path("copy"))) == text_of(here)

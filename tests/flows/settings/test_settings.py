@@ -276,15 +276,9 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
         ({"macs": "40%"}, "whole"),
         ({"zoom": "always"}, "whole"),
         ({"prior": "none"}, "whole"),
+        ({"prior": "auto"}, "whole"),  # the default
     ],
 )
 def test_a_prior_map_and_seconds_select_a_partial_scan(more: dict[str, str], extent: str) -> None:
     """Without prior map, or with another choice of lines, the whole field is captured."""
     assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent
-
-
-def test_an_explicit_default_changes_nothing() -> None:
-    """prior = auto, set or not, keeps the extent."""
-    asked = {"scene": "farm", "seconds": 5}
-    assert load_settings(None, asked) == load_settings(None, {**asked, "prior": "auto"})
-    assert load_settings(None, {**asked, "prior": "latest"}).extent == "part"

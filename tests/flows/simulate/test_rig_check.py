@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -86,15 +86,11 @@ def test_mirror_faults_fail_the_check_and_nothing_moves(script: list[Pair], aske
 
 def test_the_square_ends_at_the_first_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """A corner that is not reached is the last row. An error without a remedy gives a row without one."""
-    monkeypatch.setattr(FakeMirror, "settle", lambda *_: failing())
+    monkeypatch.setattr(FakeMirror, "settle", Mock(side_effect=RigError("it is not at rest after 2 s; mend that")))
     rows = check_mirror(lambda: FakeMirror(FakeClock()), move=True)
     assert told(rows, "fail") == ["go to 0.03; 0.03"]
     assert len(rows) == 2
     assert failed("mirror", "connect", RigError("no")) == CheckRow("mirror", "connect", "no", "fail", "")
-
-
-def failing() -> None:
-    raise RigError("it is not at rest after 2 s; mend that")
 
 
 def camera_of(script: Sequence[Pair], server: FileServer) -> Callable[[], HeadwallCamera]:
@@ -125,10 +121,7 @@ def test_a_working_camera_passes_the_check() -> None:
 
 def test_a_camera_that_is_not_there_fails_the_check() -> None:
     """Neither its control port nor its files answer."""
-
-    def gone() -> Any:
-        raise DeviceGone("no connection to it; is the camera on?")
-
+    gone = Mock(side_effect=DeviceGone("no connection to it; is the camera on?"))
     camera = HeadwallCamera(gone, FileServer("127.0.0.1", 1), clock=FakeClock())
     rows = check_camera(lambda: camera)
     assert told(rows, "fail") == ["connect", "log in to its files, port 1"]

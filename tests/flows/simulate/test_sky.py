@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.pipeline.errors import SettingsError
 
@@ -56,7 +57,7 @@ def test_scans_expose_longer_under_clouds(tmp_path: Path) -> None:
     planned = {"scene": "scouting", "size": "160x128", "out": str(tmp_path)}
     for asked, same in (({}, True), ({"seconds": 4}, False)):
         clear, dim = (
-            open_run(load_settings(None, planned | asked | sky), planning=True)
+            plan_survey(open_field(load_settings(None, planned | asked | sky), planning=True))
             for sky in ({}, {"sky.light": "overcast"})
         )
         assert clear.scans.chosen is not None
@@ -75,7 +76,7 @@ def test_a_scan_by_hand_scores_by_its_light(tmp_path: Path) -> None:
     """200 ms under an overcast sky have the expected score of 25 ms under a clear one."""
     planned = {"scene": "scouting", "size": "160x128", "out": str(tmp_path), "scan_step": 2}
     asked = ({"scan_exposure_ms": 25}, {"scan_exposure_ms": 200, "sky.light": "overcast"})
-    clear, dim = (open_run(load_settings(None, planned | one), planning=True) for one in asked)
+    clear, dim = (plan_survey(open_field(load_settings(None, planned | one), planning=True)) for one in asked)
     assert clear.capture == dim.capture
     assert dim.scans.chosen.expected == pytest.approx(dict(clear.scans.chosen.expected))
     assert dim.scans.chosen.seconds > clear.scans.chosen.seconds

@@ -10,20 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spectralzoom.flows.stages import evaluate as evaluation
+from spectralzoom.flows.stages import register
 from spectralzoom.flows.tasks.scene import judged_labels
 from spectralzoom.flows.tasks.scores import format_false_classes, format_worst_class, score_of
-from spectralzoom.flows.tasks.stages import accuracy as evaluation
-from spectralzoom.flows.tasks.stages import placement
 from spectralzoom.models.evaluation.metrics import confusion
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.rectify.registration.illumination import LightRatio
 from spectralzoom.pipeline.rectify.sweep_paths import sweep_paths
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
-from spectralzoom.pipeline.simulator.rig_model import Rig
-from spectralzoom.pipeline.simulator.scenes.scene import raster_from_values
-from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, write_table
 from tests.flows.publish.test_receipt import make_receipt
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
@@ -51,22 +48,20 @@ def test_a_false_class_is_listed_with_its_pixels() -> None:
 
 def test_the_offset_of_a_map_is_that_of_the_reference_sweep(tmp_path: Path) -> None:
     """Without registration the offset is zero."""
-    scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
     errors = PointingErrors(9.0, 4)
-    source = SimulatedSource(scene, Rig(), pointing=errors)
-    build = lambda path: (path / "registration.json").write_text('{"reference": "coarse-3"}')  # noqa: E731
-    off = evaluation.map_offset(source, [Archive.open(tmp_path).produce("register", build, version=1, params={})[0]])
+    build = lambda path: write_table(path / "registration.json", {"reference": "coarse-3"})  # noqa: E731
+    off = evaluation.map_offset(errors, Archive.open(tmp_path).produce("register", build, version=1, params={})[0])
     np.testing.assert_array_equal(off, errors.offset("coarse-3"))
-    assert (evaluation.map_offset(source, []) == 0).all()
+    assert (evaluation.map_offset(errors, None) == 0).all()
 
 
 def test_light_gains_and_path_corrections_are_per_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two sweeps in different light meet halfway; offset, drift and gain apply to their own sweep."""
     ratio = LightRatio(0, 1, np.log([4.0, 4.0]), np.zeros(2))
-    monkeypatch.setattr(placement, "overlap_light", lambda *_: [ratio])
+    monkeypatch.setattr(register, "overlap_light", lambda *_: [ratio])
     placed: Any = [SimpleNamespace(lines=SimpleNamespace(sweep=SimpleNamespace(name=name))) for name in "ab"]
     found: Any = SimpleNamespace(windows=[SimpleNamespace(window=None, measured=True)])
-    gains = placement.light_gains(found, placed, LineCamera(), np.array([500.0, 600.0]))
+    gains = register.light_gains(found, placed, LineCamera(), np.array([500.0, 600.0]))
     np.testing.assert_allclose(gains["a"], 2.0, rtol=1e-6)
     np.testing.assert_allclose(gains["b"], 0.5, rtol=1e-6)
     record = {"a": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.5, 0.0], "gain": [0.5, 2.0]}}

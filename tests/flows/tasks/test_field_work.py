@@ -10,12 +10,13 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
-from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile, region_params
+from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile
 from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.flows.tasks.prior_maps import Prior
-from spectralzoom.flows.tasks.run import SurveyRun, open_run
 from spectralzoom.models.network.sizes import CELL_PX
 from spectralzoom.models.reading.regions import plan_regions
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
@@ -26,7 +27,7 @@ from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.store import Ref
 from tests.conftest import Flags, Survey
 
-Surveyed = tuple[SurveyRun, Path]
+Surveyed = tuple[SurveyPlan, Path]
 MOST_PX = (64, 640)  # of 96 x 128 px: two regions
 ALL_PX = 96  # a halo that reaches over the whole field
 
@@ -35,9 +36,9 @@ ALL_PX = 96  # a halo that reaches over the whole field
 def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> Surveyed:
     """Return a survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
-    with mock.patch("spectralzoom.flows.publish.publishing._clear_first_mosaic"):
+    with mock.patch("spectralzoom.flows.survey.clear_first_mosaic"):
         survey_png(out)
-    return open_run(load_settings(None, flags_png(out, budget="0.8"))), out / "stages"
+    return plan_survey(open_field(load_settings(None, flags_png(out, budget="0.8")))), out / "stages"
 
 
 def _store(stages: Path, stage: str) -> Ref:
@@ -50,19 +51,19 @@ def _mosaics(stages: Path) -> list[Ref]:
     return [_store(stages, name) for name in ("rectify", "rectify_fine")]
 
 
-def _work(run: SurveyRun, pool: WorkerPool, halo: int) -> FieldWork:
-    return replace(run.work, regions=plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
+def _work(plan: SurveyPlan, pool: WorkerPool, halo: int) -> FieldWork:
+    return replace(plan.work, regions=plan_regions(plan.field.grid, SHARD, most_px=MOST_PX, halo=halo), pool=pool)
 
 
 def _draw(
-    work: FieldWork, run: SurveyRun, stages: Path, out: Path, least_gain: float | None = None
+    work: FieldWork, plan: SurveyPlan, stages: Path, out: Path, least_gain: float | None = None
 ) -> dict[str, bytes]:
     """Return the bytes of the map that this work writes into a new folder."""
-    legend = ClassNames(run.weights.class_names, run.weights.class_colours)
+    legend = ClassNames(plan.field.weights.class_names, plan.field.weights.class_colours)
     out.mkdir()
-    create_class_map(out / MAP, run.scene.shape, legend, grid=run.frame.angular_grid())
-    create_probabilities(out / PROBABILITIES, run.scene.shape, legend, grid=run.frame.angular_grid())
-    drawing = Drawing(work.weights, _mosaics(stages)[1], _store(stages, "score"), run.capture)
+    create_class_map(out / MAP, plan.field.scene.shape, legend, grid=plan.field.frame.angular_grid())
+    create_probabilities(out / PROBABILITIES, plan.field.scene.shape, legend, grid=plan.field.frame.angular_grid())
+    drawing = Drawing(work.weights, _mosaics(stages)[1], _store(stages, "score"), plan.capture)
     draw_field(work, drawing, out, least_gain, lambda done: None)
     assert sorted(path.name for path in out.iterdir()) == [MAP, PROBABILITIES]  # no overview is left
     consolidate_stores(out)  # as published stores are
@@ -76,11 +77,11 @@ def _contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("pool", [WorkerPool(workers=1), WorkerPool(workers=2)], ids=["one", "two"])
 def test_regions_with_a_full_halo_give_the_same_map(surveyed: Surveyed, tmp_path: Path, pool: WorkerPool) -> None:
     """The bytes are equal for one and two workers; the stage's own map is that of one region."""
-    run, stages = surveyed
+    plan, stages = surveyed
     stored = _contents(_store(stages, "segment").path / MAP)
-    assert len(_work(run, pool, ALL_PX).regions) == 2
-    assert _draw(_work(run, pool, ALL_PX), run, stages, tmp_path / "m") == stored
-    assert _draw(run.work, run, stages, tmp_path / "one") == stored
+    assert len(_work(plan, pool, ALL_PX).regions) == 2
+    assert _draw(_work(plan, pool, ALL_PX), plan, stages, tmp_path / "m") == stored
+    assert _draw(plan.work, plan, stages, tmp_path / "one") == stored
 
 
 @pytest.mark.parametrize(("overviews", "stored"), [(16, True), (16, False), (1, True)])
@@ -88,14 +89,14 @@ def test_regions_choose_patches_by_the_classes_of_the_field(
     surveyed: Surveyed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overviews: int, stored: bool
 ) -> None:
     """With a halo over the whole field they choose as one region does."""
-    run, stages = surveyed
-    gain = run.work.score("gain", _mosaics(stages)[1], run.capture, lambda done: None)
+    plan, stages = surveyed
+    gain = plan.work.score("gain", _mosaics(stages)[1], plan.capture, lambda done: None)
     least = float(np.quantile(gain, 0.7)) + 1e-9
     monkeypatch.setattr("spectralzoom.flows.tasks.drawing.MOST_OVERVIEWS", overviews)
     if not stored:  # an overview that was not kept is computed again
         monkeypatch.setattr("spectralzoom.flows.tasks.drawing.load_overview", lambda path, weights: None)
-    regions = _draw(_work(run, WorkerPool(workers=2), ALL_PX), run, stages, tmp_path / "m", least)
-    whole = _draw(run.work, run, stages, tmp_path / "one", least)
+    regions = _draw(_work(plan, WorkerPool(workers=2), ALL_PX), plan, stages, tmp_path / "m", least)
+    whole = _draw(plan.work, plan, stages, tmp_path / "one", least)
     assert (regions == whole) == (overviews == 16)  # one of two regions has other classes
     assert regions != _contents(_store(stages, "segment").path / MAP)
 
@@ -108,24 +109,24 @@ def test_scores_of_regions_equal_those_of_the_field(
     surveyed: Surveyed, policy: str, halo_px: int, within: float
 ) -> None:
     """The halo covers the field, or one patch, which edges need; the stage's own scores are the same for its policy."""
-    run, stages = surveyed
+    plan, stages = surveyed
     mosaic = _mosaics(stages)[0]
-    whole = run.work.score(policy, mosaic, run.capture, lambda done: None)
-    parts = _work(run, WorkerPool(workers=2), halo_px).score(policy, mosaic, run.capture, lambda done: None)
+    whole = plan.work.score(policy, mosaic, plan.capture, lambda done: None)
+    parts = _work(plan, WorkerPool(workers=2), halo_px).score(policy, mosaic, plan.capture, lambda done: None)
     np.testing.assert_allclose(parts, whole, rtol=within)  # gains are sums over the field
-    if policy == run.settings.policy:
+    if policy == plan.settings.policy:
         assert (read_array(open_group(_store(stages, "score").path / "attention.zarr"), "score") == whole).all()
 
 
 def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -> None:
     """A worker uses the weights that were sent, whatever file is at their path."""
-    run, stages = surveyed
+    plan, stages = surveyed
     copy = tmp_path / "w.safetensors"
-    copy.write_bytes(run.work.weights.path.read_bytes())
-    scoring = Scoring(replace(run.work.weights, path=copy), _mosaics(stages)[0], run.capture, "entropy")
-    sent = pickle.dumps((scoring, run.work.regions[0]))
+    copy.write_bytes(plan.work.weights.path.read_bytes())
+    scoring = Scoring(replace(plan.work.weights, path=copy), _mosaics(stages)[0], plan.capture, "entropy")
+    sent = pickle.dumps((scoring, plan.work.regions[0]))
     assert len(sent) < copy.stat().st_size + 2000
-    expected = scoring(run.work.regions[0])
+    expected = scoring(plan.work.regions[0])
     copy.write_bytes(b"other weights")
     travelled, region = pickle.loads(sent)
     assert (travelled(region) == expected).all()
@@ -157,24 +158,27 @@ def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None
     copy = tmp_path / "w.safetensors"
     copy.write_bytes(weights.read_bytes())
     with pytest.raises(WeightsError, match=r"w\.safetensors have changed since the survey began"):
-        WeightsFile(copy, "0" * 20).load()
+        WeightsFile(copy, "0" * 20, "key").load()
 
 
 @pytest.mark.parametrize("size", [(640, 640), (641, 90), (90, 641)])
 def test_keys_contain_regions_for_divided_fields_only(size: tuple[int, int]) -> None:
-    """Stores of fields up to 640 px keep their keys; a larger field gives another result in regions."""
-    assert bool(region_params(SceneGrid(*size, 16))) == (max(size) > 640)
+    """The pool and the memory do not count; a field of more than 640 px gives another result in regions."""
+    regions, file = plan_regions(SceneGrid(*size, 16), SHARD), WeightsFile(Path("w"), "seal", "key")
+    keys = [FieldWork(file, regions, WorkerPool(workers=count), count).key for count in (1, 2)]
+    assert (keys[0]["regions"] is not None) == (max(size) > 640)
+    assert keys[0] == keys[1]
 
 
 def test_a_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
     """Features come from outside of a region's halo, as far as the field has them."""
-    run, stages = surveyed
-    classes = tuple(range(len(run.weights.class_names)))
+    plan, stages = surveyed
+    classes = tuple(range(len(plan.field.weights.class_names)))
     before = Prior("a run", _store(stages, "segment"), _mosaics(stages)[0], 1.0, None, classes)
-    (field,) = plan_regions(run.grid, SHARD)
-    whole = prior_map_of(before, field, run.weights).coarse
+    (field,) = plan_regions(plan.field.grid, SHARD)
+    whole = prior_map_of(before, field, plan.field.weights).coarse
     assert whole is not None
-    for region in plan_regions(run.grid, SHARD, most_px=MOST_PX, halo=16):
+    for region in plan_regions(plan.field.grid, SHARD, most_px=MOST_PX, halo=16):
         here = region.read.over(CELL_PX)
-        found = prior_map_of(before, region, run.weights).coarse
+        found = prior_map_of(before, region, plan.field.weights).coarse
         np.testing.assert_array_equal(found, whole[here.rows, here.columns])

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,8 @@ import pytest
 import xarray as xr
 
 from spectralzoom.flows.settings.survey_settings import Settings
-from spectralzoom.flows.tasks.stages.maps import STORE, colours_of, ground
+from spectralzoom.flows.stage import Output
+from spectralzoom.flows.stages.ground import STORE, colours_of, ground
 from spectralzoom.flows.tasks.zones import place_of_field
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import PosedField
@@ -23,31 +23,25 @@ from spectralzoom.storage.arrays import class_maps
 from spectralzoom.storage.arrays.georeference import AngularGrid
 from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.layout import open_group, read_array
-from spectralzoom.storage.store import Archive, Ref
+from spectralzoom.storage.store import Ref, text_of
 from tests.exported_run import POSE
 from tests.storage.plain_mosaic import write_values
 from tests.storage.small_archive import write_class_map
 
-Stores = tuple[Ref, Ref]
+Inputs = tuple[Ref, Ref]  # class map and mosaic
 SHAPE = (120, 160)
 FIELD: Any = SimpleNamespace(shape=SHAPE, geobox=None, pixel_m=None)
 LEGEND = class_maps.ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
 
 
-@dataclass(frozen=True)
-class Run:
-    """Stand-in for a survey, with what the stage needs."""
+def grid_of(settings: Settings) -> GroundGrid:
+    """Return the grid on the ground that these settings ask for."""
+    place = place_of_field(settings, FIELD)
+    assert isinstance(place, PosedField)
+    return place.grid
 
-    archive: Archive
-    settings: Settings = field(default_factory=lambda: Settings(pose=POSE))
-    report: Callable[[float], None] = lambda done: None
 
-    @property
-    def ground_grid(self) -> GroundGrid:
-        """Return the grid that the settings ask for."""
-        place = place_of_field(self.settings, FIELD)
-        assert isinstance(place, PosedField)
-        return place.grid
+GRID = grid_of(Settings(pose=POSE))
 
 
 def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
@@ -63,13 +57,7 @@ def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = N
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
-    """Return a survey of a small field with a pose."""
-    return Run(Archive.open(tmp_path / "archive"))
-
-
-@pytest.fixture
-def stores(tmp_path: Path) -> Stores:
+def inputs(tmp_path: Path) -> Inputs:
     """Return stores of a class map of two halves, the upper right nodata, and of a mosaic that brightens downwards."""
     classes = np.zeros(SHAPE, np.uint8)
     classes[:, 80:] = 1
@@ -85,34 +73,40 @@ def stores(tmp_path: Path) -> Stores:
     return Ref("segment", "m", tmp_path / "map"), Ref("rectify", "r", tmp_path / "mosaic")
 
 
-def draw(run: Run, stores: Stores) -> Ref:
-    """Run the stage as an engine does and return its store."""
-    return ground.produce(run.archive, ground.wants(run, *stores))[0]
+@pytest.fixture
+def drawn(inputs: Inputs, tmp_path: Path) -> Path:
+    """Return the folder of the map on the ground of these stores."""
+    return draw(tmp_path / "ground", *inputs)
 
 
-def image(ref: Ref, name: str) -> np.ndarray:
+def draw(folder: Path, class_map: Ref, mosaic: Ref) -> Path:
+    """Run the stage into a folder and return it."""
+    folder.mkdir()
+    ground.build(Output(folder, lambda done: None, folder), class_map, mosaic, ground_grid=GRID)
+    return folder
+
+
+def image(folder: Path, name: str) -> np.ndarray:
     """Read an image of a map on the ground."""
-    return read_array(open_group(ref.path / STORE), name)
+    return read_array(open_group(folder / STORE), name)
 
 
-def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores) -> None:
+def test_map_and_picture_follow_the_rays_to_the_ground(inputs: Inputs, drawn: Path) -> None:
     """Each scene pixel's class is at the end of its ray; the picture brightens towards the rig, as the mosaic does."""
-    ref = draw(run, stores)
-    found = load_ground_map(ref.path / STORE)
-    grid = run.ground_grid
+    found = load_ground_map(drawn / STORE)
     y, x = pixel_places(SHAPE)
     points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
-    places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
+    places = GRID.frame.ground_to_map(GRID.frame.view.scene_to_ground(points))
     column, row = (np.floor(part).astype(int) for part in ~found.geobox.affine * places.T)
     wanted = np.where(points[:, 1] < 0, 0, np.where(points[:, 0] < y[30], UNLABELLED, 1))
-    assert image(ref, "classes")[row, column].tolist() == wanted.tolist()
-    sure = image(ref, "confidence")[row, column]
+    assert image(drawn, "classes")[row, column].tolist() == wanted.tolist()
+    sure = image(drawn, "confidence")[row, column]
     np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
     assert sure[wanted == 1] == pytest.approx(0.75)
-    tones = colours_of(stores[1])
+    tones = colours_of(inputs[1])
     assert np.nanmin(tones) >= 1
     assert np.isnan(tones[:20, :20]).all()
-    picture = image(ref, "picture")
+    picture = image(drawn, "picture")
     seen = picture.max(axis=2) > 0
     assert 0.3 < seen.mean() < 0.95
     assert not seen[0, 0]
@@ -121,49 +115,41 @@ def test_map_and_picture_follow_the_rays_to_the_ground(run: Run, stores: Stores)
     assert np.corrcoef(along, picture[row, column, 0])[0, 1] > 0.95
 
 
-def field_pixels(run: Run, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def field_pixels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the mask of map pixels within the field, and row and column of the field's pixel that each shows."""
-    places = run.ground_grid.scene_pixels(*(slice(0, size) for size in shape))
+    places = GRID.scene_pixels(*(slice(0, size) for size in shape))
     seen = np.isfinite(places[..., 0])
     return seen, np.floor(places[seen] + 0.5).astype(int).T
 
 
-def test_changes_come_from_the_nearest_pixel(run: Run, stores: Stores, tmp_path: Path) -> None:
+def test_changes_come_from_the_nearest_pixel(inputs: Inputs, tmp_path: Path) -> None:
     """Old classes are not interpolated; outside of the field they are nodata."""
     rng = np.random.default_rng(3)
     old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
-    write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(stores[0].path / "class_map.zarr"))
+    write_class_map(tmp_path / "later" / "class_map.zarr", class_maps.load_class_map(inputs[0].path / "class_map.zarr"))
     believe(tmp_path / "later", np.zeros(SHAPE, np.float32), old.astype(np.uint8))
-    ref = draw(run, (Ref("segment", "l", tmp_path / "later"), stores[1]))
-    old_class = image(ref, "changed_from")
-    seen, (row, column) = field_pixels(run, old_class.shape)
+    drawn = draw(tmp_path / "ground", Ref("segment", "l", tmp_path / "later"), inputs[1])
+    old_class = image(drawn, "changed_from")
+    seen, (row, column) = field_pixels(old_class.shape)
     np.testing.assert_array_equal(old_class[seen], old[row, column])
     assert (old_class[~seen] == UNLABELLED).all()
 
 
-def test_a_first_visit_has_no_changes(run: Run, stores: Stores) -> None:
-    """The store has no variable for changes."""
-    ref = draw(run, stores)
-    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
-        assert "changed_from" not in content
-
-
-def test_the_store_has_areas_pose_and_crs(run: Run, stores: Stores) -> None:
-    """Areas are sums of footprints; plain xarray reads pose, pixel counts and CRS."""
-    ref = draw(run, stores)
-    areas = load_ground_map(ref.path / STORE).areas
-    exact = run.ground_grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
+def test_the_store_has_areas_pose_and_crs(drawn: Path) -> None:
+    """Areas are sums of footprints; plain xarray reads pose, pixel counts and CRS; a first visit has no changes."""
+    areas = load_ground_map(drawn / STORE).areas
+    exact = GRID.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
     assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
-    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+    with xr.open_zarr(drawn / STORE, consolidated=False) as content:
+        assert "changed_from" not in content
         assert content.attrs["proj:code"] == "EPSG:32632"
         assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
         assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
 
 
-def test_the_key_follows_the_pose(run: Run, stores: Stores) -> None:
-    """The same pose finds its store; another tilt makes a new one."""
-    changed = [run.settings, replace(run.settings, pose=replace(POSE, tilt_deg=51.0)), run.settings]
-    keys = [draw(replace(run, settings=settings), stores).key for settings in changed]
-    assert keys[0] == keys[2] != keys[1]
+def test_the_key_follows_the_pose() -> None:
+    """The same pose has the same key; another tilt has another one."""
+    same, other = (grid_of(Settings(pose=replace(POSE, tilt_deg=tilt))) for tilt in (POSE.tilt_deg, 51.0))
+    assert text_of(same) == text_of(GRID) != text_of(other)

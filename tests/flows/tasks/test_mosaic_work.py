@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spectralzoom.flows.tasks.stages.placement import MosaicRecipe, tile_budget, write_mosaic
+from spectralzoom.flows.stages.rectify import MosaicRecipe, tile_budget, write_mosaic
 from spectralzoom.pipeline.errors import SettingsError, ShapeError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep

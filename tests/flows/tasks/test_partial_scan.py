@@ -16,11 +16,11 @@ import xarray as xr
 from rich.console import Console
 
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.tasks import extent_choice
 from spectralzoom.flows.tasks.drawing import Drawing
 from spectralzoom.flows.tasks.extent_choice import ExtentGains
 from spectralzoom.flows.tasks.patch_budget import SHARD
-from spectralzoom.flows.tasks.run import SurveyRun
 from spectralzoom.models.network.sizes import MultiplyAdds, TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.reading.expected_errors import PatchExpectedErrors
@@ -249,10 +249,9 @@ def test_the_reader_counts_for_the_choice_of_lines_and_for_the_map() -> None:
     """The choice reads a quarter of the prior map's pixels."""
     reader = SimpleNamespace(sizes=TemporalSizes(2, 4))
     costs = SimpleNamespace(of_map=lambda index: MultiplyAdds(5, 0, 7))
-    facts = {"prior": "there", "reader": reader, "grid": SceneGrid(95, 63, 4), "least_gain": None, "chooses": False}
-    run: Any = SimpleNamespace(costs=costs, **facts)
+    field = SimpleNamespace(reader=reader, grid=SceneGrid(95, 63, 4))
     map_px, choice_px = 95 * 63, 48 * 32
     for extent, pixels in ((None, map_px), ("chosen", map_px + choice_px)):
-        run.extent = extent
-        done = SurveyRun.work_done(run, np.arange(3)).detail
+        plan: Any = SimpleNamespace(costs=costs, field=field, least_gain=None, chooses=False, extent=extent)
+        done = SurveyPlan.work_done(plan, np.arange(3)).detail
         assert done == 7 + reader.sizes.multiply_adds(pixels)

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from spectralzoom.flows.archive.plan_command import plan_content
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.load import load_settings, parse_settings
 from spectralzoom.flows.tasks.patch_budget import PatchBudget, ReadingCosts
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.models.network.sizes import SegmenterConfig, multiply_adds
 from spectralzoom.models.policies.policies import score_multiply_adds
 from spectralzoom.pipeline.errors import BudgetError, SettingsError
@@ -165,9 +166,8 @@ def test_a_large_field_is_counted_region_by_region() -> None:
 def test_a_zoomed_survey_reads_the_overview_twice(tmp_path: Path) -> None:
     """It reads it to choose lines and again with all lines; a uniform scan reads it once, for the map."""
     flags = {"scene": "farm", "size": "320x256", "seconds": "12", "out": str(tmp_path)}
-    never, always = (
-        open_run(load_settings(None, {**flags, "zoom": zoom}), planning=True) for zoom in ("never", "always")
-    )
+    both = (load_settings(None, {**flags, "zoom": zoom}) for zoom in ("never", "always"))
+    never, always = (plan_survey(open_field(one, planning=True)) for one in both)
     assert always.least_gain is not None
     assert always.work_done(np.arange(5)).overview == 2 * never.work_done(np.arange(5)).overview
 

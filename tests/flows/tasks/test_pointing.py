@@ -94,7 +94,6 @@ TOLD: dict[str, tuple[dict[str, Any], str]] = {
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "residual_rms_px": 0.123},
         "corrected by up to 5.0 px; residual rms 0.12 px",
     ),
-    "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "corrected by up to 5.0 px"),
     "none found": (
         {"held": "the mosaic", "sweeps": {"b": [0, 0]}, "not_found": ["b"]},
         "corrected by up to 0.0 px; not found b",

@@ -54,11 +54,6 @@ def visited(twice: tuple[Path, Any, Any], tmp_path: Path) -> Path:
     return Path(shutil.copytree(twice[0], tmp_path / "archive"))
 
 
-def class_map(out: Path, published: Any) -> np.ndarray:
-    """Return the classes of a run's map."""
-    return np.asarray(xr.open_zarr(out / published.receipt["products"]["class_map"], consolidated=False).classes.values)
-
-
 def words_of(out: Path, survey_png: Survey, **flags: Any) -> tuple[str, Any]:
     """Return the terminal output of a survey, joined into one line, and the run."""
     text = io.StringIO()
@@ -75,7 +70,8 @@ def test_a_first_visit_has_no_prior_map(twice: tuple[Path, Any, Any]) -> None:
     probabilities = xr.open_zarr(out / first.receipt["products"]["class_probabilities"], consolidated=False)
     assert float(probabilities.age.max()) == 0.0
     assert "changed_from" not in probabilities
-    agree = np.nan_to_num(probabilities.log_probability.values, nan=-9).argmax(axis=-1) == class_map(out, first)
+    drawn = xr.open_zarr(out / first.receipt["products"]["class_map"], consolidated=False).classes.values
+    agree = np.nan_to_num(probabilities.log_probability.values, nan=-9).argmax(axis=-1) == drawn
     assert agree.mean() > 0.95  # except for classes closer than one step, which these weights often give
 
 
@@ -99,11 +95,9 @@ def test_a_later_visit_uses_the_one_before_as_prior_map(twice: tuple[Path, Any, 
 
 def test_a_survey_uses_no_prior_map_by_default(visited: Path, survey_png: Survey) -> None:
     """Its map is that of a first visit, so the stage is cached."""
-    published = survey_png(visited, **RASTER, visit=LATER)
-    assert "prior_map" not in published.receipt
-    fresh = survey_png(visited, **RASTER, visit=FIRST)
-    (row,) = (stage for stage in fresh.receipt["stages"] if stage["name"] == "segment")
-    assert row["state"] == "cached"
+    receipt = survey_png(visited, **RASTER, visit=LATER).receipt
+    assert "prior_map" not in receipt
+    assert "cached" in [stage["state"] for stage in receipt["stages"] if stage["name"] == "segment"]
 
 
 @pytest.mark.parametrize(

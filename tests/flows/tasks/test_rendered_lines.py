@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from spectralzoom.flows.field import make_source
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.tasks.run import make_source
-from spectralzoom.flows.tasks.stages.capture import take_lines
+from spectralzoom.flows.stages.capture import take_lines
 from spectralzoom.pipeline.errors import RigError, SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
 from spectralzoom.flows.tradeoff import coarse_of_sweeps
 from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.weights.files import Weights, describe_weights, load_weights
-from spectralzoom.pipeline.errors import BudgetError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import frame_patches, full_sweeps
@@ -49,19 +47,10 @@ def test_file_is_small_and_has_a_training_record(weights: Weights) -> None:
     assert ScanPerformance.read(weights.record["scans"]).steps == (1, 2, 4, 8)
 
 
-@pytest.mark.parametrize("asked", [{"budget": "0.5"}, {"scan_step": "4"}, {"seconds": "9"}, {}])
-def test_one_file_is_the_default_for_every_capture(asked: dict[str, str]) -> None:
-    """Weights of the user replace it for all captures."""
-    assert weights_path(load_settings(None, asked)) == shipped_weights()
-    assert weights_path(load_settings(None, {**asked, "weights": "mine.safetensors"})) == Path("mine.safetensors")
-
-
-def test_seconds_below_every_scan_are_refused(tmp_path: Path) -> None:
-    """The message has the minimum; no archive is made."""
-    asked = load_settings(None, {"seconds": "0.5", "size": "640x512", "out": str(tmp_path / "a")})
-    with pytest.raises(BudgetError, match=r"--seconds 0.5; the least is .*every 8th line"):
-        open_run(asked)
-    assert not (tmp_path / "a").exists()
+def test_weights_of_the_user_replace_the_shipped_ones() -> None:
+    """One file is the default for every capture."""
+    assert weights_path(load_settings(None, {"budget": "0.5"})) == PATH
+    assert weights_path(load_settings(None, {"weights": "mine.safetensors"})) == Path("mine.safetensors")
 
 
 def test_reading_by_expected_gain_beats_random_patches(weights: Weights) -> None:

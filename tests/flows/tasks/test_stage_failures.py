@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -17,19 +17,20 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from spectralzoom.flows import stage as stage_module
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.publish import run_folder as publish
-from spectralzoom.flows.tasks import prefect_tasks
-from spectralzoom.flows.tasks.open_survey import STAGES
-from spectralzoom.flows.tasks.stage import Stage, Wanted
+from spectralzoom.flows.stage import Output, Stage
 from spectralzoom.pipeline.errors import ArchiveError, RigError
 from spectralzoom.storage.store import Archive
-from tests.flows.conftest import Ended, class_map, newest_run, problems
+from tests.flows.conftest import Ended, act_instead, class_map, newest_run, problems, stages
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
-NOT_HERE = ("register_coarse", "register_fine", "ground", "condense_raster")
-OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes without pointing errors
+OF_THIS = [  # of a survey in two passes without pointing errors
+    *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score"),
+    *("capture_fine", "condense_fine", "rectify_fine", "segment", "evaluate"),
+]
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 BUG = "rectify"  # the stage that fails with a bug
 FULL_DISK = "cannot write to the archive: no space left; make room"
@@ -40,39 +41,25 @@ def refusal(stage: str) -> RigError | ArchiveError:
     return RigError(NO_REPLY) if stage in ("capture_coarse", "capture_fine") else ArchiveError(FULL_DISK)
 
 
-def altered(stage: str, built: Callable[[], None], tried: Callable[[], None] = lambda: None) -> Stage:
-    """Return the stage with one call at its start, and one when its files are written but not yet published."""
-    real = STAGES[stage]
+def altered(name: str, then: Callable[[], object]) -> Stage[Any]:
+    """Return the stage with one call when its files are written but not yet published."""
+    real = stages()[name]
 
-    def wants(*given: Any) -> Wanted:
-        tried()
-        wanted = real.wants(*given)
+    @wraps(real.build)
+    def build(out: Output, *given: Any, **facts: Any) -> None:
+        real.build(out, *given, **facts)
+        then()
 
-        def build(path: Path) -> None:
-            wanted.build(path)
-            built()
-
-        return replace(wanted, build=build)
-
-    return replace(real, wants=wants)
+    return replace(real, build=build)
 
 
-def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
-    """Return the stage with a failure when its files are written but not yet published."""
+def broken(error: Exception) -> Callable[[], None]:
+    """Return a function that raises an error."""
 
-    def broken() -> None:
+    def fail() -> None:
         raise error
 
-    return altered(stage, broken, tried)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Result of a failed stage: the end of the command, the keys of the stores, and the problems in the archive."""
-
-    ended: Ended
-    keys: frozenset[str]
-    problems: list[Any]
+    return fail
 
 
 @dataclass
@@ -81,8 +68,8 @@ class Walk:
 
     undisturbed: Path
     out: Path
-    keys: dict[str, str]  # of each stage that makes a store, of the undisturbed survey
-    trials: dict[str, Trial]
+    keys: dict[str, str]  # of each stage, of the undisturbed survey
+    trials: dict[str, tuple[Ended, set[str], list[str]]]  # by the stage that fails: its end, stores and problems
     builds: Counter[str]
     last: dict[str, str]  # states of the completed run
 
@@ -94,7 +81,7 @@ def walk(
     """Repeat one command while each stage fails in turn, one with a bug, the others with errors; return the result."""
     folder = tmp_path_factory.mktemp("failures")
     receipt = surveyed_png(folder / "undisturbed").receipt
-    keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
+    keys = {stage["name"]: stage["key"] for stage in receipt["stages"]}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, Counter(), {})
     files = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]
     flags = ["--source", "sim", "--engine", "plain", "--budget", "0.8"]
@@ -102,13 +89,13 @@ def walk(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
         for stage in OF_THIS:
-            patch.setitem(STAGES, stage, altered(stage, partial(found.builds.update, [stage])))
+            act_instead(patch, stage, altered(stage, partial(found.builds.update, [stage])))
         for stage in OF_THIS:
-            with pytest.MonkeyPatch.context() as broken:
-                broken.setitem(STAGES, stage, failing(stage, KeyError("north") if stage == BUG else refusal(stage)))
+            with pytest.MonkeyPatch.context() as once:
+                act_instead(once, stage, altered(stage, broken(KeyError("north") if stage == BUG else refusal(stage))))
                 ended = command(words)
-            stores = frozenset(ref.key for ref in Archive.open(found.out).refs())
-            found.trials[stage] = Trial(ended, stores, problems(found.out))
+            stores = {ref.key for ref in Archive.open(found.out).refs()}
+            found.trials[stage] = ended, stores, problems(found.out)
         receipt = survey_png(found.out).receipt
         found.last.update({stage["name"]: stage["state"] for stage in receipt["stages"]})
     return found
@@ -125,16 +112,15 @@ def command(words: list[Any]) -> Ended:
 @pytest.mark.parametrize("stage", OF_THIS)
 def test_a_failed_stage_gives_one_message(stage: str, walk: Walk) -> None:
     """It is the error, or for a bug the file with the traceback; the archive has the stores of earlier stages."""
-    before = OF_THIS[: OF_THIS.index(stage)]
-    trial = walk.trials[stage]
-    assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
-    assert "Traceback" not in trial.ended.err
-    assert trial.problems == []
-    assert trial.keys == {walk.keys[name] for name in before if name in walk.keys}
-    told, _, file = trial.ended.errors[0].partition("please report ")
+    ended, stores, damaged = walk.trials[stage]
+    assert (ended.code, ended.out, len(ended.errors)) == (1, "", 1)
+    assert "Traceback" not in ended.err
+    assert damaged == []
+    assert stores == {walk.keys[name] for name in OF_THIS[: OF_THIS.index(stage)]}
+    told, _, file = ended.errors[0].partition("please report ")
     if stage == BUG:
         assert told == "KeyError: 'north'; this is a defect of SpectralZoom: "
-        assert "in broken" in Path(file).read_text()
+        assert "in fail" in Path(file).read_text()
     else:
         assert told == str(refusal(stage))
 
@@ -156,8 +142,8 @@ def test_a_run_without_a_quicklook_is_not_published(
     """Quicklook and receipt follow the last stage; the next run reads every store."""
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
     before = Archive.open(out).runs()
-    with monkeypatch.context() as broken:
-        broken.setattr(publish, "draw_quicklook", Mock(side_effect=ArchiveError(FULL_DISK)))
+    with monkeypatch.context() as patch:
+        patch.setattr(publish, "draw_quicklook", Mock(side_effect=ArchiveError(FULL_DISK)))
         with pytest.raises(ArchiveError, match="no space left"):
             survey_png(out)
     assert (Archive.open(out).runs(), problems(out)) == (before, [])
@@ -165,34 +151,25 @@ def test_a_run_without_a_quicklook_is_not_published(
     assert (len(Archive.open(out).runs()), problems(out)) == (len(before) + 1, [])
 
 
-@pytest.mark.parametrize(
-    ("stage", "after", "tries"), [("capture_coarse", "choose_effects", 3), ("condense_coarse", "capture_coarse", 1)]
-)
 def test_a_stage_that_fails_in_prefect_has_a_failed_task(
-    stage: str, after: str, tries: int, server: str, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: str, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Task and flow are Failed with the message; a device gets three tries.
-
-    Prefect draws an arrow to the task from its input.
-    """
-    tried: list[str] = []
-    error = refusal(stage)
-    monkeypatch.setitem(STAGES, stage, failing(stage, error, lambda: tried.append(stage)))
-    monkeypatch.setattr(prefect_tasks, "RETRY_DELAY_S", 0.0)
-    prefect_tasks._task.cache_clear()
-    with pytest.raises(type(error), match=str(error)[:20]):
+    """Task and flow are Failed with the message after three tries; the task has the edge of its input."""
+    stage = "capture_coarse"
+    tried = Mock(side_effect=refusal(stage))
+    act_instead(monkeypatch, stage, altered(stage, tried))
+    monkeypatch.setattr(stage_module, "RETRY_DELAY_S", 0.0)
+    stage_module._task.cache_clear()
+    with pytest.raises(RigError, match=NO_REPLY[:20]):
         survey_png(tmp_path, engine="prefect", **{"camera.samples": 160})
-    before = OF_THIS[: OF_THIS.index(stage)]
-    run, tasks = newest_run("survey", len(before) + 2)
+    run, tasks = newest_run("survey", 2)
     assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")
-    assert str(error) in run.state.message
-    assert tasks.keys() == {f"{name}-scene" for name in ("plan_capture", *before, stage)}
-    assert {tasks[f"{name}-scene"].state.type.value for name in before} == {"COMPLETED"}
-    failed = tasks[f"{stage}-scene"]
-    assert failed.state.type.value == "FAILED"
-    assert str(error) in failed.state.message
-    assert (len(tried), failed.run_count) == (tries, tries)
-    assert tasks[f"{after}-scene"].id in [given.id for given in failed.task_inputs["inputs"]]
+    assert tasks.keys() == {"choose_effects-scene", "capture_coarse-scene"}
+    before, failed = tasks["choose_effects-scene"], tasks["capture_coarse-scene"]
+    assert (before.state.type.value, failed.state.type.value) == ("COMPLETED", "FAILED")
+    assert all(NO_REPLY in one.state.message for one in (run, failed))
+    assert (tried.call_count, failed.run_count) == (3, 3)
+    assert before.id in [given.id for given in failed.task_inputs["inputs"]]
     assert problems(tmp_path) == []
 
 
@@ -204,8 +181,8 @@ def test_failed_reprocessing_resumes(server: str, walk: Walk, tmp_path: Path, mo
     archive = Archive.open(out)
     (missing,) = archive.refs("segment")
     archive.discard(missing.uri)
-    with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "segment", failing("segment", refusal("segment")))
+    with monkeypatch.context() as patch:
+        act_instead(patch, "segment", altered("segment", broken(refusal("segment"))))
         state = reprocess(archive=str(out), return_state=True)
     run, _ = newest_run("reprocess", 0)
     assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)

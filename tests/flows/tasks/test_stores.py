@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from functools import partial
 from pathlib import Path
@@ -14,37 +13,22 @@ import pytest
 import xarray as xr
 import zarr
 
-from spectralzoom.flows.publish.publishing import clear_raw, publish
+from spectralzoom.flows.products import Pass, Products
+from spectralzoom.flows.publish.publishing import clear_first_mosaic
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.parameters import SurveySettings
-from spectralzoom.flows.settings.survey_settings import Settings
-from spectralzoom.flows.survey import draw_class_map, survey
+from spectralzoom.flows.stages.condense import SignalChoice, components_of
+from spectralzoom.flows.survey import survey
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.captures import plan_capture
-from spectralzoom.flows.tasks.open_survey import STAGES, OpenSurvey
-from spectralzoom.flows.tasks.run import SurveyRun
-from spectralzoom.flows.tasks.stage import Product, Stage, Wanted
-from spectralzoom.flows.tasks.stages.condense import SignalChoice, components_of
-from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.arrays.cubes import open_raw_cube
 from spectralzoom.storage.runs import read_run
-from spectralzoom.storage.store import Archive, Ref
+from spectralzoom.storage.store import Archive, Ref, uri_of
 from tests.conftest import QUIET, Survey
 from tests.faults.small_survey import stored
-from tests.flows.conftest import problems
+from tests.flows.conftest import act_instead, problems
 from tests.storage.plain_mosaic import KillOnce
-
-
-def test_a_store_whose_input_was_cleared_meanwhile_is_not_published(tmp_path: Path) -> None:
-    """Lines that another survey cleared read as nodata, so the store would hold wrong values."""
-    archive = Archive.open(tmp_path / "archive", create=True)
-    given, _ = archive.produce("capture", lambda folder: (folder / "a").write_text("a") and None, version=1, params={})
-    one = Stage("rectify", "", Product("rectify", 1), lambda: None, None, 0, None)  # type: ignore[arg-type, return-value]
-    with pytest.raises(ArchiveError, match="another survey has cleared an input of rectify meanwhile"):
-        one.produce(archive, Wanted(lambda folder: archive.clear(given) and None, {}, [given]))
-    assert archive.refs("rectify") == []
 
 
 @pytest.mark.parametrize("order", [(1.0, 16.0), (16.0, 1.0)], ids=["short pass first", "long pass first"])
@@ -65,21 +49,27 @@ def test_few_bands_are_stored_in_steps_of_the_longest_exposure(order: tuple[floa
 
 
 @pytest.mark.usefixtures("no_effects")
-def test_stores_of_another_run_are_not_cleared(tmp_path: Path) -> None:
+def test_stores_of_another_run_are_not_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another survey kept these raw lines and published the first pass's mosaic without a second pass."""
     np.save(tmp_path / "nothing.npy", np.zeros((96, 96), np.float32))
     bands = ",".join(map(str, range(5, 265, 40)))
     given: dict[str, Any] = {"scene": "farm", "size": (96, 96), "bands": bands, "out": str(tmp_path / "archive")}
     given |= {"engine": "plain", "accuracy": False, "budget": 0.95, "coarse_exposure_ms": 4.0, "zoom": "always"}
-    first = plan_capture(SurveySettings(**given, policy="random"))
-    assert isinstance(first, OpenSurvey)
-    archive = first.run.archive
-    with first.at_work():
-        draw_class_map(first)
-        other = survey.fn(SurveySettings(**given, policy="mask", mask=str(tmp_path / "nothing.npy"), keep="raw"))
-        clear_raw(first, publish(first))
-    assert archive.is_there(first.products["capture_coarse"].uri)
-    assert archive.is_there("/".join(read_run(other.folder).products["mosaic"].split("/")[:3]))
+    others: list[Path] = []
+
+    def meanwhile(*survey_of: Any) -> None:
+        """Run the other survey when the first one has its map."""
+        monkeypatch.undo()
+        nothing = {"policy": "mask", "mask": str(tmp_path / "nothing.npy")}
+        others.append(survey.fn(SurveySettings(**given, **nothing, keep="raw")).folder)
+        clear_first_mosaic(*survey_of)
+
+    act_instead(monkeypatch, "clear_first_mosaic", meanwhile)
+    one = read_run(survey.fn(SurveySettings(**given, policy="random")).folder)
+    archive = Archive.open(tmp_path / "archive")
+    assert "raw_fine" in one.products
+    assert archive.locate(one.products["raw_coarse"]).is_dir()
+    assert archive.locate(read_run(others[0]).products["mosaic"]).is_dir()
 
 
 @pytest.mark.usefixtures("no_effects")
@@ -118,7 +108,7 @@ def test_processes_make_the_same_archive(
     """Two processes, one killed by kill -9, write the keys and bytes of a survey with threads; xarray opens the map."""
     roots = tmp_path / "threads", tmp_path / "processes"
     surveyed_png(roots[0])
-    monkeypatch.setattr("spectralzoom.flows.tasks.stages.placement.TileMaker", partial(KillOnce, folder=str(tmp_path)))
+    monkeypatch.setattr("spectralzoom.flows.stages.rectify.TileMaker", partial(KillOnce, folder=str(tmp_path)))
     survey_png(roots[1], scheduler="processes", workers=2)
     assert (tmp_path / "killed").exists()
     assert stored(roots[0]) == stored(roots[1])
@@ -128,16 +118,14 @@ def test_processes_make_the_same_archive(
         assert found["classes"].values.shape == (96, 128)
 
 
-@pytest.mark.parametrize("absent", [("condense_raster", "rectify"), ("rectify", "rectify_fine")])
-def test_store_names_in_receipts_are_unique(absent: tuple[str, ...]) -> None:
-    """The exception is the mosaic of the first pass and that of both passes, so each case leaves out one of them."""
-    named = [one.addresses(Ref(one.product.name, "abc", Path())) for name, one in STAGES.items() if name not in absent]
-    assert all(named)
-    assert len({name for one in named for name in one}) == sum(map(len, named))
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_a_survey_has_the_arguments_of_its_stages(name: str) -> None:
-    """Each keyword argument of a stage is an attribute of a run or a setting."""
-    run, settings = ({*dir(kind), *kind.__dataclass_fields__} for kind in (SurveyRun, Settings))
-    assert {*inspect.getfullargspec(inspect.unwrap(STAGES[name].wants)).kwonlyargs} <= run | settings
+def test_a_receipt_names_every_store() -> None:
+    """The mosaic of the first pass has its name where there is no second pass."""
+    kinds = ("raw", "signal", "mosaic", "seams", "places")
+    first, second = (Pass(*(Ref(f"{kind}-{number}", "k", Path()) for kind in kinds)) for number in range(2))
+    rest = {name: Ref(name, "k", Path()) for name in ("attention", "class_map", "effects", "ground", "accuracy")}
+    for later, given in ((None, [first]), (second, [first, second])):
+        found = Products(mosaic=given[-1].mosaic, first=first, second=later, **rest).addresses()
+        stores = {ref.uri for one in given for name, ref in vars(one).items() if name != "places" or one is first}
+        hidden = set() if later is None else {first.mosaic.uri}
+        assert {uri_of(address) for address in found.values()} == stores - hidden | {ref.uri for ref in rest.values()}
+        assert uri_of(found["mosaic"]) == given[-1].mosaic.uri

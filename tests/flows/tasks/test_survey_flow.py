@@ -6,8 +6,8 @@ import gc
 import json
 import os
 import signal
+from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -16,105 +16,86 @@ from pydantic import ValidationError
 
 from spectralzoom.flows import survey as survey_flow
 from spectralzoom.flows import survey_command
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.parameters import SurveySettings
-from spectralzoom.flows.survey import draw_class_map
+from spectralzoom.flows.stage import Request, Stores
+from spectralzoom.flows.survey import run_stages
 from spectralzoom.flows.tasks.local_server import ServerUnavailable
-from spectralzoom.flows.tasks.open_survey import Products
-from spectralzoom.flows.tasks.run import SurveyRun
-from spectralzoom.pipeline.errors import IncompleteStoreError
-from spectralzoom.storage.store import Ref
-from tests.flows.conftest import act_instead, newest_run
+from spectralzoom.storage.store import Archive, Ref
+from tests.exported_run import POSE
+from tests.flows.conftest import act_instead, newest_run, stages
 from tests.prior_work import with_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
+ONCE, TWICE = {"scan_step": "2", "scan_exposure_ms": "25"}, {"budget": "0.8"}
 RASTER: dict[str, Any] = {"source": "raster", "budget": None}
 
 
-class UnmadeRef(Ref):
-    """Address of a store that does not exist: it has no key."""
+class NotedStores(Stores):
+    """Stores that make nothing, and note the stages of each request's inputs."""
 
-    uri = ""
+    def __init__(self) -> None:
+        super().__init__(Archive(Path("nowhere"), writes=False), dry=True)
+        self.inputs: dict[str, list[str]] = {}
 
-    def __getattribute__(self, name: str) -> Any:
-        """Raise for the key."""
-        if name == "key":
-            raise IncompleteStoreError("it was not made")
-        return super().__getattribute__(name)
-
-
-class Noted:
-    """Open survey of an empty archive that records the inputs of each requested stage."""
-
-    hold_rig = staticmethod(lambda *capture: None)
-
-    def __init__(self, **facts: bool) -> None:
-        self.uniform = self.registers = self.on_the_ground = self.is_map = False
-        self.__dict__ |= facts
-        self.steps: dict[str, list[str]] = {}
-        self.products = Products()
-        archive = SimpleNamespace(ref=UnmadeRef, is_there=lambda uri: True)
-        self.run = SimpleNamespace(archive=archive, plan=SimpleNamespace(plain=self.uniform))
-
-    def stop_after(self, ref: Ref, *stages: str) -> None:
-        """Do not stop."""
-
-    def goes_back(self, request: Ref) -> bool:
-        """Return whether the plan asks for more lines."""
-        return not self.uniform
-
-    def __call__(self, stage: str, *inputs: Ref) -> Ref:
-        """Record the names of the stages that wrote the inputs."""
-        self.steps[stage] = [ref.stage for ref in inputs]
-        self.products[stage] = UnmadeRef(stage, "", Path())
-        return self.products[stage]
+    def get(self, request: Request, *_: Ref) -> Ref:
+        """Return an address without a key, as of a store whose inputs are missing."""
+        self.inputs[request.stage.name] = [ref.stage for ref in request.inputs]
+        return Ref(request.stage.name, "", Path())
 
 
-def steps(**facts: bool) -> dict[str, list[str]]:
+def steps(scene_files: Path, weights: Path, **flags: Any) -> dict[str, list[str]]:
     """Return the stages of a survey in order, each with its input stages."""
-    noted: Any = Noted(**facts)
-    draw_class_map(noted)
-    return dict(noted.steps)
+    files = {"scene": str(scene_files / "scene.png"), "labels": str(scene_files / "labels.png")}
+    settings = load_settings(None, {"source": "sim", "weights": str(weights), **files, **flags})
+    noted = NotedStores()
+    run_stages(noted, plan_survey(open_field(settings, planning=True)))
+    return noted.inputs
 
 
-def test_a_zoomed_survey_captures_again() -> None:
+def test_a_zoomed_survey_captures_again(scene_files: Path, weights: Path) -> None:
     """Requested lines follow from the plan and are condensed with the first ones; the map uses both passes."""
-    found = steps()
-    assert list(found) == [
-        *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score"),
-        *("capture_fine", "condense_fine", "rectify_fine", "segment"),
-    ]
-    assert found["capture_fine"] == ["score", "choose_effects"]
-    assert found["condense_fine"] == ["capture_fine", "capture_coarse"]
-    assert found["rectify_fine"] == ["condense_fine"]
-    assert found["segment"] == ["rectify_fine", "score"]
+    assert steps(scene_files, weights, budget="0.8") == {
+        "choose_effects": [],
+        "capture_coarse": ["choose_effects"],
+        "condense_coarse": ["capture_coarse"],
+        "locate": ["condense_coarse"],
+        "rectify": ["condense_coarse", "locate"],
+        "score": ["rectify"],
+        "capture_fine": ["score", "choose_effects"],
+        "condense_fine": ["capture_fine", "capture_coarse"],
+        "rectify_fine": ["condense_fine"],
+        "segment": ["rectify_fine", "score"],
+        "evaluate": ["rectify_fine", "segment"],
+    }
 
 
-def test_a_uniform_scan_has_no_second_pass() -> None:
-    """The map is made from the mosaic of the one scan."""
-    found = steps(uniform=True)
-    assert not [name for name in found if name.endswith("_fine")]
-    assert found["segment"] == ["rectify", "score"]
-
-
-@pytest.mark.parametrize(("uniform", "passes"), [(True, ["coarse"]), (False, ["coarse", "fine"])])
-def test_a_mosaic_uses_the_registration_of_its_own_pass(uniform: bool, passes: list[str]) -> None:
-    """The registration of the other pass is no input of it."""
-    found = steps(registers=True, uniform=uniform)
-    assert [name for name in found if name.startswith("register")] == [f"register_{one}" for one in passes]
+@pytest.mark.parametrize("passes", [1, 2])
+def test_a_mosaic_uses_the_registration_of_its_own_pass(scene_files: Path, weights: Path, passes: int) -> None:
+    """The evaluation has that of the first pass, whose reference sweep is that of the map."""
+    found = steps(scene_files, weights, **(TWICE if passes == 2 else ONCE), pointing_px=4)
+    assert found["register_coarse"] == ["condense_coarse"]
     assert found["locate"] == ["condense_coarse", "register_coarse"]
     assert found["rectify"] == ["condense_coarse", "locate", "register_coarse"]
-    assert found.get("rectify_fine") == (None if uniform else ["condense_fine", "register_fine"])
+    assert found.get("register_fine") == (["condense_fine", "rectify"] if passes == 2 else None)
+    assert found.get("rectify_fine") == (["condense_fine", "register_fine"] if passes == 2 else None)
+    assert found["evaluate"] == ["rectify_fine" if passes == 2 else "rectify", "segment", "register_coarse"]
 
 
-def test_a_survey_with_a_pose_has_a_ground_map() -> None:
-    """The ground map is made from the class map and the mosaic."""
-    assert steps(on_the_ground=True)["ground"] == ["segment", "rectify_fine"]
+def test_a_uniform_scan_has_one_pass_and_a_pose_a_ground_map(scene_files: Path, weights: Path) -> None:
+    """The map is made from the mosaic of the one scan, and the ground map from both."""
+    found = steps(scene_files, weights, **ONCE, pose=asdict(POSE))
+    assert not [name for name in found if name.endswith("_fine")]
+    assert found["segment"] == ["rectify", "score"]
+    assert found["ground"] == ["segment", "rectify"]
 
 
-def test_a_raster_is_neither_captured_nor_rectified() -> None:
+def test_a_raster_is_neither_captured_nor_rectified(scene_files: Path, weights: Path) -> None:
     """Its own pixels replace capture, geolocation grid and mosaic."""
-    assert list(steps(is_map=True)) == ["condense_raster", "score", "segment"]
+    found = steps(scene_files, weights, source="raster")
+    assert list(found) == ["condense_raster", "score", "segment", "evaluate"]
 
 
 SETTINGS = [
@@ -189,17 +170,17 @@ def test_prefect_makes_the_stores_of_plain(survey_png: Any, surveyed_png: Any, t
     names = [*(stage["name"] for stage in flow["stages"]), *STEPS]
     assert sorted(tasks) == sorted(f"{name}-scene" for name in names)
     assert {one.state.type.value for one in tasks.values()} == {"COMPLETED"}
-    assert edges(tasks, "condense_fine") == {"plan_capture", "capture_fine", "capture_coarse"}
-    assert edges(tasks, "rectify") == {"plan_capture", "condense_coarse", "locate"}
-    assert edges(tasks, "rectify_fine") == {"plan_capture", "condense_fine"}
-    assert edges(tasks, "publish") >= {"plan_capture", "segment", "evaluate"}
+    assert edges(tasks, "condense_fine") == {"capture_fine", "capture_coarse"}
+    assert edges(tasks, "rectify") == {"condense_coarse", "locate"}
+    assert edges(tasks, "rectify_fine") == {"condense_fine"}
+    assert edges(tasks, "publish") >= {"segment", "evaluate"}
     assert any(words.startswith("mosaic: ") and "stages/rectify/" in words for words in log)
     assert set(artifacts) == {"survey-scene"}
     assert "data:image/jpeg;base64," in artifacts["survey-scene"].data
     assert "report.html" in artifacts["survey-scene"].data
 
 
-STEPS = ("plan_capture", "publish", "clear_raw")
+STEPS = ("publish", "clear_raw")
 
 
 def edges(tasks: dict[str, Any], name: str) -> set[str]:
@@ -214,19 +195,19 @@ def prefect_variables() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name.startswith("PREFECT")}
 
 
-def opened_surveys() -> set[int]:
-    """Return the ids of the survey runs in memory."""
+def plans_in_memory() -> set[int]:
+    """Return the ids of the plans of surveys in memory."""
     gc.collect()
-    return {id(one) for one in gc.get_objects() if type(one) is SurveyRun}
+    return {id(one) for one in gc.get_objects() if type(one) is SurveyPlan}
 
 
 def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The server's files are in the archive, and the environment is unchanged afterwards."""
     monkeypatch.delenv("PREFECT_API_URL", raising=False)
     before = prefect_variables()
-    opened = opened_surveys()
+    opened = plans_in_memory()
     survey_png(tmp_path, engine="prefect", **RASTER)
-    assert opened_surveys() <= opened  # no run stays in memory
+    assert plans_in_memory() <= opened  # no run stays in memory
     assert (tmp_path / ".prefect" / "prefect.db").exists()
     assert prefect_variables() == before
 
@@ -251,12 +232,12 @@ def test_sigterm_in_a_stage(field_file: Any, server: str, monkeypatch: pytest.Mo
     """SIGTERM gives exit code 143 and one sentence, despite Prefect's own handling; the same command resumes."""
     file = field_file(**RASTER)
 
-    def terminated(*given: Any) -> None:
+    def terminated(*given: Any, **facts: Any) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
     with monkeypatch.context() as patch:
-        act_instead(patch, "segment", terminated)
+        act_instead(patch, "segment", replace(stages()["segment"], build=terminated))
         ended = command_line("survey", file)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])
     assert ended.err.splitlines()[-1] == "terminated; run the same command to resume"

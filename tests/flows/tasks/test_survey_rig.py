@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import zarr
 
-import spectralzoom.flows.tasks.prefect_tasks
-import spectralzoom.flows.tasks.rig_field
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.run import open_run
+from spectralzoom.flows.tasks.rig_field import rig_to_oneself
 from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError
-from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 from spectralzoom.pipeline.rig.fakes import FakeCamera
 from spectralzoom.pipeline.rig.transports import DeviceGone
 from spectralzoom.storage.arrays.class_maps import load_class_map
@@ -49,35 +48,6 @@ def small_settings(out: Path, **changed: Any) -> Settings:
 def fake_settings(out: Path, **changed: Any) -> Settings:
     """Return settings of a tiny survey through a fake rig."""
     return small_settings(out, source="rig", **FAKE, **changed)
-
-
-class Watch:
-    """Captures of coarse lines by fake cameras, and an error that their next fetch of lines raises."""
-
-    def __init__(self) -> None:
-        self.coarse = 0
-        self.error: Exception | None = None
-
-
-@pytest.fixture
-def watch(monkeypatch: pytest.MonkeyPatch) -> Iterator[Watch]:
-    """Watch all fake cameras of a test."""
-    found = Watch()
-    capture, fetch = FakeCamera.capture, FakeCamera.fetch
-
-    def captured(camera: FakeCamera, frames: int, *, prefix: str = "") -> Any:
-        found.coarse += "coarse" in prefix
-        return capture(camera, frames, prefix=prefix)
-
-    def fetched(camera: FakeCamera, *given: Any) -> CapturedLines:
-        error, found.error = found.error, None
-        if error is not None:
-            raise error
-        return fetch(camera, *given)
-
-    monkeypatch.setattr(FakeCamera, "capture", captured)
-    monkeypatch.setattr(FakeCamera, "fetch", fetched)
-    return found
 
 
 def arrays_of(archive: Path, published: Published, product: str) -> dict[str, bytes]:
@@ -121,36 +91,41 @@ def test_a_mounting_that_cannot_reach_the_field_is_refused(tmp_path: Path) -> No
     """The mirror's range ends before the field does; the error comes before anything moves."""
     beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
     with pytest.raises(PoseError, match=r"as mounted \(offset 0.5; 0.5\), .* outside the unit disk"):
-        open_run(fake_settings(tmp_path, **beside), planning=True)
+        plan_survey(open_field(fake_settings(tmp_path, **beside), planning=True))
 
 
-def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, watch: Watch) -> None:
+def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the camera failed, the same command resumes the survey; another visit is captured again.
 
     The receipt has no password; the camera's files go with the spool.
     """
     settings = fake_settings(tmp_path, **{"rig.password": "secret", "budget": 0.5})
-    watch.error = DeviceGone("the camera's file server is not there")
-    with pytest.raises(DeviceGone, match="camera's file server"):
-        run_survey(settings, QUIET)
+    captures = Mock(wraps=FakeCamera.capture)
+    monkeypatch.setattr(FakeCamera, "capture", lambda *given, **named: captures(*given, **named))
+
+    def coarse() -> int:
+        return sum("coarse" in one.kwargs.get("prefix", "") for one in captures.call_args_list)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeCamera, "fetch", Mock(side_effect=DeviceGone("the camera's file server is not there")))
+        with pytest.raises(DeviceGone, match="camera's file server"):
+            run_survey(settings, QUIET)
     published = run_survey(settings, QUIET)
-    assert watch.coarse == 1
+    assert coarse() == 1
     assert published.receipt["settings"]["visit"] == "first"
     assert "secret" not in (published.folder / "receipt.json").read_text()
     assert not list((tmp_path / "spool").iterdir())
-    run_survey(replace(settings, visit="second"), QUIET)
-    assert watch.coarse == 2
-    run_survey(replace(settings, name="west"), QUIET)  # another field of the same settings
-    assert watch.coarse == 3
-    run_survey(replace(settings, rig=replace(settings.rig, mirror_axes="-x,-y")), QUIET)  # another mounting
-    assert watch.coarse == 4
+    others = {"visit": "second"}, {"name": "west"}, {"rig": replace(settings.rig, mirror_axes="-x,-y")}
+    for count, other in enumerate(others, 2):  # another visit, another field of the same settings, another mounting
+        run_survey(replace(settings, **other), QUIET)
+        assert coarse() == count
     assert {finding.kind for finding in verify_everything(Archive.open(tmp_path))} == {"whole"}
 
 
 def test_a_rig_on_hardware_is_for_one_survey(tmp_path: Path) -> None:
     """Stored lines need no rig, and a fake mirror no lock. A real mirror is used by one survey at a time."""
     settings = fake_settings(tmp_path, **{"rig.port": f"/dev/tty{tmp_path.name}"})
-    with spectralzoom.flows.tasks.rig_field.rig_to_oneself(settings.rig.port):  # by another survey
+    with rig_to_oneself(settings.rig.port):  # by another survey
         run_survey(settings, QUIET)
         real = replace(settings, visit="second", rig=replace(settings.rig, mirror_driver=""))
         with pytest.raises(RigError, match="in use by another survey"):
@@ -170,7 +145,6 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, weights: Path) -> N
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
     "axes": ({"rig.mirror_axes": "x,x"}, r"'rig.mirror_axes' must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
     "memory": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* at most 8191 pairs"),
     "size": ({"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"}, r"give its size"),

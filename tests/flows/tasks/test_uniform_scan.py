@@ -13,10 +13,11 @@ from PIL import Image
 
 from spectralzoom.flows.archive.plan_command import plan_content
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.run import SurveyRun, open_run
 from spectralzoom.pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import QUIET, Flags, Survey, WeightsMaker
 from tests.prior_work import with_effects
@@ -198,13 +199,13 @@ def test_scenes_of_any_size_need_no_flag(weights: Path, tmp_path: Path, shape: t
 
 def test_spacings_that_do_not_fit_are_no_candidates(tmp_path: Path) -> None:
     """Every 8th line of 640 px cannot overlap by 712 px: it is no candidate, and refused on request."""
-    farm = {"scene": "farm", "size": "160x128", "out": str(tmp_path), "pointing_px": "100"}
-    scans = plan_content(load_settings(None, farm | {"scan_step": "1"}))["scans"]
+    farm = {"size": "160x128", "pointing_px": "100"}
+    scans = plan_content(load_settings(None, farm | {"out": str(tmp_path), "scan_step": "1"}))["scans"]
     assert {one["step"] for one in scans["candidates"]} == {1, 2, 4}
     with pytest.raises(SettingsError, match="overlap by 712 px of a line of 640 px; give less than 64"):
-        open_run(load_settings(None, farm | {"scan_step": "8"}), planning=True)
+        planned(tmp_path, **farm, scan_step="8")
     with pytest.raises(SettingsError, match="a line of 64 px; lines are too short"):
-        open_run(load_settings(None, farm | {"camera.samples": "64"}), planning=True)
+        planned(tmp_path, **farm, **{"camera.samples": "64"})
 
 
 def test_a_faster_coarse_pass_gives_its_seconds_to_the_fine_pass(survey_png: Any, tmp_path: Path) -> None:
@@ -231,9 +232,10 @@ def test_a_faster_coarse_pass_gives_its_seconds_to_the_fine_pass(survey_png: Any
 WIDE = {"camera.samples": "80", "seconds": "27"}  # eight swaths; the default camera covers the field with one
 
 
-def planned(out: Path, **flags: str) -> SurveyRun:
-    """Return an opened survey of the farm."""
-    return open_run(load_settings(None, {"scene": "farm", "size": "640x512", "out": str(out), **flags}), planning=True)
+def planned(out: Path, **flags: str) -> SurveyPlan:
+    """Return the plan of a survey of the farm."""
+    settings = load_settings(None, {"scene": "farm", "size": "640x512", "out": str(out), **flags})
+    return plan_survey(open_field(settings, planning=True))
 
 
 @pytest.mark.parametrize(
@@ -254,24 +256,25 @@ def planned(out: Path, **flags: str) -> SurveyRun:
 )
 def test_two_passes_are_taken_on_wide_fields_in_short_times(tmp_path: Path, flags: dict[str, str], zooms: bool) -> None:
     """The settings of the run name the choice, and no limit of a uniform scan is dropped."""
-    run = planned(tmp_path, **flags)
-    assert (run.settings.zoom, run.plan.plain) == ("always" if zooms else "never", not zooms)
-    exposures = {sweep.exposure_ms for sweep in run.planned}  # simulated effects are chosen for these
-    assert (len(exposures) >= 3) if zooms else (run.planned == tuple(run.plan.coarse))
-    assert (run.scans.chosen is None) == zooms
-    assert any(note.startswith("two passes: every 4th line") for note in run.notes) == zooms
+    plan = planned(tmp_path, **flags)
+    assert (plan.settings.zoom, plan.passes.plain) == ("always" if zooms else "never", not zooms)
+    exposures = {sweep.exposure_ms for sweep in plan.typical}  # simulated effects are chosen for these
+    assert (len(exposures) >= 3) if zooms else (plan.typical == tuple(plan.passes.coarse))
+    assert (plan.scans.chosen is None) == zooms
+    assert any(note.startswith("two passes: every 4th line") for note in plan.notes) == zooms
 
 
 def test_the_chosen_plan_equals_that_of_zoom_always(tmp_path: Path) -> None:
     """First pass and remaining time are those of `--zoom always`, and so are the settings of the run."""
     chosen, asked = planned(tmp_path, **WIDE), planned(tmp_path, **WIDE, zoom="always")
-    assert (chosen.plan, chosen.settings) == (asked.plan, asked.settings)
-    assert chosen.plan.coarse_s + chosen.plan.fine_s == pytest.approx(27)
+    assert (chosen.passes, chosen.settings) == (asked.passes, asked.settings)
+    assert chosen.passes.coarse_s + chosen.passes.fine_s == pytest.approx(27)
 
 
 def test_the_line_spacing_of_the_first_pass_may_be_given(tmp_path: Path) -> None:
     """The exposure is the best for that spacing; by default the weights choose every 4th line."""
     steps = {"scan_step": "8"}, {}, {"scan_step": "8", "seconds": None, "budget": "0.5"}
     given, usual, half = (planned(tmp_path, **{**WIDE, "zoom": "always", **one}) for one in steps)
-    assert [run.settings.scan_step for run in (given, usual, half)] == [8, 4, 8]
-    assert given.plan.coarse_s < usual.plan.coarse_s < given.plan.coarse_s + given.plan.fine_s == pytest.approx(27)
+    assert [plan.settings.scan_step for plan in (given, usual, half)] == [8, 4, 8]
+    asked, taken = given.passes, usual.passes
+    assert asked.coarse_s < taken.coarse_s < asked.coarse_s + asked.fine_s == pytest.approx(27)

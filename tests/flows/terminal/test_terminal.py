@@ -52,24 +52,18 @@ def test_bars_and_json_show_names_as_escapes() -> None:
 
 
 def test_pages_show_names_as_escapes() -> None:
-    """A name cannot reverse the text beside it, and HTML in a name is not markup."""
+    """A name cannot reverse the text beside it; HTML in it is no markup, nor is Markdown on Prefect's page."""
     receipt = make_receipt()
     receipt["survey"] = HOSTILE + '<b title="x">'
-    text = render_report(receipt, b"")
-    assert all(is_visible(letter) for letter in text)
-    assert text.count(SHOWN) >= 2
-    assert '<b title="' not in text
-
-
-def test_prefects_pages_show_names_as_escapes() -> None:
-    """Prefect's Markdown page of a survey shows escapes, and Markdown in a name is not markup."""
+    page = render_report(receipt, b"")
+    assert page.count(SHOWN) >= 2
+    assert '<b title="' not in page
     words = HOSTILE + "<b>[x](y)`|"
-    text = render_markdown(
-        "survey.md", survey=words, headline=words, picture="", findings=[words], where="archive/runs/x_1"
-    )
-    assert all(is_visible(letter) for letter in text)
+    shown = {"survey": words, "headline": words, "findings": [words]}
+    text = render_markdown("survey.md", **shown, picture="", where="archive/runs/x_1")
     assert text.count(r"\<b\>\[x\](y)\`\|") == 3
     assert "`archive/runs/x_1/report.html`" in text
+    assert all(map(is_visible, page + text))
 
 
 def test_a_command_names_a_hostile_file_in_escapes(command_line: Any, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from rich.console import Console
 
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.cli.model_verbs import TrainFlags
+from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.tasks.run import open_run
 from spectralzoom.flows.training import figures, train_scenes
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
@@ -39,12 +39,13 @@ from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
+NUMBERS = ("001", "002", "003", "004")  # of frames
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with four frames of 16 x 16 px and two classes."""
-    return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), ("001", "002", "003", "004"))
+    return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), NUMBERS)
 
 
 @pytest.fixture(scope="module")
@@ -64,25 +65,20 @@ def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:
     return TrainRequest(str(folder), out, **{"patch": 8, "width": 4, "settings": SETTINGS, **choices})
 
 
-def test_the_record_lists_the_training_scenes(folder: Path, out: Path, tmp_path: Path):
-    """Scenes kept for validation or held out are not among them; full exposures give no scan performance."""
-    record = train_weights(_request(folder, out, validation=1, hold_out=("003",)))
-    assert "scans" not in record
+def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
+    """It has scenes (none of validation, none held out) and ranges of the training data, and the calibration."""
+    field = write_field(tmp_path / "field", (32, 32), NUMBERS)
+    record = train_weights(_request(field, out, validation=1, hold_out=("003",)))
+    assert "scans" not in record  # of a single exposure
+    assert describe_weights(out).map_scores is None
     split = record["split"]
     assert (len(split["train"]), len(split["validation"])) == (2, 1)
     assert not set(split["train"]) & {*split["validation"], "003"}
     assert (split["held_out"], record["training"]["steps"]) == (["003"], 1)
-    assert load_weights(tmp_path / "w.safetensors").record["split"] == split
-
-
-def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
-    """It has the ranges of the training data, and the calibration by validation scenes."""
-    field = write_field(tmp_path / "field", (32, 32), ("001", "002", "003", "004"))
-    record = train_weights(_request(field, out, validation=1))
+    assert load_weights(out).record["split"] == split
     told = TrainedOn.read(load_weights(out).record["trained_on"])
-    assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
+    assert (told.scenes, told.exposure_ms, told.day) == (2, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
-    assert describe_weights(out).map_scores is None  # of a single exposure
 
 
 @pytest.mark.parametrize("sizes", [{"patch": 24}, {"tokens": {"dim": 18}}])
@@ -197,7 +193,7 @@ def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
     for number in ("001", "002"):
         scene = folder / "images" / f"{number}_image.png"
         flags = {"scene": str(scene), "source": "sim", "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
-        notes[number] = " ".join(open_run(load_settings(None, flags)).notes)
+        notes[number] = " ".join(open_field(load_settings(None, flags)).notes)
     assert "a training scene" in notes["001"]
     assert "a training scene" not in notes["002"]
 
@@ -221,9 +217,9 @@ def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
     train_weights(_masked(tmp_path, slice(10), out))
     flags = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800], "source": "sim", "budget": 1}
     flags |= {"scene": str(tmp_path / "cube.npy"), "weights": str(out)}
-    run = open_run(load_settings(None, flags | {"out": str(tmp_path / "a")}))
-    assert (run.labels[:10] == 255).all()
-    assert (run.labels[10:] != 255).all()
+    labels = open_field(load_settings(None, flags | {"out": str(tmp_path / "a")})).labels.read()
+    assert (labels[:10] == 255).all()
+    assert (labels[10:] != 255).all()
 
 
 @pytest.mark.parametrize(
@@ -244,7 +240,7 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
     train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
     np.save(tmp_path / "other.npy", factor * values[..., : len(bands)])
     asked = {"scene": str(tmp_path / "other.npy"), "wavelengths": bands, "source": "raster", "weights": str(out)}
-    notes = " ".join(open_run(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
+    notes = " ".join(open_field(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
     assert re.search(note, notes)
     assert bool(note) == ("of the training" in notes)
 
@@ -328,6 +324,7 @@ def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
+        ({}, "training scenes"),  # others of the same names
         ({"hold_out": ("003",)}, "training scenes"),
         ({"validation": 2}, "training scenes"),
         ({"columns": 2}, "bands"),
@@ -335,19 +332,12 @@ def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
     ],
 )
 def test_continued_training_refuses_changed_input(
-    folder: Path, out: Path, first: tuple[Path, Any], changed: dict[str, Any], what: str
+    tmp_path: Path, out: Path, first: tuple[Path, Any], changed: dict[str, Any], what: str
 ) -> None:
-    """One message names the difference: missing training scenes, other bands or other network sizes."""
+    """One message names the difference: training scenes, of which the content counts, bands or network sizes."""
+    field = write_field(tmp_path / "field", (16, 16), NUMBERS, seed=0 if changed else 9)
     with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
-        train_weights(_request(folder, out, **{"validation": 1, "start": first[0], **changed}))
-
-
-def test_continued_training_refuses_other_scenes_of_the_same_names(folder: Path, out: Path, tmp_path: Path) -> None:
-    """Content identifies scenes; else validation could use scenes of the first training."""
-    train_weights(_request(folder, out, validation=0))
-    other = write_field(tmp_path / "field", (16, 16), ("001", "002", "003", "004"), seed=9)
-    with pytest.raises(SettingsError, match="other training scenes"):
-        train_weights(_request(other, tmp_path / "b.safetensors", validation=0, start=out))
+        train_weights(_request(field, out, **{"validation": 1, "start": first[0], **changed}))
 
 
 @pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])

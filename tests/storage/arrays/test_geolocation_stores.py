@@ -1,4 +1,4 @@
-"""Stored geolocation tables are read bit by bit; digests follow the values that scan paths depend on."""
+"""Stored geolocation tables are read bit by bit."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from hypothesis import given
-from hypothesis import strategies as st
 
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from spectralzoom.pipeline.rectify.placed import TieTable, tie_table
 from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from spectralzoom.storage.arrays.geolocation import open_geolocation, path_digest, write_geolocation
+from spectralzoom.storage.arrays.geolocation import open_geolocation, write_geolocation
 
 CAMERA = LineCamera()
 
@@ -33,7 +31,7 @@ def test_geolocation_tables_round_trip(tmp_path: Path) -> None:
     """Scan paths that turn, dwell and have gaps, and their tables, are read as they were written."""
     there = np.concatenate([np.arange(20.0), np.arange(25.0, 50), [49.0, 49.0], np.arange(48.0, 0, -1)])
     tables = {"coarse 0": tabulated(np.arange(50.0)), "fine/1": tabulated(there), "dark": []}
-    write_geolocation(tmp_path / "geolocation.zarr", tables, {"ifov_rad": CAMERA.ifov_rad})
+    write_geolocation(tmp_path / "geolocation.zarr", tables)
     found = open_geolocation(tmp_path / "geolocation.zarr")
     assert list(found) == list(tables)
     for name, scan_paths in tables.items():
@@ -44,7 +42,7 @@ def test_geolocation_tables_round_trip(tmp_path: Path) -> None:
                     np.testing.assert_array_equal(getattr(other, field.name), getattr(value, field.name))
                     assert type(getattr(other, field.name)) is type(getattr(value, field.name))
     root = zarr.open_group(tmp_path / "geolocation.zarr", mode="r")
-    assert (root.attrs["ifov_rad"], root["sweep_0"].attrs["sweep"]) == (CAMERA.ifov_rad, "coarse 0")
+    assert root["sweep_0"].attrs["sweep"] == "coarse 0"
     assert root["sweep_0/scan_path_0"].attrs["spacing"] == 16
     assert 0 < root["sweep_0/scan_path_0"].attrs["bound_px"] <= 2e-3
 
@@ -62,36 +60,3 @@ def test_a_damaged_geolocation_store_is_refused(tmp_path: Path) -> None:
     (path / "sweep_0" / "scan_path_0" / "zarr.json").unlink()
     with pytest.raises(IncompleteStoreError, match="scan_path_0"):
         open_geolocation(path)
-
-
-@given(st.integers(0, 4), st.floats(1e-12, 1e-3))
-def test_path_digest_depends_on_usable_lines(line: int, change: float) -> None:
-    """The digest changes with a usable line's position or correction, and with the set of usable lines."""
-    position = np.linspace(0.1, 0.5, 10).reshape(5, 2)
-    shift = np.zeros((5, 2))
-    usable = np.ones(5, np.bool_)
-    moved, off = position.copy(), usable.copy()
-    moved[line, 1] += change
-    off[line] = False
-    names = {
-        path_digest(position, usable, shift),
-        path_digest(moved, usable, shift),
-        path_digest(position, off, shift),
-        path_digest(position, usable, shift + change),
-        path_digest(position[:4], usable[:4], shift[:4]),
-    }
-    assert len(names) == 5
-    assert path_digest(moved, off, shift) == path_digest(position, off, shift)
-
-
-def test_path_digest_ignores_defaults_and_unusable_lines() -> None:
-    """Default flags, a correction of 0, memory order and NaN at an unusable line do not change the digest."""
-    position = np.linspace(0.1, 0.5, 10).reshape(5, 2)
-    plain = path_digest(position)
-    assert len(plain) == 20
-    assert plain == path_digest(position, np.ones(5, np.bool_), -np.zeros((5, 2)))
-    assert plain == path_digest(np.asfortranarray(position))
-    usable = np.arange(5) != 2
-    lost = position.copy()
-    lost[2] = np.nan
-    assert path_digest(lost, usable) == path_digest(position, usable)
