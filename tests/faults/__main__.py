@@ -26,6 +26,7 @@ PLACES = {
     "many_writers": "many_writers:rows",
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
+    "metadata_flips": "metadata_flips:rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 
