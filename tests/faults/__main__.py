@@ -27,6 +27,7 @@ PLACES = {
     "lost_lines": "lost_lines:rows",
     "growing_files": "growing_files:rows",
     "metadata_flips": "metadata_flips:rows",
+    "hostile_archives": "hostile_archives:rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 import _pyio
 import builtins
 import errno
+import fcntl
 import functools
 import importlib
 import io
 import os
+import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -63,6 +65,29 @@ def end_before(place: str, number: int, call: int = 1) -> None:
         return real(*given, **named)
 
     setattr(inside, name, ended)
+
+
+def fail_locks(number: int) -> None:
+    """Let every lock fail with error ``number``; with 0 every lock is granted, and holds nothing."""
+
+    def flock(*_: Any) -> None:
+        if number:
+            raise OSError(number, os.strerror(number))
+
+    fcntl.__dict__["flock"] = flock
+
+
+def stop_without_locks(root: str, at: int) -> None:
+    """Stop this process just before its ``at``-th call that changes a file below ``root``; locks hold nothing."""
+    fail_locks(0)
+    end_at(root, at, signal.SIGSTOP)
+
+
+def be_nobody(number: int) -> None:
+    """Become another user, who may read and write what all users may."""
+    os.setgroups([])
+    os.setgid(number)
+    os.setuid(number)
 
 
 def label(path: Path) -> str | None:

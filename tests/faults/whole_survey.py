@@ -144,7 +144,7 @@ def digest(content: bytes) -> str:
 
 
 def other_receipt(whole: Whole, out: Path) -> list[str]:
-    """Return the parts in which the receipt of the newest run but that of ``whole`` differs from the undisturbed one."""
+    """Return the parts in which the receipt of the newest run beside the first one differs from that."""
     runs = [path for path in (out / "runs").glob("*/receipt.json") if f"runs/{path.parent.name}" != whole.run]
     newest = max(runs, key=lambda path: path.stat().st_mtime_ns)
     found: Mapping[str, Any] = comparable(json.loads(newest.read_text()))
