@@ -28,6 +28,7 @@ PLACES = {
     "growing_files": "growing_files:rows",
     "metadata_flips": "metadata_flips:rows",
     "hostile_archives": "hostile_archives:rows",
+    "vanishing_stores": "vanishing_stores:rows",
 }
 FAULTS = {name: rows_of(f"tests.faults.{place}") for name, place in PLACES.items()}
 

@@ -13,6 +13,7 @@ import functools
 import importlib
 import io
 import os
+import shutil
 import signal
 import threading
 from collections.abc import Callable
@@ -88,6 +89,34 @@ def be_nobody(number: int) -> None:
     os.setgroups([])
     os.setgid(number)
     os.setuid(number)
+
+
+def vanish_before(root: str, at: int, kept: list[str]) -> None:
+    """Remove all stores below ``root`` but those ``kept``, just before the ``at``-th call that looks at a file there.
+
+    Calls that look are `stat`, `scandir` and `open`, also those of the standard library.
+    """
+    calls = count(1)
+    rename, rmtree, glob = os.rename, shutil.rmtree, Path.glob
+
+    def remove() -> None:
+        for number, path in enumerate(list(glob(Path(root), "stages/*/*"))):
+            if path.relative_to(root).as_posix() not in kept and not path.name.endswith(".part"):
+                rename(path, gone := f"{root}/../vanished-{os.getpid()}-{number}")
+                rmtree(gone)
+
+    def around(call: Callable[..., Any]) -> Callable[..., Any]:
+        def watched(*given: Any, **named: Any) -> Any:
+            path = os.fsdecode(given[0]) if given and isinstance(given[0], str | bytes | os.PathLike) else ""
+            if path.startswith(root) and next(calls) == at:
+                remove()
+            return call(*given, **named)
+
+        return watched
+
+    for name in ("stat", "lstat", "scandir", "listdir", "open"):
+        setattr(os, name, around(getattr(os, name)))
+    builtins.open = io.open = _pyio.open
 
 
 def label(path: Path) -> str | None:

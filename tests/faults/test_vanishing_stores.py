@@ -1,0 +1,26 @@
+"""Commands beside `gc` of another process end well or with one message, and nothing is damaged.
+
+``python tests/faults vanishing_stores`` tries more.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.faults import vanishing_stores
+from tests.faults.small_survey import Subject
+
+
+def test_commands_end_well_while_gc_removes_stores(subject: Subject, tmp_path: Path) -> None:
+    """Survey, gc, verify, ls and explain are started while 60 stores go: 90 commands, and the gc."""
+    found = vanishing_stores.start_beside_gc(subject, tmp_path, 6, 3)
+    assert found.wrong == []
+    assert found.removed == 6 * vanishing_stores.STORES
+    assert found.tried == 6 * (5 * 3 + 3)
+
+
+def test_commands_end_well_when_stores_vanish_before_any_call(subject: Subject, tmp_path: Path) -> None:
+    """All stores that no run names go at once, before a random call that looks at a file."""
+    found = vanishing_stores.vanish_at_calls(subject, tmp_path, 30, seed=0)
+    assert found.wrong == []
+    assert found.removed >= 20 * vanishing_stores.STORES  # else the calls were not met
