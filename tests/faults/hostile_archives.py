@@ -160,12 +160,7 @@ def try_place(whole: Whole, out: Path, place: str, kind: str, tries: Tries) -> N
     uri, outside = change(whole, out, place, kind)
     before = tree(outside)
     _run_readers(whole, out, uri, kind, tries)
-    verbs = {
-        "survey": asked(out),
-        "gc": ["gc", str(out), "--keep-days", "0"],
-        "gc --damaged": ["gc", str(out), "--damaged"],
-    }
-    for name, command in verbs.items():
+    for name, command in _writers(out).items():
         ended = ended_in_time(whole.nursery.start(command))
         tries.told(f"{name} with a {kind} at {place}", ended, codes=(2, *CODES.get(name.split()[0], (0, 1))))
     after = tree(outside)
@@ -234,6 +229,55 @@ def try_places(whole: Whole, cases: Sequence[tuple[str, str]], folder: Path) -> 
     return tries
 
 
+# --- missing rights ---------------------------------------------------------------------------------------------------
+
+RIGHTS = {  # address, and its mode
+    "": 0o000,
+    "stages": 0o000,
+    "stages/segment": 0o555,
+    "{segment}": 0o000,
+    "{segment}/manifest.json": 0o000,
+    "{segment}/class_map.zarr": 0o000,
+    "{segment}/class_map.zarr/zarr.json": 0o000,
+    "{effects}/effects.json": 0o000,
+    "runs": 0o555,
+    "{run}": 0o000,
+    "{run}/receipt.json": 0o000,
+    ".locks": 0o555,
+    ".locks/use.lock": 0o000,
+    "spool": 0o555,
+}
+
+
+def try_rights(whole: Whole, folder: Path, places: Sequence[str]) -> Tries:
+    """Run every command without the rights to one place; then give them back, and complete the archive."""
+    tries = Tries()
+    names = {name: next(uri for uri in whole.stores if f"/{name}/" in uri) for name in ("segment", "effects")}
+    for number, place in enumerate(places):
+        out = Path(shutil.copytree(whole.out, folder / f"rights-{number}"))
+        (out / "spool").mkdir(exist_ok=True)
+        path = out / place.format(run=whole.run, **names)
+        mode = path.stat().st_mode
+        path.chmod(RIGHTS[place])
+        for name, command in {**_writers(out), **readers(whole, out, out.with_name(f"{out.name}-exported"))}.items():
+            ended = ended_in_time(whole.nursery.start(command, "obey_rights"))
+            called = f"{name} without the rights to {place or 'the archive'}"
+            tries.told(called, ended, codes=(2, *CODES.get(name.split()[0], (0, 1))))
+            if not place and ended.code == 0:
+                tries.wrong.append(f"{called}: it had them")
+        tries.places += 1
+        if path.exists():
+            path.chmod(mode)
+        _complete(whole, out, f"missing rights to {place}", tries)
+    return tries
+
+
+def _writers(out: Path) -> dict[str, list[str]]:
+    """Return the commands that write to an archive, by name; after the last, what is damaged is removed."""
+    gc = ["gc", str(out)]
+    return {"survey": asked(out), "gc": [*gc, "--keep-days", "0"], "gc --damaged": [*gc, "--damaged"]}
+
+
 # --- locks that fail, and locks that hold nothing ---------------------------------------------------------------------
 
 LOCK_ERRORS = (errno.ENOSYS, errno.EIO, errno.EBADF)
@@ -245,13 +289,7 @@ def refuse_locks(whole: Whole, folder: Path, numbers: Sequence[int]) -> Tries:
     tries = Tries()
     for number in numbers:
         out = whole.copy(folder / f"locks-{number}")
-        commands = {
-            "survey": asked(out),
-            "gc": ["gc", str(out), "--keep-days", "0"],
-            "gc --damaged": ["gc", str(out), "--damaged"],
-            **readers(whole, out, out.with_name(f"{out.name}-exported")),
-        }
-        for name, command in commands.items():
+        for name, command in {**_writers(out), **readers(whole, out, out.with_name(f"{out.name}-exported"))}.items():
             ended = ended_in_time(whole.nursery.start(command, "fail_locks", number=number))
             tries.told(f"{name} with lock error {number}", ended, codes=CODES.get(name.split()[0], (0, 1)))
         tries.places += 1
@@ -317,6 +355,7 @@ def rows(quick: bool) -> Iterator[Row]:
         moments = moments_of(subject, 4 if quick else 80, 0)
         table = (
             ("strange archives", "file, folder, pipe or link in it", lambda: try_places(whole, some, Path(name))),
+            ("missing rights", "no rights to one place", lambda: try_rights(whole, Path(name), list(RIGHTS))),
             ("failing locks", "ENOSYS, EIO, EBADF of each", lambda: refuse_locks(whole, Path(name), LOCK_ERRORS)),
             ("no locks", "two at once, one held", lambda: write_without_locks(subject, Path(name), moments)),
         )

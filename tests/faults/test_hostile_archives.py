@@ -25,6 +25,13 @@ def test_strange_things_in_an_archive_end_in_one_message(whole: Whole, tmp_path:
     assert tries.commands >= 10 * tries.places >= 50
 
 
+def test_missing_rights_end_in_one_message(whole: Whole, tmp_path: Path) -> None:
+    """Who may not read or write one place is told so, and the archive stays whole."""
+    tries = hostile_archives.try_rights(whole, tmp_path, list(hostile_archives.RIGHTS)[::2])
+    assert tries.wrong == []
+    assert tries.places == 7
+
+
 def test_failing_locks_end_in_one_message(whole: Whole, tmp_path: Path) -> None:
     """Each command tells of errors that no system is known to give, and the archive stays whole."""
     tries = hostile_archives.refuse_locks(whole, tmp_path, LOCK_ERRORS)
