@@ -336,14 +336,14 @@ def _wait_until_stopped(child: Child) -> bool:
 
 
 def moments_of(subject: Subject, count: int, seed: int) -> list[tuple[int, tuple[str, ...]]]:
-    """Return calls to stop at, and the command that runs meanwhile: half are renames, half any call."""
+    """Return calls to stop at and commands that run meanwhile: publications, calls on spools and any calls by turns."""
     rng = random.Random(seed)
-    names = [number for number, name, _ in subject.changing_calls if name in ("rename", "replace", "mkdir")]
-    every = [number for number, *_ in subject.changing_calls]
+    calls = subject.changing_calls
+    published = [number for number, name, path in calls if name == "rename" or path.name == "manifest.json"]
+    spooled = [number for number, _, path in calls if path.parts[0] == "spool"]
+    pools = published, spooled, [number for number, *_ in calls]
     others = ((), OTHER, ("gc", "--keep-days", "0"), ("gc", "--damaged"))
-    return [
-        (rng.choice((names, every)[number // 2 % 2]), others[(0, 1, 0, 2, 0, 3)[number % 6]]) for number in range(count)
-    ]
+    return [(rng.choice(pools[number % 3]), others[(0, 1, 0, 2, 0, 3)[number // 3 % 6]]) for number in range(count)]
 
 
 def rows(quick: bool) -> Iterator[Row]:
