@@ -340,7 +340,7 @@ def moments_of(subject: Subject, count: int, seed: int) -> list[tuple[int, tuple
     rng = random.Random(seed)
     calls = subject.changing_calls
     published = [number for number, name, path in calls if name == "rename" or path.name == "manifest.json"]
-    spooled = [number for number, _, path in calls if path.parts[0] == "spool"]
+    spooled = [number for number, _, path in calls if path.parts[:1] == ("spool",)]
     pools = published, spooled, [number for number, *_ in calls]
     others = ((), OTHER, ("gc", "--keep-days", "0"), ("gc", "--damaged"))
     return [(rng.choice(pools[number % 3]), others[(0, 1, 0, 2, 0, 3)[number // 3 % 6]]) for number in range(count)]

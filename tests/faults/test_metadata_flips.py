@@ -23,7 +23,7 @@ def test_drawn_flips_are_named_or_change_no_number(whole: Whole, tmp_path: Path)
 def test_aimed_flips_are_named_and_removed(whole: Whole, tmp_path: Path) -> None:
     """Scale, shape, type, names and others are changed in each kind of store; after `gc --damaged` all is as before."""
     flips = metadata_flips.each_kind(metadata_flips.aimed_flips(whole), 1)
-    found = metadata_flips.try_flips(whole, flips, tmp_path, exported=2)
+    found = metadata_flips.try_flips(whole, flips, tmp_path, exported=2, cured=2)
     assert found.wrong == []
     assert {flip.uri for flip in flips} == {*whole.stores, whole.run}
     assert len(found.tried) > 10
