@@ -226,8 +226,8 @@ def rows(quick: bool) -> Iterator[Row]:
     """Yield a row for random flips and one for aimed ones."""
     with tempfile.TemporaryDirectory(prefix="flips-") as name, Nursery(Path(name)) as nursery:
         whole = survey_whole(prepare(nursery))
-        aimed = aimed_flips(whole)
-        cases = {"drawn": drawn_flips(whole, 26 if quick else 600, 0), "aimed": each_kind(aimed, 2) if quick else aimed}
+        aimed = each_kind(aimed_flips(whole), 2 if quick else len(AIMS))
+        cases = {"drawn": drawn_flips(whole, 26 if quick else 300, 0), "aimed": aimed}
         for kind, flips in cases.items():
             found = try_flips(whole, flips, Path(name))
             demanded = "an error that names the store and its removal, or the same numbers; then the same bytes again"
