@@ -66,7 +66,7 @@ from spectralzoom.pipeline.signal.subspace import SignalStatistics, find_compone
 from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
 from spectralzoom.pipeline.simulator.effects.probe import noise_electrons
 from spectralzoom.pipeline.simulator.readout import dark_frame, read_out
-from spectralzoom.pipeline.simulator.render import EFFECTS, USUAL, Choice, expected_light
+from spectralzoom.pipeline.simulator.render import EFFECTS, USUAL, expected_light
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
@@ -307,10 +307,9 @@ def condense_farm(seed: int, _scene: str | None = None, _weights: Path | None = 
     scene = farm_scene(seed, FIELD_SHAPE)
     along, _, _ = cheapest_full(SceneGrid(*FIELD_SHAPE, PATCH), rig.camera, CostModel())
     (sweep,) = uniform_sweeps(SceneGrid(*FIELD_SHAPE, PATCH), rig.camera, along, step=1, exposure_ms=EXPOSURE_MS)
-    choice = Choice.of(USUAL)
     block = sweep_block(scene, rig, sweep, range(sweep.lines), seed=seed)
-    light, dark = expected_light(scene, block, choice), dark_frame(block, choice)
-    raw = read_out(light, block, choice)
+    light, dark = expected_light(scene, block, USUAL), dark_frame(block, USUAL)
+    raw = read_out(light, block, USUAL)
     lines = SimulatedSweep(SimulatedSource(scene, rig, seed), sweep)
     per_dn = np.float32(rig.camera.electrons_per_dn)
 

@@ -24,7 +24,8 @@ from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
 from spectralzoom.pipeline.planning.coverage import cheapest_full
 from spectralzoom.pipeline.rectify.region import mosaic_rows
 from spectralzoom.pipeline.signal.subspace import FEW_BANDS
-from spectralzoom.pipeline.simulator.render import EFFECTS, Choice
+from spectralzoom.pipeline.simulator.effects.effect import Effect
+from spectralzoom.pipeline.simulator.render import EFFECTS
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
@@ -100,6 +101,6 @@ def observe_finely(
     return columns, replace(of_columns, spectra=spectra if bands > FEW_BANDS else None)
 
 
-def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:
+def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> dict[Effect, str]:
     """Choose effects as a survey of these sweeps does."""
-    return Choice.of(decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen)
+    return decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy
@@ -28,11 +26,10 @@ from spectralzoom.pipeline.simulator.effects.counting import (
     photon_counts,
     rounded_counts,
 )
-from spectralzoom.pipeline.simulator.effects.effect import OFF, Radiance, SweepBlock
-from spectralzoom.pipeline.simulator.render import Choice
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Chosen, Effect, Radiance, SweepBlock
 
 
-def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
+def read_out(light: Radiance, block: SweepBlock, chosen: Chosen) -> NDArray[np.uint16]:
     """Turn expected electrons into DN, with the readout's effects among those chosen.
 
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
@@ -41,19 +38,19 @@ def read_out(light: Radiance, block: SweepBlock, chosen: Mapping[Any, str] | Cho
     Returns (line, sample, band) uint16.
     Raises SceneError: a number is not finite; names the first.
     """
-    readout = Readout(block, Choice.of(chosen))
+    readout = Readout(block, chosen)
     raw = np.empty(light.shape, np.uint16)
     for row, number in enumerate(block.numbers):
         raw[row] = readout.numbers(light[row], int(number))
     return raw
 
 
-def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
+def dark_frame(block: SweepBlock, chosen: Chosen) -> Radiance:
     """Return what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]
 
     Numbers below 0 become 0, so that the mean is above a dark level that noise reaches down from.
     """
-    readout = Readout(block, Choice.of(chosen))
+    readout = Readout(block, chosen)
     camera = block.rig.camera
     dark: Radiance = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32) + readout.added
     dark = dark / np.float32(camera.electrons_per_dn) + np.float32(camera.dark_dn)
@@ -69,11 +66,11 @@ class Readout:
     """The readout of one block's samples under a choice of effects."""
 
     block: SweepBlock
-    choice: Choice
+    chosen: Chosen
 
     def numbers(self, light: Radiance, number: int) -> NDArray[np.uint16]:
         """Return the converter's numbers of one line's light, (sample, band) [e-]."""
-        cheap = self._variant(SHOT.name) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
+        cheap = self._variant(SHOT) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
         if not cheap:  # shot and read noise are draws of their own
             return self.converted(self.electrons(light, number))
         from spectralzoom.pipeline.simulator import compiled_loops
@@ -99,7 +96,7 @@ class Readout:
         """Return what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
         expected = self._expected(light, number)
         electrons = expected
-        shot = self._variant(SHOT.name)
+        shot = self._variant(SHOT)
         if shot != OFF:
             deviate = self._deviates(SHOT.name, number)
             electrons = (photon_counts if shot == EXACT else rounded_counts)(expected, deviate)
@@ -121,22 +118,22 @@ class Readout:
     @cached_property
     def added(self) -> Radiance | np.float32:
         """Return electrons that come without light: a number, or (sample, band) where there are hot elements."""
-        same = np.float32(dark_electrons(self.block.rig) if self._variant(DARK_CURRENT.name) != OFF else 0.0)
-        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_fraction:
+        same = np.float32(dark_electrons(self.block.rig) if self._variant(DARK_CURRENT) != OFF else 0.0)
+        if self._variant(DEFECTS) == OFF or not self.block.rig.detector.hot_fraction:
             return same
         return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same
 
     @cached_property
     def dead(self) -> NDArray[np.bool_] | None:
         """Return elements without response, (sample, band); None where there are none."""
-        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.dead_fraction:
+        if self._variant(DEFECTS) == OFF or not self.block.rig.detector.dead_fraction:
             return None
         return dead_elements(self.block.rig, len(self.block.wavelength_nm))
 
     @cached_property
     def read_noise_e(self) -> float:
         """Return standard deviation of the amplifier's noise; 0 where it is off. [e-]"""
-        return 0.0 if self._variant(READ_NOISE.name) == OFF else self.block.rig.camera.read_noise_e
+        return 0.0 if self._variant(READ_NOISE) == OFF else self.block.rig.camera.read_noise_e
 
     def _expected(self, light: Radiance, number: int) -> Radiance:
         """Return electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""
@@ -157,6 +154,6 @@ class Readout:
         size = self.block.rig.camera.samples, len(self.block.wavelength_nm)
         return normal_deviates(self.block.stream(stream, number), math.prod(size)).reshape(size)
 
-    def _variant(self, name: str) -> str:
-        ideal = self.block.rig.detector.noiseless and name in (SHOT.name, READ_NOISE.name)
-        return OFF if ideal else self.choice.variant(name)
+    def _variant(self, effect: Effect) -> str:
+        ideal = self.block.rig.detector.noiseless and effect in (SHOT, READ_NOISE)
+        return OFF if ideal else self.chosen.get(effect, OFF)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, line_positions, shifted_position
 from spectralzoom.pipeline.simulator.effects.air import ABSORPTION, PARALLAX, PATH_RADIANCE, TURBULENCE, WIND
@@ -24,7 +23,7 @@ from spectralzoom.pipeline.simulator.effects.counting import (
     SATURATION,
     SHOT,
 )
-from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect, Radiance, SweepBlock
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Chosen, Effect, Radiance, SweepBlock
 from spectralzoom.pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
 from spectralzoom.pipeline.simulator.effects.line import BOXES, FOLDED, ROTATION, SLIT, SMEAR, box_of, smeared_positions
 from spectralzoom.pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, LAG, STAIRCASE, THERMAL_DRIFT
@@ -38,57 +37,20 @@ from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Ra
 PROBES = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Effects that are on, each with its variant, in the order of the chain; those of the readout may be among them.
-
-    ``slit``, ``smear`` and ``rotation`` are given by their names, the others by what they do.
-    """
-
-    effects: tuple[tuple[Effect, str], ...] = ()
-
-    @staticmethod
-    def of(chosen: Mapping[Any, str] | Choice) -> Choice:
-        """Take a mapping {effect: variant}, in the order of the chain; effects that are off may be among them.
-
-        Raises SettingsError: an effect has no such variant.
-        """
-        if isinstance(chosen, Choice):
-            return chosen
-        for effect, variant in chosen.items():
-            if variant not in (*effect.variants, OFF):
-                raise SettingsError(f"effect {effect.name} has no variant {variant!r}; choose from {effect.variants}")
-        return Choice(tuple((effect, variant) for effect, variant in chosen.items() if variant != OFF))
-
-    def variant(self, name: str) -> str:
-        """Return the variant of an effect by its name; off where it is not chosen."""
-        return next((variant for effect, variant in self.effects if effect.name == name), OFF)
-
-    def doing(self, action: str) -> Iterator[tuple[Any, str]]:
-        """Return the effects that have this action, as (effect, variant) in the order of the chain."""
-        return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
-
-
-def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Radiance:
+def expected_light(scene: RasterScene, block: SweepBlock, chosen: Chosen) -> Radiance:
     """Return the electrons that the samples of some lines gather on average, before the readout.
 
-    ``chosen``: the effects that are on, in the order of the chain, each with its variant. Without any, the camera
-    stands still and its lines lie straight. Returns (line, sample, band) float32. [e-] Raises PoseError: a position,
-    with what aims add, is out of the mirror's reach. SettingsError: an effect has no such variant.
+    Without effects the camera stands still and its lines lie straight. Returns (line, sample, band) float32. [e-]
+    Raises PoseError: a position, with what aims add, is out of the mirror's reach.
     """
-    choice = Choice.of(chosen)
-    steps = [views.flat() for views in _views(block, choice, scene.shape)]
-    moments = tuple(choice.doing("moments"))
-    names = tuple(map(choice.variant, ("slit", "smear", "rotation")))
-    light = _sampler(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).scan_pass(
-        scene,
-        steps,
-        along_y=block.sweep.along == "y",
-        exposure_ratio=block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS,
-    )
+    steps = [views.flat() for views in _views(block, chosen, scene.shape)]
+    of_the_line = tuple(chosen.get(effect, OFF) for effect in (SLIT, SMEAR, ROTATION))
+    sampler = _sampler(block.rig, block.sweep, block.wavelength_nm.tobytes(), _doing(chosen, "moments"), of_the_line)
+    ratio = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
+    light = sampler.scan_pass(scene, steps, along_y=block.sweep.along == "y", exposure_ratio=ratio)
     light = light.reshape(len(block.lines), -1, light.shape[1])
     pending: Radiance | None = None
-    for effect, variant in choice.effects:
+    for effect, variant in chosen.items():
         if hasattr(effect, "gain"):
             gain = effect.gain(block, variant)
             if gain.shape[-1] == 1:
@@ -105,13 +67,17 @@ def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, s
     return light
 
 
-def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterator[RayViews]:
+def _doing(chosen: Chosen, action: str) -> tuple[tuple[Any, str], ...]:
+    return tuple((effect, variant) for effect, variant in chosen.items() if hasattr(effect, action))
+
+
+def _views(block: SweepBlock, chosen: Chosen, shape: tuple[int, int]) -> Iterator[RayViews]:
     """Yield where the samples look at each held position, (line, sample) each. [px of the scene]
 
     The mirror holds each position, aims included, for as long as the others.
     """
-    position = smeared_positions(block, choice.variant("smear"))
-    for aim, variant in choice.doing("aim"):
+    position = smeared_positions(block, chosen.get(SMEAR, OFF))
+    for aim, variant in _doing(chosen, "aim"):
         shift = aim.aim(block, variant)
         if shift.shape[1] not in (1, position.shape[1]) and block.sweep.positions > 1:  # its course is not followed
             shift = shift.mean(axis=1, keepdims=True)
@@ -119,9 +85,9 @@ def _views(block: SweepBlock, choice: Choice, shape: tuple[int, int]) -> Iterato
     ifov = block.rig.camera.ifov_rad
     size = shape if block.sweep.along == "y" else shape[::-1]
     for step in range(position.shape[1]):
-        views = _tangents(position[:, step, None], block.slopes, exact=choice.variant("rotation") != OFF)
+        views = _tangents(position[:, step, None], block.slopes, exact=chosen.get(ROTATION, OFF) != OFF)
         along, scan = views.along / ifov, views.scan / ifov
-        for displacement, variant in choice.doing("displaced"):
+        for displacement, variant in _doing(chosen, "displaced"):
             beside = displacement.displaced(block, along, scan, variant)
             along, scan = along + beside[0], scan + beside[1]
         yield replace(views, along=along + (size[0] - 1) / 2, scan=scan + (size[1] - 1) / 2)
@@ -138,12 +104,12 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
 
 @lru_cache(maxsize=2)  # its tables take up to 630 MB, in the most oblique sweep of 10 240 px
 def _sampler(
-    rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], names: tuple[str, ...]
+    rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], of_the_line: tuple[str, ...]
 ) -> SceneSampler:
     wavelength = np.frombuffer(wavelengths)
     normal = middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]
-    slit, smear, rotation = names
+    slit, smear, rotation = of_the_line
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)
     lines = np.linspace(0, len(whole) - 1, PROBES).round().astype(np.intp)
     slopes = np.linspace(-0.5, 0.5, PROBES) * rig.camera.samples * rig.camera.ifov_rad
@@ -164,6 +130,6 @@ LIGHT: tuple[Effect, ...] = (
 READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION)
 EFFECTS: tuple[Effect, ...] = (*AIMS, *RAYS, *FOOTPRINT, *LIGHT, *READOUT)
 BY_NAME = MappingProxyType({effect.name: effect for effect in EFFECTS})
-# effects of any camera behind a mirror, without noise and with: a farm changes by .015 sigma at most beside exact ones
-QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: "held"})
-USUAL = Choice((*QUIET.effects, (SHOT, GAUSSIAN), (READ_NOISE, "exact"), (SATURATION, "exact")))
+# effects of any camera behind a mirror: a farm changes by .015 sigma at most beside exact ones
+USUAL: dict[Any, str] = {ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: "held"}
+USUAL |= {SHOT: GAUSSIAN, READ_NOISE: "exact", SATURATION: "exact"}

@@ -7,23 +7,23 @@ rest stays in the data: stray light, blur and keystone, air, sky, and the sun's 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import wire_positions
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
 from spectralzoom.pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
-from spectralzoom.pipeline.simulator.effects.effect import OFF, SweepBlock
+from spectralzoom.pipeline.simulator.effects.effect import OFF, Chosen, SweepBlock
 from spectralzoom.pipeline.simulator.effects.lighting import VIGNETTING
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
 from spectralzoom.pipeline.simulator.readout import dark_frame, read_out
-from spectralzoom.pipeline.simulator.render import USUAL, Choice, expected_light
+from spectralzoom.pipeline.simulator.render import USUAL, expected_light
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.source import AT_REST, Line, References
@@ -40,27 +40,29 @@ class SimulatedSource:
     """A source that looks at ``scene`` with ``rig``. Quantisation and saturation are always on: raw lines are uint16.
 
     Streams are keyed (seed, sweep name, effect, line number). So a line does not depend on the first line asked for,
-    the order of sweeps, or other effects. ``chosen`` are the effects that are on, {effect: variant}, in the order of
-    the chain. ``clock`` says when sweeps start, by name, after the survey did [s]; a sweep it does not name is at once.
-    With ``pointing`` the mirror looks beside the planned positions and still reports those.
+    the order of sweeps, or other effects. ``clock`` says when sweeps start, by name, after the survey did [s]; a sweep
+    it does not name is at once. With ``pointing`` the mirror looks beside the planned positions and reports those.
+    Raises SettingsError: an effect has no such variant.
     """
 
     scene: RasterScene
     rig: Rig
     seed: int = 0
-    chosen: Mapping[Any, str] | Choice = USUAL
+    chosen: Chosen = field(default_factory=USUAL.copy)
     name: str = "sim"
     clock: Mapping[str, float] | None = None
     pointing: PointingErrors | None = None
 
     def __post_init__(self) -> None:
-        _ = self.choice  # refuses variants that effects do not have
+        for effect, variant in self.chosen.items():
+            if variant not in (*effect.variants, OFF):
+                raise SettingsError(f"effect {effect.name} has no variant {variant!r}; choose from {effect.variants}")
 
     @cached_property
-    def choice(self) -> Choice:
+    def effects(self) -> Chosen:
         """Return all effects that are on, pointing among them."""
-        chosen = Choice.of(self.chosen)
-        return chosen if self.pointing is None else Choice(((self.pointing, "exact"), *chosen.effects))
+        on = {effect: variant for effect, variant in self.chosen.items() if variant != OFF}
+        return on if self.pointing is None else {self.pointing: "exact"} | on
 
     @property
     def camera(self) -> LineCamera:
@@ -78,11 +80,21 @@ class SimulatedSource:
         return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
 
     def render(self, sweep: Sweep, lines: range) -> Raw:
+        """Return the raw numbers of some lines, (line, sample, band) uint16 [DN]. Threads may ask at the same time.
+
+        Neither the other lines asked for nor the order of calls changes a number. Raises PoseError: a position is out
+        of the mirror's reach.
+        """
+        raw = np.empty((len(lines), self.camera.samples, len(self.wavelength_nm)), np.uint16)
         started_s = self.started_s(sweep)
-        return render_lines(self.scene, self.rig, self.choice, sweep, lines, seed=self.seed, started_s=started_s)
+        for first in range(0, len(lines), BLOCK_LINES):
+            some = slice(first, first + BLOCK_LINES)
+            block = sweep_block(self.scene, self.rig, sweep, lines[some], seed=self.seed, started_s=started_s)
+            raw[some] = read_out(expected_light(self.scene, block, self.effects), block, self.effects)
+        return raw
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
-        """Yield the sweep's lines from line ``first`` on. Raises PoseError as `render_lines`."""
+        """Yield the sweep's lines from line ``first`` on. Raises PoseError as `render`."""
         for start in range(first, sweep.lines, BLOCK_LINES):
             yield from self.lines_of(sweep, range(start, min(start + BLOCK_LINES, sweep.lines)))
 
@@ -116,10 +128,10 @@ class SimulatedSource:
         """
         rig = self.rig.taking(sweep)
         block = sweep_block(self.scene, rig, AT_REST, range(1))
-        dark = dark_frame(block, self.choice)
+        dark = dark_frame(block, self.effects)
         assert block.white_e is not None
         light = np.repeat(block.white_e.astype(np.float32)[None, None], block.rig.camera.samples, axis=1)
-        for effect, variant in self.choice.effects:
+        for effect, variant in self.effects.items():
             if effect.name not in SEEN:
                 continue
             if hasattr(effect, "gain"):
@@ -128,20 +140,20 @@ class SimulatedSource:
                 light = effect.change(light, block, variant)
         seen: Frame = light[0]
         bad = None
-        if self.choice.variant(DEFECTS.name) != OFF:
+        if DEFECTS in self.effects:
             dead = dead_elements(rig, seen.shape[1])
             seen[dead] = 0
             elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)
             bad = elements if elements.any() else None
         white_reference = self.scene.white_reference.astype(np.float32)
-        if (response := self.choice.variant(RESPONSE.name)) != OFF:
-            white_reference = RESPONSE.change(white_reference[None, None], block, response)[0, 0]
+        if RESPONSE in self.effects:
+            white_reference = RESPONSE.change(white_reference[None, None], block, self.effects[RESPONSE])[0, 0]
         return References(
             dark=_rounded(dark),
             white=_rounded(dark + seen / np.float32(rig.camera.electrons_per_dn)),
             white_reference=white_reference,
             bad=bad,
-            by_mirror=self.choice.variant(VIGNETTING.name) != OFF,
+            by_mirror=VIGNETTING in self.effects,
         )
 
 
@@ -207,30 +219,6 @@ def sweep_block(
     rig = rig.taking(sweep)
     white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, started_s, scene.fwhm_nm, white)
-
-
-def render_lines(
-    scene: RasterScene,
-    rig: Rig,
-    chosen: Mapping[Any, str] | Choice,
-    sweep: Sweep,
-    lines: range,
-    *,
-    seed: int = 0,
-    started_s: float = 0.0,
-) -> Raw:
-    """Return the raw numbers of some lines, (line, sample, band) uint16 [DN]. Threads may share arguments.
-
-    Neither the other lines asked for nor the order of calls changes a number. Raises PoseError: a position is out of
-    the mirror's reach.
-    """
-    choice = Choice.of(chosen)
-    raw = np.empty((len(lines), rig.camera.samples, len(scene.wavelength_nm)), np.uint16)
-    for first in range(0, len(lines), BLOCK_LINES):
-        some = slice(first, first + BLOCK_LINES)
-        block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s)
-        raw[some] = read_out(expected_light(scene, block, choice), block, choice)
-    return raw
 
 
 def _rounded(frame: Frame) -> Frame:

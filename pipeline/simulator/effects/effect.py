@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from spectralzoom.pipeline.simulator.rig_model import Rig
 
 Radiance = NDArray[np.float32]
 OFF = "off"
+Chosen = Mapping[Any, str]  # effects that are on, each with its variant, in the order of the chain
 
 
 @dataclass(frozen=True)

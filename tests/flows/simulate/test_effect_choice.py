@@ -47,9 +47,9 @@ def test_manifest_and_source_have_the_chosen_effects(decided: Ref, settings: Set
     assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
     field = SimulatedField(make_source(open_simulation(settings)[0], settings))
     source = field.lit(chosen_effects(decided), {"a": 3.0}).source
-    assert {effect.name: variant for effect, variant in source.choice.effects} == on
+    assert {effect.name: variant for effect, variant in source.effects.items()} == on
     assert source.clock == {"a": 3.0}
-    assert list(chosen_effects(decided)) == [effect for effect, _ in source.choice.effects]
+    assert list(chosen_effects(decided)) == list(source.effects)
 
 
 def test_effects_unknown_to_this_version_are_refused(monkeypatch: pytest.MonkeyPatch, decided: Ref) -> None:

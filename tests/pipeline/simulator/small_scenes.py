@@ -15,8 +15,9 @@ from scipy.ndimage import map_coordinates
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.effects.counting import GAUSSIAN, SHOT
+from spectralzoom.pipeline.simulator.effects.effect import Effect
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
-from spectralzoom.pipeline.simulator.render import BY_NAME, EFFECTS, Choice
+from spectralzoom.pipeline.simulator.render import BY_NAME, EFFECTS
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
 from spectralzoom.pipeline.simulator.selection import survey_probe
 
@@ -56,10 +57,10 @@ def seen_at(scene: RasterScene, y: np.ndarray, x: np.ndarray) -> np.ndarray:
     return np.stack(found, axis=-1)
 
 
-def effects_on(*names: str) -> Choice:
+def effects_on(*names: str) -> dict[Effect, str]:
     """Return effects by their names, in the order of the chain: exact variants, except for cheap shot noise."""
     assert set(names) <= set(BY_NAME)
-    return Choice(tuple((one, GAUSSIAN if one is SHOT else one.variants[0]) for one in EFFECTS if one.name in names))
+    return {one: GAUSSIAN if one is SHOT else one.variants[0] for one in EFFECTS if one.name in names}
 
 
 @dataclass(frozen=True)
