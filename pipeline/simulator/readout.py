@@ -11,21 +11,8 @@ import scipy
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.simulator.effects.counting import (
-    DARK_CURRENT,
-    DEFECTS,
-    EXACT,
-    LEAST_MERGED_READ_E,
-    READ_NOISE,
-    SHOT,
-    dark_electrons,
-    dead_elements,
-    hot_electrons,
-    least_expected,
-    normal_deviates,
-    photon_counts,
-    rounded_counts,
-)
+from spectralzoom.pipeline.simulator.effects import counting
+from spectralzoom.pipeline.simulator.effects.counting import DARK_CURRENT, DEFECTS, EXACT, READ_NOISE, SHOT
 from spectralzoom.pipeline.simulator.effects.effect import OFF, Chosen, Effect, Radiance, SweepBlock
 
 
@@ -70,25 +57,24 @@ class Readout:
 
     def numbers(self, light: Radiance, number: int) -> NDArray[np.uint16]:
         """Return the converter's numbers of one line's light, (sample, band) [e-]."""
-        cheap = self._variant(SHOT) not in (OFF, EXACT) and self.read_noise_e >= LEAST_MERGED_READ_E
-        if not cheap:  # shot and read noise are draws of their own
-            return self.converted(self.electrons(light, number))
+        if self.shot in (OFF, EXACT) or self.read_noise_e < counting.LEAST_MERGED_READ_E:
+            return self.converted(self.electrons(light, number))  # shot and read noise are draws of their own
         from spectralzoom.pipeline.simulator import compiled_loops
 
         seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
-        deviate = self._deviates(SHOT.name, number)
+        deviate = self._deviates(SHOT, number)
         camera = self.block.rig.camera
         raw = np.empty(light.shape, np.uint16)
         finite = compiled_loops.read_merged(
             *(seen.reshape(-1), np.ravel(np.asarray(self.added, np.float32)), deviate.reshape(-1), self.read_noise_e),
             *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
         )
-        least = least_expected(self.read_noise_e)
+        least = counting.least_expected(self.read_noise_e)
         if not finite or least:
             expected = self._expected(light, number)
             dim = np.flatnonzero(expected < np.float32(least))
-            exact = photon_counts(expected.take(dim), deviate.take(dim))
-            exact += self._deviates(READ_NOISE.name, number).take(dim) * np.float32(self.read_noise_e)
+            exact = counting.photon_counts(expected.take(dim), deviate.take(dim))
+            exact += self._deviates(READ_NOISE, number).take(dim) * np.float32(self.read_noise_e)
             raw.reshape(-1)[dim] = self.converted(exact)
         return raw
 
@@ -96,15 +82,15 @@ class Readout:
         """Return what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
         expected = self._expected(light, number)
         electrons = expected
-        shot = self._variant(SHOT)
-        if shot != OFF:
-            deviate = self._deviates(SHOT.name, number)
-            electrons = (photon_counts if shot == EXACT else rounded_counts)(expected, deviate)
-            if shot != EXACT and (least := least_expected(0.0)):
+        if self.shot != OFF:
+            deviate = self._deviates(SHOT, number)
+            counts = counting.photon_counts if self.shot == EXACT else counting.rounded_counts
+            electrons = counts(expected, deviate)
+            if self.shot != EXACT and (least := counting.least_expected(0.0)):
                 dim = np.flatnonzero(expected < np.float32(least))
-                electrons.reshape(-1)[dim] = photon_counts(expected.take(dim), deviate.take(dim))
+                electrons.reshape(-1)[dim] = counting.photon_counts(expected.take(dim), deviate.take(dim))
         if self.read_noise_e:
-            electrons += self._deviates(READ_NOISE.name, number) * np.float32(self.read_noise_e)
+            electrons += self._deviates(READ_NOISE, number) * np.float32(self.read_noise_e)
         return electrons
 
     def converted(self, electrons: Radiance) -> NDArray[np.uint16]:
@@ -118,22 +104,28 @@ class Readout:
     @cached_property
     def added(self) -> Radiance | np.float32:
         """Return electrons that come without light: a number, or (sample, band) where there are hot elements."""
-        same = np.float32(dark_electrons(self.block.rig) if self._variant(DARK_CURRENT) != OFF else 0.0)
-        if self._variant(DEFECTS) == OFF or not self.block.rig.detector.hot_fraction:
-            return same
-        return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same
+        dark = counting.dark_electrons(self.block.rig) if DARK_CURRENT in self.chosen else 0.0
+        if DEFECTS not in self.chosen or not self.block.rig.detector.hot_fraction:
+            return np.float32(dark)
+        return counting.hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + np.float32(dark)
 
     @cached_property
     def dead(self) -> NDArray[np.bool_] | None:
         """Return elements without response, (sample, band); None where there are none."""
-        if self._variant(DEFECTS) == OFF or not self.block.rig.detector.dead_fraction:
+        if DEFECTS not in self.chosen or not self.block.rig.detector.dead_fraction:
             return None
-        return dead_elements(self.block.rig, len(self.block.wavelength_nm))
+        return counting.dead_elements(self.block.rig, len(self.block.wavelength_nm))
 
-    @cached_property
+    @property
+    def shot(self) -> str:
+        """Return the variant of shot noise; an ideal sensor has none."""
+        return OFF if self.block.rig.detector.noiseless else self.chosen.get(SHOT, OFF)
+
+    @property
     def read_noise_e(self) -> float:
         """Return standard deviation of the amplifier's noise; 0 where it is off. [e-]"""
-        return 0.0 if self._variant(READ_NOISE) == OFF else self.block.rig.camera.read_noise_e
+        rig = self.block.rig
+        return 0.0 if rig.detector.noiseless or READ_NOISE not in self.chosen else rig.camera.read_noise_e
 
     def _expected(self, light: Radiance, number: int) -> Radiance:
         """Return electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""
@@ -149,11 +141,7 @@ class Readout:
             )
         return expected
 
-    def _deviates(self, stream: str, number: int) -> Radiance:
+    def _deviates(self, effect: Effect, number: int) -> Radiance:
         """Return standard normal deviates of one line, (sample, band)."""
         size = self.block.rig.camera.samples, len(self.block.wavelength_nm)
-        return normal_deviates(self.block.stream(stream, number), math.prod(size)).reshape(size)
-
-    def _variant(self, effect: Effect) -> str:
-        ideal = self.block.rig.detector.noiseless and effect in (SHOT, READ_NOISE)
-        return OFF if ideal else self.chosen.get(effect, OFF)
+        return counting.normal_deviates(self.block.stream(effect.name, number), math.prod(size)).reshape(size)

@@ -14,15 +14,7 @@ from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_t
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, line_positions, shifted_position
 from spectralzoom.pipeline.simulator.effects.air import ABSORPTION, PARALLAX, PATH_RADIANCE, TURBULENCE, WIND
 from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
-from spectralzoom.pipeline.simulator.effects.counting import (
-    DARK_CURRENT,
-    DEFECTS,
-    GAUSSIAN,
-    QUANTISATION,
-    READ_NOISE,
-    SATURATION,
-    SHOT,
-)
+from spectralzoom.pipeline.simulator.effects.counting import GAUSSIAN, READ_NOISE, READOUT, SATURATION, SHOT
 from spectralzoom.pipeline.simulator.effects.effect import OFF, Chosen, Effect, Radiance, SweepBlock
 from spectralzoom.pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT, POLARISATION, VIGNETTING
 from spectralzoom.pipeline.simulator.effects.line import BOXES, FOLDED, ROTATION, SLIT, SMEAR, box_of, smeared_positions
@@ -127,7 +119,6 @@ LIGHT: tuple[Effect, ...] = (
     *(DRIFT, CLOUD, BRDF, PATH_RADIANCE, ABSORPTION),
     *(RESPONSE, SMILE, VIGNETTING, POLARISATION, STRAY_LIGHT, PRNU, STRIPING),
 )
-READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION)
 EFFECTS: tuple[Effect, ...] = (*AIMS, *RAYS, *FOOTPRINT, *LIGHT, *READOUT)
 BY_NAME = MappingProxyType({effect.name: effect for effect in EFFECTS})
 # effects of any camera behind a mirror: a farm changes by .015 sigma at most beside exact ones

@@ -11,7 +11,7 @@ below 6 km.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -40,7 +40,6 @@ GUST_M = 3.0  # length of the waves that run over a canopy; assumed
 FARTHEST_M = 1e7  # infinity: nothing passes so much air
 
 
-@dataclass(frozen=True)
 class Turbulence(Aim):
     """Jitter of the lines, normal and equal in both directions: warm air bends the light, anew for every line.
 
@@ -84,7 +83,6 @@ def turbulence_px(rig: Rig) -> float:
     return angle / rig.camera.ifov_rad
 
 
-@dataclass(frozen=True)
 class Wind(Displacement):
     """Crop motion: the scene sways by a travelling wave along the wind, its phase and direction drawn for a survey.
 
@@ -127,7 +125,6 @@ def sway_px(rig: Rig) -> float:
     return 0.0 if air.distance_m is None else air.wind_amplitude_m / (air.distance_m * rig.camera.ifov_rad)
 
 
-@dataclass(frozen=True)
 class Parallax(Displacement):
     """Displacement of what is not at the scene's distance, for which scale and geometry are right.
 
@@ -232,7 +229,6 @@ ANGSTROM = 1.14  # exponent of a rural aerosol [4]
 KRUSE = 0.585  # of the root of 1 km [5]
 
 
-@dataclass(frozen=True)
 class Absorption(Gain):
     """Fraction of the light that gases leave over a distance, averaged over the width of a band.
 
@@ -295,7 +291,6 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
     return np.asarray((passed * (weight / weight.sum())).sum(axis=-1))
 
 
-@dataclass(frozen=True)
 class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
 
@@ -51,7 +50,6 @@ def even(variance: Floats, bands: int) -> Moments:
     return Moments(np.zeros((2, bands)), np.repeat(np.asarray(variance, np.float64)[:, None], bands, axis=1))
 
 
-@dataclass(frozen=True)
 class Diffraction(Blur):
     """Diffraction at the mirror, the aperture stop: an Airy pattern, stretched along the scan by the elliptic pupil.
 
@@ -101,7 +99,6 @@ def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:
     return angle / rig.camera.ifov_rad * np.sqrt(spread_of_waves(normal))[:, None]
 
 
-@dataclass(frozen=True)
 class Aberration(Blur):
     """Blur by the lens itself: a Gaussian of ``optics.aberration_px`` (sd) in all bands and both directions."""
 
@@ -115,7 +112,6 @@ class Aberration(Blur):
         return blurred_bound(probe, "blur of the lens", self.moments(rig, probe.wavelength_nm, variant).variance[None])
 
 
-@dataclass(frozen=True)
 class Defocus(Blur):
     """Blur by the distance from the plane of focus, that of ``air.distance_m`` for all of the scene.
 
@@ -156,7 +152,6 @@ def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None)
     return round_px * np.sqrt(spread_of_rays(normal))
 
 
-@dataclass(frozen=True)
 class Keystone(Blur):
     """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
 

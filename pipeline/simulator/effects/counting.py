@@ -7,7 +7,6 @@ same light have nearly the same noise, and their difference is that of the light
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
 
@@ -171,7 +170,6 @@ EXACT, GAUSSIAN = "exact", "gaussian"
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
 class DarkCurrent(Effect):
     """Electrons that warmth sets free, as many in every element; they take part in the shot noise."""
 
@@ -198,7 +196,6 @@ def dark_electrons(rig: Rig) -> float:
     return rig.detector.dark_e_per_s * (rig.camera.exposure_ms * 1e-3)
 
 
-@dataclass(frozen=True)
 class Defects(Effect):
     """Dead elements gather no light; hot ones add electrons, with their shot noise. An element may be both."""
 
@@ -244,7 +241,6 @@ def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) ->
     return mask
 
 
-@dataclass(frozen=True)
 class Saturation(Effect):
     """Light above the converter's full scale is lost. Off, the converter clips all the same.
 
@@ -267,7 +263,6 @@ class Saturation(Effect):
         return Bound(probe.added(over, camera.electrons_per_dn), why)
 
 
-@dataclass(frozen=True)
 class Shot(Effect):
     """Poisson counts. ``gaussian`` has their first three cumulants, and takes the read noise into the same draw.
 
@@ -308,7 +303,6 @@ def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
     return deviations * sd_e / rig.camera.electrons_per_dn
 
 
-@dataclass(frozen=True)
 class ReadNoise(Effect):
     """Normal, with the camera's standard deviation. It is one draw with the shot noise where that is not exact.
 
@@ -331,7 +325,6 @@ class ReadNoise(Effect):
         return Bound(in_unit(separable(total, shot), total, probe, rig), why)
 
 
-@dataclass(frozen=True)
 class Quantisation(Effect):
     """Rounding half to even. Raw lines are whole numbers, so it is never left out."""
 
@@ -343,11 +336,6 @@ class Quantisation(Effect):
         return Bound(value, f"0.5 DN of {rig.camera.electrons_per_dn:g} e-")
 
 
-DARK_CURRENT, DEFECTS, SATURATION, SHOT, READ_NOISE, QUANTISATION = (
-    DarkCurrent(),
-    Defects(),
-    Saturation(),
-    Shot(),
-    ReadNoise(),
-    Quantisation(),
-)
+DARK_CURRENT, DEFECTS, SHOT = DarkCurrent(), Defects(), Shot()
+READ_NOISE, SATURATION, QUANTISATION = ReadNoise(), Saturation(), Quantisation()
+READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATION, QUANTISATION)

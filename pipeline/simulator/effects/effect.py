@@ -61,6 +61,13 @@ class Effect(Protocol):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound the error of leaving it out, or of a variant that is not the exact one."""
 
+    def __eq__(self, other: object) -> bool:
+        """Return whether both are the same effect, also in another process."""
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
 
 class Aim(Effect, Protocol):
     """The mirror looks beside its plan."""

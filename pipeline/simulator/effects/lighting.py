@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -26,7 +25,6 @@ HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
 _PROBES = 65  # incidences that bounds are taken at
 
 
-@dataclass(frozen=True)
 class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
@@ -65,7 +63,6 @@ class Drift(Gain):
         return relative_daylight(sky, block.wavelength_nm, block.time_s)[:, None].astype(np.float32)
 
 
-@dataclass(frozen=True)
 class Cloud(Gain):
     """Straight bands of shadow, as wide as the gaps between them, that drift over the scene at a constant speed.
 
@@ -114,7 +111,6 @@ def shadow(way_px: Floats, size_px: float) -> Floats:
     return t * t * (3 - 2 * t)
 
 
-@dataclass(frozen=True)
 class Brdf(Gain):
     """Reflectance over that in the undeflected direction: 1 + b a + h exp(-phase / 2 deg), never below 0.
 
@@ -182,7 +178,6 @@ _ALUMINIUM = np.array([  # [2]
 ])  # fmt: skip
 
 
-@dataclass(frozen=True)
 class Vignetting(Gain):
     """Light goes with the mirror's area as the camera sees it: |n_z| over |n_z| at rest, one factor for each line.
 
@@ -227,7 +222,6 @@ def ahead(along_px: float, scan_px: Floats, camera: LineCamera) -> Floats:
     return eta / np.sqrt(1 + xi**2 + eta**2)
 
 
-@dataclass(frozen=True)
 class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -39,7 +38,6 @@ def beside_plan_px(probe: Probe, rig: Rig) -> tuple[float, float]:
     return way, way + greatest_lag_px(rig, probe.sweeps)
 
 
-@dataclass(frozen=True)
 class Rotation(Effect):
     """Line rotation and projective scale, by rays. Off, every line lies straight along its axis at nominal scale."""
 
@@ -73,7 +71,6 @@ def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tu
     return float(np.abs(along_px - straight).max()), float(np.abs(scan_px - scan).max())
 
 
-@dataclass(frozen=True)
 class SlitBox(Effect):
     """The footprint of slit and pixel, a box in closed form. Off, a sample sees what its middle ray meets.
 
@@ -111,7 +108,6 @@ def box_of(variant: str, rig: Rig) -> tuple[float, float]:
     return (0.0, 0.0) if variant == OFF else (rig.camera.slit_px, 1.0)
 
 
-@dataclass(frozen=True)
 class Smear(Effect):
     """The positions held within an exposure while the mirror moves on. Off, it stands at mid exposure.
 

@@ -50,7 +50,6 @@ def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan
     return float(moved[0]), float(moved[1])
 
 
-@dataclass(frozen=True)
 class Jitter(Aim):
     """A normal deviate of the tilt about either axis, anew for every line.
 
@@ -111,7 +110,6 @@ def _sigma_px(rig: Rig) -> float:
     return rig.mirror.repeatability_urad * 1e-6 / rig.camera.ifov_rad
 
 
-@dataclass(frozen=True)
 class Hysteresis(Aim):
     """A systematic error of pointing: smooth over the mirror's disk, one field for each copy of the rig.
 
@@ -133,7 +131,6 @@ class Hysteresis(Aim):
         return Bound(probe.moved(*at_line_ends(probe.sweeps, rig.camera, along, scan)), why)
 
 
-@dataclass(frozen=True)
 class ThermalDrift(Aim):
     """The view walks in one direction as the unit warms up; each copy of the rig has a direction of its own."""
 
@@ -214,7 +211,6 @@ MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a 
 _RAMP = 64  # steps of a line that are as good as a ramp
 
 
-@dataclass(frozen=True)
 class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
@@ -270,7 +266,6 @@ def _parts(positions: float, step: int) -> int:
     return min(ratio.numerator, MOST_PARTS) if abs(ratio - Fraction(positions)) < 1e-9 else MOST_PARTS
 
 
-@dataclass(frozen=True)
 class Lag(Aim):
     """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
 

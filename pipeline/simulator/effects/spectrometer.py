@@ -22,7 +22,6 @@ LEAST_WEIGHT = 1e-8
 REACH_SD = 6.0  # the kernel's weight beyond it is below 1e-8
 
 
-@dataclass(frozen=True)
 class Response(LightChange):
     """Each band is averaged over its neighbours so that variances add up to the rig's: fwhm_rig^2 - fwhm_scene^2.
 
@@ -124,7 +123,6 @@ def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
     return kernel
 
 
-@dataclass(frozen=True)
 class Smile(LightChange):
     """A sample records in band b the light of wavelength lambda_b + s, s = smile_nm (u / u_end)^2.
 
@@ -255,7 +253,6 @@ def _gains(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -
     return gains
 
 
-@dataclass(frozen=True)
 class StrayLight(LightChange):
     """A fraction of all the light in a line is scattered over its detector: (1 - f) S + f K S. A band is a row.
 
