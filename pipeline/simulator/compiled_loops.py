@@ -1,10 +1,8 @@
 """The simulator in compiled loops: noise, bands, and sums over windows of pixels.
 
-A sample's result does not depend on its place. A library's product of matrices is no faster here, and rounds rows
-otherwise where they stand elsewhere in a block.
-
 All are compiled, for arrays of one type each, and may be called by several threads at once. A sample's light depends on
-nothing but its own view. It is summed tap after tap, in the same order wherever it stands.
+nothing but its own view: it is summed tap after tap, in the same order wherever it stands. A library's product of
+matrices is no faster here, and rounds rows otherwise where they stand elsewhere in a block.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,9 +22,11 @@ from spectralzoom.pipeline.simulator.effects.pointing import HYSTERESIS, JITTER,
 from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRAY_LIGHT, STRIPING
 from spectralzoom.pipeline.simulator.optics.kernel_fit import Moments, fold
 from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
-from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+
+if TYPE_CHECKING:
+    from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
 
 PROBES = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
@@ -98,6 +100,8 @@ def _tangents(position: Floats, slopes: Floats, *, exact: bool) -> RayViews:
 def _sampler(
     rig: Rig, sweep: Sweep, wavelengths: bytes, blurs: tuple[tuple[Any, str], ...], of_the_line: tuple[str, ...]
 ) -> SceneSampler:
+    from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
+
     wavelength = np.frombuffer(wavelengths)
     normal = middle_normal(sweep, rig.camera)
     moments = [blur.moments(rig, wavelength, variant, normal) for blur, variant in blurs]

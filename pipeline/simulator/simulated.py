@@ -129,8 +129,7 @@ class SimulatedSource:
         rig = self.rig.taking(sweep)
         block = sweep_block(self.scene, rig, AT_REST, range(1))
         dark = dark_frame(block, self.effects)
-        assert block.white_e is not None
-        light = np.repeat(block.white_e.astype(np.float32)[None, None], block.rig.camera.samples, axis=1)
+        light = np.full((1, rig.camera.samples, len(block.wavelength_nm)), block.white_e, np.float32)
         for effect, variant in self.effects.items():
             if effect.name not in SEEN:
                 continue

@@ -1,11 +1,11 @@
 """Air and depth: distances, parallax, turbulence, wind in the crop; haze and gases.
 
-[3] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924. A contrast
-of 2 % is left at the visibility V, so that extinction is 3.912 / V, molecules included. [4] Bird and Riordan, "Simple
-solar spectral model for direct and diffuse irradiance on horizontal and tilted planes at the earth's surface for
-cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936. The constant 118.3 is that of its published program. [5]
-Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962. Angstrom's exponent is 0.585 V^(1/3)
-below 6 km.
+[1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters 6, 8.
+[2] Fried, Journal of the Optical Society of America 56, 1966. doi:10.1364/JOSA.56.001372
+[3] Koschmieder, "Theorie der horizontalen Sichtweite", Beitraege zur Physik der freien Atmosphaere 12, 1924.
+[4] Bird and Riordan, "Simple solar spectral model for direct and diffuse irradiance on horizontal and tilted planes
+   at the earth's surface for cloudless atmospheres", TR-215-2436, 1984. doi:10.2172/5986936
+[5] Kruse, McGlauchlin and McQuistan, "Elements of Infrared Technology", Wiley, 1962.
 """
 
 from __future__ import annotations
@@ -41,12 +41,7 @@ FARTHEST_M = 1e7  # infinity: nothing passes so much air
 
 
 class Turbulence(Aim):
-    """Jitter of the lines, normal and equal in both directions: warm air bends the light, anew for every line.
-
-    [1] Andrews and Phillips, "Laser Beam Propagation through Random Media", 2nd edition, SPIE Press, 2005, chapters 6,
-        8.
-    [2] Fried, Journal of the Optical Society of America 56, 1966. doi:10.1364/JOSA.56.001372
-    """
+    """Jitter of the lines, normal and equal in both directions: warm air bends the light, anew for every line."""
 
     name = "turbulence"
     cost_ns = MappingProxyType({"jitter": 0.13})
@@ -72,10 +67,9 @@ def turbulence_px(rig: Rig) -> float:
     """Return the deviation of the angle of arrival per axis, sqrt(1.09 Cn2 d D^(-1/3)), from the farthest part. [px]
 
     In spherical waves air near the point tilts them less than air near the aperture, by (z / d)^(5/3) a length of way.
-    So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for
-    Kolmogorov's spectrum with one Cn2 all along the way, and D between inner and outer scale. The Fresnel width
-    sqrt(lambda d) must not be much wider than D. Turbulence must be weak. Returns 0 without
-    a distance; no way is longer than `FARTHEST_M`.
+    So 3/8 of a plane wave's 2.91 are left [1]. D is the aperture as seen at rest, 10.6 mm of 15. It is valid for weak
+    turbulence by Kolmogorov's spectrum, with one Cn2 all along the way. D lies between inner and outer scale, and the
+    Fresnel width sqrt(lambda d) is not much wider. Returns 0 without a distance; no way is longer than `FARTHEST_M`.
     """
     metres = 0.0 if rig.distances_m is None else min(max(rig.distances_m), FARTHEST_M)
     aperture_m = rig.optics.aperture_mm * 1e-3 * _REST
@@ -223,10 +217,10 @@ OXYGEN = np.array([
 AIR_MASS_M = 8434.0  # air at the ground that holds as much as the whole atmosphere above it: standard, 15 deg C
 _KNOTS = 65  # distances, evenly in the logarithm, between which the transmission is taken as straight in it
 _QUADRATURE = np.linspace(-2.0, 2.0, 33)  # over a band, in standard deviations of its Gaussian
-KOSCHMIEDER = 3.912  # -ln 0.02 [3]
+KOSCHMIEDER = 3.912  # -ln 0.02: a contrast of 2 % is left at the visibility, molecules included [3]
 VISIBLE_NM = 550.0  # of the visibility
 ANGSTROM = 1.14  # exponent of a rural aerosol [4]
-KRUSE = 0.585  # of the root of 1 km [5]
+KRUSE = 0.585  # of the root of 1 km: Angstrom's exponent is 0.585 V^(1/3) below 6 km [5]
 
 
 class Absorption(Gain):
@@ -287,15 +281,15 @@ def transmission(metres: Floats, rig: Rig, wavelength_nm: Floats) -> Floats:
     x = water * water_cm
     y = oxygen * (metres[:, None, None] / AIR_MASS_M)
     passed = np.exp(-0.2385 * x / (1 + 20.07 * x) ** 0.45)  # [4] Eq. 2-8
-    passed *= np.exp(-1.41 * y / (1 + 118.3 * y) ** 0.45)  # [4] Eq. 2-11
+    passed *= np.exp(-1.41 * y / (1 + 118.3 * y) ** 0.45)  # [4] Eq. 2-11; 118.3 is that of its published program
     return np.asarray((passed * (weight / weight.sum())).sum(axis=-1))
 
 
 class PathRadiance(LightChange):
     """Light L at a distance d arrives as L exp(-beta d) + H (1 - exp(-beta d)), beta of ``extinction_per_m``.
 
-    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight. None is
-    added where the white reference's light is not known. Each sample has its own distance.
+    H, the light of endless air, is ``air.airlight_fraction`` of the white reference's and follows the daylight. Each
+    sample has its own distance.
     """
 
     name = "path-radiance"
@@ -307,26 +301,21 @@ class PathRadiance(LightChange):
         if reach is None:
             return Bound(0.0, "the scene has no distance")
         lost = -np.expm1(-extinction_per_m(rig.air, probe.wavelength_nm) * reach[1])
-        contrast = probe.level  # at most the greater of both, over the unit
-        if probe.white_e is not None:
-            horizon = rig.air.airlight_fraction * probe.white_e * np.maximum(DRIFT.gain_range(probe, rig).greatest, 1.0)
-            contrast = np.maximum(probe.level, horizon / (probe.unit_least_dn * rig.camera.electrons_per_dn))
+        horizon = rig.air.airlight_fraction * probe.white_e * np.maximum(DRIFT.gain_range(probe, rig).greatest, 1.0)
+        contrast = np.maximum(probe.level, horizon / (probe.unit_least_dn * rig.camera.electrons_per_dn))  # the greater
         why = f"air takes at most {lost.max(initial=0.0):.2%} of the light and adds its own, over {format_reach(reach)}"
         return Bound(float((contrast * lost).max(initial=0.0)), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         """Return what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
 
-        Added light is the airlight's fraction of the white reference's, where that is known, times what the daylight
-        grows by.
+        Added light is the airlight's fraction of the white reference's, times what the daylight grows by.
         """
         reach = reach_m(rig)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
         passed = np.exp(-np.array(reach)[:, None] * extinction_per_m(rig.air, probe.wavelength_nm))
         alone = GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
-        if probe.white_e is None:
-            return alone
         most = DRIFT.gain_range(probe, rig).greatest.max(initial=1.0)
         return replace(alone, added_e=rig.air.airlight_fraction * probe.white_e * (1 - passed[1]) * most)
 
@@ -337,13 +326,11 @@ class PathRadiance(LightChange):
         metres = sample_distances(block)[..., None]
         lost = -np.expm1(-(extinction_per_m(block.rig.air, block.wavelength_nm) * metres).astype(np.float32))
         light *= 1 - lost
-        if block.white_e is not None:
-            sky = block.rig.sky
-            still = block.rig.air.airlight_fraction * np.asarray(block.white_e, np.float64)
-            if sky.started is not None:
-                still = still * relative_daylight(sky, block.wavelength_nm, block.time_s)
-            horizon = np.atleast_2d(still)[:, None].astype(np.float32)  # of endless air, (line or 1, 1, band)
-            light += (horizon * lost).astype(np.float32, copy=False)
+        sky = block.rig.sky
+        horizon = np.atleast_2d(block.rig.air.airlight_fraction * block.white_e)  # of endless air, (line or 1, band)
+        if sky.started is not None:
+            horizon = horizon * relative_daylight(sky, block.wavelength_nm, block.time_s)
+        light += horizon[:, None].astype(np.float32) * lost
         return light
 
 
@@ -360,10 +347,7 @@ def extinction_per_m(air: Air, wavelength_nm: Floats) -> Floats:
 
 
 def rayleigh_per_m(wavelength_nm: Floats) -> Floats:
-    """Return the scattering by molecules at sea level, (band,) [1/m].
-
-    It is the optical depth of [4], Eq. 2-4, over 8434 m.
-    """
+    """Return the scattering by molecules at sea level, (band,) [1/m]: the optical depth of [4] (2-4) over 8434 m."""
     micron = wavelength_nm * 1e-3
     return 1 / (micron**4 * (115.6406 - 1.3366 / micron**2)) / AIR_MASS_M
 

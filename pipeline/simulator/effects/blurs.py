@@ -58,18 +58,14 @@ class Diffraction(Blur):
     """
 
     name = "diffraction"
-    # Each kernel costs: of the pattern's core, of its tails, of the bands' own widths.
-    cost_ns = MappingProxyType({"airy": 6.5})
+    cost_ns = MappingProxyType({"airy": 6.5})  # of kernels for the pattern's core, its tails, the bands' own widths
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
         none = np.zeros((2, len(wavelength_nm)))
         return Moments(none, none, _waves(rig, wavelength_nm, normal))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound over all positions of the sweeps: the pattern is a sum of Gaussians of many widths.
-
-        Each changes the image at most as much as its variance does.
-        """
+        """Bound over all positions of the sweeps, by the variances of Gaussians whose sum is the pattern."""
         fraction, size = airy_gaussians()
         found = [_waves(rig, probe.wavelength_nm, normal) for normal in extreme_normals(probe.sweeps, rig.camera)]
         missing = [[(one * waves) ** 2 for one in size] for waves in found]
@@ -80,8 +76,7 @@ class Diffraction(Blur):
 def airy_gaussians() -> tuple[Floats, Floats]:
     """Return shares, none below 0, of sum 1, and widths (sd) [lambda / D] of Gaussians whose sum is an Airy pattern.
 
-    The least squares fit to the pupil's transfer is within 0.004 of it up to 0.6 of its cut-off. For bounds, not for
-    light.
+    The fit to the pupil's transfer is within 0.004 of it up to 0.6 of its cut-off: for bounds, not for light.
     """
     size = np.geomspace(0.1, 160.0, 24)
     u = np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
@@ -131,15 +126,16 @@ class Defocus(Blur):
         if rig.distances_m is None:
             return Bound(0.0, "the scene has no distance")
         normals = extreme_normals(probe.sweeps, rig.camera)
+        # the variance of an even disc is a sixteenth of its diameter squared
         worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
         return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None], mean_way=DISC_WAY)
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:
-    """Return the axes of the blur's disc, (2,) along line and scan: pupil |1/d - 1/d_f| / IFOV; 0 without a distance.
+    """Return the axes of the disc along line and scan, (2,): pupil |1/d - 1/d_f| / IFOV; 0 without a distance [px].
 
-    It is in px; the variance of such an even disc is a sixteenth of its diameter squared.
+    Raises SettingsError: the disc is wider than `MOST_BLUR_PX`.
     """
     if distance_m is None or distance_m == rig.optics.focus_m:
         return np.zeros(2)
@@ -156,8 +152,7 @@ class Keystone(Blur):
     """Shift along the line, of its own in each band: a line is imaged longer at one wavelength than at another.
 
     At the last wavelength a sample sees the scene ``keystone_px / 2`` further along the line (towards higher samples)
-    than the mirror model says. At the first wavelength it sees it as much less far. The shift is linear from 400 to
-    1000 nm, and held beyond.
+    than the mirror model says, at the first as much less far. It is linear from 400 to 1000 nm, and held beyond.
     """
 
     name = "keystone"

@@ -27,9 +27,7 @@ PIECE = 16384  # elements at a time, so that temporaries stay in the cache
 
 
 def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
-    """Draw ``count`` standard normal deviates by pairs out of 32-bit words, (count,) float32; none exceeds 6.8.
-
-    The words come from the bit generator as they are: every deviate takes as many, and the stream may be counted.
+    """Draw ``count`` standard normal deviates by pairs [1] of the generator's words, (count,) float32, at most 6.8.
 
     [1] Box, Muller, "A note on the generation of random normal deviates", Ann. Math. Stat. 29, 1958.
            doi:10.1214/aoms/1177706645
@@ -44,8 +42,8 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Radiance:
 def photon_counts(expected: Radiance, deviate: Radiance) -> Radiance:
     """Return exact Poisson counts: the quantile of each deviate's probability; 0 where 0 or less is expected.
 
-    ``expected``: Electrons, any shape, finite. [e-] ``deviate``: Standard normal, the same shape. Returns the same
-    shape, whole numbers (above 2^24 as near as float32 comes). [e-]
+    ``expected``: of any shape, finite [e-]; ``deviate``: standard normal. Returns the same shape, whole numbers (above
+    2^24 as near as float32 comes). [e-]
     """
     counts = np.zeros(expected.size, np.float32)
     mean, normal = expected.reshape(-1), deviate.reshape(-1)
@@ -81,8 +79,7 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
     """Bound how far one cheap draw's distribution is from the exact one's (chi-square divergence).
 
     These are the leading terms of its Gram-Charlier expansion, c2^2 / 2 + c4^2 / 24. Here c2 and c4 are the differences
-    of variance and fourth cumulant, in units of the standard deviation. Without read noise that is 1 / (216
-    expected^2).
+    of variance and fourth cumulant over the standard deviation. Without read noise that is 1 / (216 expected^2).
     """
     variance = np.maximum(expected + read_noise_e**2, np.finfo(float).tiny)
     fraction = expected / variance
@@ -95,8 +92,7 @@ def divergence(expected: Floats, read_noise_e: float) -> Floats:
 def least_expected(read_noise_e: float) -> float:
     """Return from how many expected electrons on cheap draws may stand for exact ones; 0 is at any light.
 
-    From there on, a patch of `CHIP_SAMPLES` cheap numbers is close to one of exact numbers. Their total variation is at
-    most sqrt(N divergence) / 2 <= `MOST_VARIATION`.
+    From there on, patches of `CHIP_SAMPLES` differ by a total variation of sqrt(N divergence) / 2 <= `MOST_VARIATION`.
     """
     levels = np.geomspace(1e-3, 1e6, 4096)
     too_far = divergence(levels, read_noise_e) * CHIP_SAMPLES > (2 * MOST_VARIATION) ** 2
@@ -110,9 +106,9 @@ def chip_variation(read_noise_e: float) -> float:
 
 
 def separable(sd: float, other: float) -> float:
-    """Return twice the total variation distance of two normal distributions of one mean and these deviations.
+    """Return twice the total variation of two normal distributions of one mean, by their deviations: 0 to 2.
 
-    0 where both are alike, 2 where one has no spread. Their densities cross at x^2 = 2 ln(a / b) / (1 / b^2 - 1 / a^2).
+    Their densities cross at x^2 = 2 ln(a / b) / (1 / b^2 - 1 / a^2).
     """
     wide, narrow = max(sd, other), min(sd, other)
     if wide == narrow:
@@ -127,9 +123,8 @@ def separable(sd: float, other: float) -> float:
 def _series_quantile(mean: Floats, z: Floats) -> Floats:
     """Return the Poisson quantile at Phi(z) for means from `SERIES_FROM_E` on.
 
-    C(x) = Gamma(x, mean) / Gamma(x) runs smoothly through the distribution: F(k) = C(k + 1). The quantile is floor(x)
-    where C(x) = Phi(z). The solution x is expanded in 1 / sqrt(mean) [1]. If it comes as near to a whole number as the
-    expansion may err, the distribution itself is asked.
+    It is floor(x) where Gamma(x, mean) / Gamma(x) = Phi(z), with x expanded in 1 / sqrt(mean) [1]. If x comes as near
+    to a whole number as the expansion may err, the distribution itself is asked.
 
     [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans. Math.
     Softw. 42, 2016. doi:10.1145/2699466
@@ -242,10 +237,7 @@ def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) ->
 
 
 class Saturation(Effect):
-    """Light above the converter's full scale is lost. Off, the converter clips all the same.
-
-    Raw lines are numbers of so many bits, so every line is clipped whatever a probe of a few lines found.
-    """
+    """Light above the converter's full scale is lost: raw lines are numbers of so many bits, also where it is off."""
 
     name = "saturation"
     cost_ns = MappingProxyType({"exact": 0.1})
@@ -266,8 +258,7 @@ class Saturation(Effect):
 class Shot(Effect):
     """Poisson counts. ``gaussian`` has their first three cumulants, and takes the read noise into the same draw.
 
-    It is exact where so few electrons are expected that a patch could be told from exact ones. Noise counts as
-    `separable`.
+    It is exact where a patch of so few expected electrons could be told from an exact one. Noise counts as `separable`.
     """
 
     name = "shot"
@@ -284,8 +275,7 @@ class Shot(Effect):
         total = float(np.hypot(np.sqrt(brightest), read))
         if variant == GAUSSIAN:
             worst = max(chip_variation(0.0), chip_variation(read))
-            # for one sample: 2 TV <= sqrt(divergence)
-            apart = 2 * worst / np.sqrt(CHIP_SAMPLES)
+            apart = 2 * worst / np.sqrt(CHIP_SAMPLES)  # for one sample: 2 TV <= sqrt(divergence)
             return Bound(
                 in_unit(apart, total, probe, rig),
                 f"{CHIP_SAMPLES:.0e} numbers have a total variation of at most {worst:.2g} from exact ones"
@@ -298,16 +288,11 @@ class Shot(Effect):
 
 def in_unit(deviations: float, sd_e: float, probe: Probe, rig: Rig) -> float:
     """Return deviations of a noise of ``sd_e`` in each sample [e-] in the unit of the probe."""
-    if probe.unit == "sigma":
-        return deviations
-    return deviations * sd_e / rig.camera.electrons_per_dn
+    return deviations if probe.unit == "sigma" else deviations * sd_e / rig.camera.electrons_per_dn
 
 
 class ReadNoise(Effect):
-    """Normal, with the camera's standard deviation. It is one draw with the shot noise where that is not exact.
-
-    Noise counts twice the total variation between the distributions of a sample with and without: see `separable`.
-    """
+    """Normal noise of the camera's deviation; one draw with shot noise where that is not exact. See `separable`."""
 
     name = "read-noise"
     cost_ns = MappingProxyType({"exact": 0.0})  # 3.2 where shot noise is exact or off

@@ -122,7 +122,7 @@ class SweepBlock:
     seed: int = 0
     started_s: float = 0.0
     fwhm_nm: Floats | None = None  # (band,) of the scene's own bands; None where not known
-    white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
+    white_e: Floats | float = 0.0  # (band,) electrons of the white reference in one exposure
 
     @property
     def numbers(self) -> NDArray[np.int64]:

@@ -36,10 +36,7 @@ class Drift(Gain):
     cost_ns = MappingProxyType({"spectral": 0.4})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the greatest change of the light through the survey.
-
-        The light is straight between its knots, so that its extremes lie on them.
-        """
+        """Bound by level times the greatest change through the survey; light is straight between its knots."""
         if rig.sky.started is None:
             return Bound(0.0, "the survey has no time of day")
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
@@ -78,11 +75,10 @@ class Cloud(Gain):
         sky = rig.sky
         if sky.cloud_fraction == 0:
             return Bound(0.0, "the sky is clear")
-        return Bound(
-            probe.scaled(sky.cloud_fraction),
-            f"a shadow takes {sky.cloud_fraction:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s"
-            " over the scene",
+        why = (
+            f"a shadow takes {sky.cloud_fraction:.0%} of the light and moves {sky.cloud_px_per_s:g} px/s over the scene"
         )
+        return Bound(probe.scaled(sky.cloud_fraction), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         fraction = rig.sky.cloud_fraction
@@ -102,10 +98,7 @@ class Cloud(Gain):
 
 
 def shadow(way_px: Floats, size_px: float) -> Floats:
-    """Return the fraction of a cloud between the sun and points so far along its way, 0 to 1; the period is 2 sizes.
-
-    It is 1 about every even multiple of the size, 0 about the odd ones, 1/2 in the middle of an edge.
-    """
+    """Return the fraction of a cloud before the sun: 1 about even multiples of the size, 0 about the odd ones."""
     from_middle = np.abs((way_px + size_px) % (2 * size_px) - size_px)
     t = np.clip((size_px / 2 - from_middle) / (EDGE_FRACTION * size_px) + 0.5, 0.0, 1.0)
     return t * t * (3 - 2 * t)
@@ -188,10 +181,7 @@ class Vignetting(Gain):
     cost_ns = MappingProxyType({"held": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the factor furthest from 1.
-
-        It is at the ends of the sweeps: the factor never turns round in between.
-        """
+        """Bound by level times the factor furthest from 1, at the ends of the sweeps: it never turns round between."""
         ends = sweep_ends(probe, rig.camera)
         if not ends.size:
             return Bound(0.0, "no line is taken")
@@ -200,9 +190,8 @@ class Vignetting(Gain):
         return Bound(probe.scaled(float(np.abs(fractions - 1).max())), why)
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        fractions = np.sqrt(1 - sweep_ends(probe, rig.camera))
-        least, greatest = float(fractions.min(initial=1.0)), float(fractions.max(initial=1.0))
-        return GainRange.between(least, greatest, len(probe.wavelength_nm))
+        fractions = np.sqrt(1 - np.append(sweep_ends(probe, rig.camera), 0.0))  # and at rest
+        return GainRange.between(float(fractions.min()), float(fractions.max()), len(probe.wavelength_nm))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
         sweep = block.sweep
@@ -226,8 +215,8 @@ class Polarisation(Gain):
     """Light goes with the coating's reflectance at the chief ray's incidence over that at rest, 45 deg.
 
     Fresnel's equations for bare metal give it. From 20 to 70 deg aluminium goes from +0.5 to -3.7 % (mean of 400 to
-    1000 nm; -5.4 % at 820 nm). Valid for unpolarised light and a spectrograph
-    that takes both polarisations alike. One factor for each line and band, at mid exposure.
+    1000 nm; -5.4 % at 820 nm). Valid for unpolarised light and a spectrograph that takes both polarisations alike. One
+    factor for each line and band, at mid exposure.
     """
 
     name = "polarisation"
@@ -239,18 +228,12 @@ class Polarisation(Gain):
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
         most = np.abs(_factors_between(incidence, rig, probe.wavelength_nm) - 1).max(axis=0)
-        least_deg, most_deg = np.degrees(incidence.min()), np.degrees(incidence.max())
-        where = f" at {probe.wavelength_nm[int(most.argmax())]:.0f} nm" if most.size else ""
-        return Bound(
-            probe.scaled(most),
-            f"{rig.mirror.coating} changes {100 * most.max(initial=0.0):.2g} % of the light{where}, at incidences from"
-            f" {least_deg:.1f} to {most_deg:.1f} deg",
-        )
+        angles = f"{np.degrees(incidence.min()):.1f} to {np.degrees(incidence.max()):.1f} deg"
+        changed = f"{100 * most.max():.2g} % of the light at {probe.wavelength_nm[int(most.argmax())]:.0f} nm"
+        return Bound(probe.scaled(most), f"{rig.mirror.coating} changes {changed}, at incidences from {angles}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         incidence = _incidence(sweep_ends(probe, rig.camera))
-        if not incidence.size:
-            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
         return GainRange.of(_factors_between(incidence, rig, probe.wavelength_nm), uneven=0.0)
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
@@ -275,8 +258,7 @@ def _factors_between(incidence_rad: Floats, rig: Rig, wavelength_nm: Floats) -> 
 def reflectance(coating: Coating, wavelength_nm: Floats, incidence_rad: Floats) -> Floats:
     """Return the fraction of unpolarised light that a coating reflects, (incidence, band): both polarisations' mean.
 
-    Valid from 310 to 2066 nm, and for films that no light passes (50 nm or more). Beyond, the index of the nearest end
-    is held.
+    Valid from 310 to 2066 nm, beyond which the index of the nearest end is held, for films of 50 nm or more.
     """
     if coating == "ideal":
         return np.ones((len(incidence_rad), len(wavelength_nm)))

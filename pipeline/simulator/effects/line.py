@@ -13,8 +13,7 @@ from spectralzoom.pipeline.simulator.effects.air import turbulence_px
 from spectralzoom.pipeline.simulator.effects.effect import OFF, Bound, Effect, SweepBlock
 from spectralzoom.pipeline.simulator.effects.pointing import beside_plan, greatest_lag_px, transient
 from spectralzoom.pipeline.simulator.effects.probe import Probe
-from spectralzoom.pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP
-from spectralzoom.pipeline.simulator.optics.scene_radiance import TABULATED
+from spectralzoom.pipeline.simulator.optics.kernel_fit import BETWEEN_ROWS, SCALE_STEP, TABULATED
 from spectralzoom.pipeline.simulator.rig_model import Rig
 
 MARGIN = 1.5  # over what the probe measured at the roughest places found
@@ -74,18 +73,15 @@ def _course(sweep: Sweep, camera: LineCamera, beside: tuple[float, float]) -> tu
 class SlitBox(Effect):
     """The footprint of slit and pixel, a box in closed form. Off, a sample sees what its middle ray meets.
 
-    A variant parts it into so many boxes across and along that do not lie turned. Two across and more have its
-    covariance.
+    A variant parts it into boxes across and along that do not lie turned; two across and more have its covariance.
     """
 
     name = "slit"
-    # measured at a strip of 320 px. One box is no dearer than none.
-    cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, UPRIGHT: 0.0})
+    cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, UPRIGHT: 0.0})  # one box is no dearer than none
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
 
-        The error of a variant depends on the light within the footprint, which no derivative of the image gives.
         Rounding in tables adds a little, and so do lines that turn more where the mirror looks beside its plan.
         """
         width = rig.camera.slit_px

@@ -28,10 +28,9 @@ _MODES = 6
 
 
 def end_gains(sweep: Sweep, camera: LineCamera) -> Floats:
-    """Return the derivatives of a line's points (along, scan) by those of its centre, (line, point, 2, 2).
+    """Return the derivatives of a line's ends and centre (along, scan) by those of its centre, (line, point, 2, 2).
 
-    The points are the line's two ends and its centre, where the derivatives are 1 and 0. At the end of 320 px a centre
-    that moves by 1 px along the line moves the point by .034 px along the scan.
+    At the end of 320 px a centre that moves by 1 px along the line moves the point by .034 px along the scan.
     """
     slopes = np.array([-0.5, 0.0, 0.5]) * camera.samples * camera.ifov_rad
     centre = sweep.line_px()[:, None]
@@ -53,8 +52,8 @@ def at_line_ends(sweeps: Iterable[Sweep], camera: LineCamera, along: float, scan
 class Jitter(Aim):
     """A normal deviate of the tilt about either axis, anew for every line.
 
-    At rest the view moves by 2 sigma in the plane of incidence, which is the scan's axis. Across it, along the line, it
-    moves by sqrt(2) sigma. Elsewhere the derivatives of the exact reflection say how far.
+    At rest the view moves by 2 sigma in the plane of incidence, along the scan, and by sqrt(2) sigma along the line.
+    Elsewhere the derivatives of the exact reflection say how far.
     """
 
     name = "jitter"
@@ -68,9 +67,8 @@ class Jitter(Aim):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound what the worst of all lines' deviates changes; with a probability of 1e-3 a survey goes beyond.
 
-        A line changes by at most its slope's share in the two tilts times the length of the two deviates. That length
-        exceeds m with probability exp(-m^2 / 2), so any of n lines' does with at most n exp(-m^2 / 2). The limit m is
-        sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
+        A line changes by at most its slope's share in the two tilts times the length of the two deviates. Any of n
+        lines exceeds m with a probability of at most n exp(-m^2 / 2), so m is sqrt(2 ln(n / 1e-3)), 5.4 for 2560 lines.
         """
         sigma = _sigma_px(rig)
         lines = probe.lines
@@ -91,9 +89,8 @@ class Jitter(Aim):
 def tilt_to_scene(normals: Floats) -> Floats:
     """Return the derivatives of scene tangents with respect to tilts of the mirror, (..., 2, 2).
 
-    ``normals``: (..., 3) unit normals. Returns rows are along the line and along the scan. Columns are a tilt about the
-    axis most nearly in the plane of incidence, and one about y. The first moves the view across that plane, the second
-    within it. At rest diag(sqrt(2), 2).
+    ``normals``: (..., 3) unit normals. Rows are along the line and along the scan. Columns are a tilt about the axis
+    most nearly in the plane of incidence, which moves the view across it, and one about y. At rest diag(sqrt(2), 2).
     """
     within = np.stack([normals[..., 2], np.zeros_like(normals[..., 0]), -normals[..., 0]], axis=-1)  # y x n
     within /= np.hypot(normals[..., 2], normals[..., 0])[..., None]
@@ -111,9 +108,9 @@ def _sigma_px(rig: Rig) -> float:
 
 
 class Hysteresis(Aim):
-    """A systematic error of pointing: smooth over the mirror's disk, one field for each copy of the rig.
+    """A smooth error over the mirror's disk, one field of at most ``hysteresis_px`` for each copy of the rig.
 
-    The field is at most ``hysteresis_px`` in either axis; a scan the other way meets it with the other sign.
+    A scan the other way meets it with the other sign.
     """
 
     name = "hysteresis"
@@ -180,8 +177,8 @@ def _along_and_scan(rig: Rig) -> tuple[float, float]:
 class PointingErrors(Aim):
     """An aim of the chain, on wherever there is one: the mirror looks beside the places that it reports.
 
-    Errors are in px of the scene along the line and the scan. Every sweep has an offset drawn evenly from
-    ``-offset_px`` to ``offset_px`` in either axis, from a stream of its own, keyed (seed, sweep name).
+    Every sweep has an offset drawn evenly from ``-offset_px`` to ``offset_px`` along the line and the scan, from a
+    stream of its own, keyed (seed, sweep name).
     """
 
     offset_px: float
@@ -215,8 +212,8 @@ class Staircase(Aim):
     """Sample and hold with any number of positions per px of path. Off, each px of the path has its one position.
 
     The memory is played at a steady rate while lines are exposed, timed so that in the long run lines lie where they
-    are planned. It is the mean position in equal parts of the exposure: so many that no position changes within a part,
-    at most :data:`MOST_PARTS`.
+    are planned. It is the mean position in equal parts of the exposure, within which no position changes, at most
+    :data:`MOST_PARTS`.
     """
 
     name = "staircase"
@@ -245,8 +242,8 @@ class Staircase(Aim):
 def beside_plan(positions: float, step: int, numbers: NDArray[np.int64], parts: int = 1) -> Floats:
     """Return the mean position less the planned one in each part of each held px of path, (line, step * parts). [px]
 
-    Held positions are ``1 / positions`` px apart. Within a time t, counted in px of path, the mirror lags the ramp by
-    frac(positions * t) / positions. The result is the difference of that from its mean.
+    Held positions are ``1 / positions`` px apart. At a time t, counted in px of path, the mirror lags the ramp by
+    frac(positions * t) / positions; the mean of that is taken off.
     """
     edges = np.arange(step * parts + 1) / parts
     place = positions * (numbers[:, None] * float(step) + edges)
@@ -270,9 +267,9 @@ class Lag(Aim):
     """Mirror lag and overshoot: what is left of the start of a sweep, as the mean shift over each held position.
 
     The mirror follows its commands as a second-order system, x'' + 2 zeta x' + x = 0 in units of 1 / natural frequency.
-    Calibration takes away the way that one in steady motion lies behind. The remainder is the free oscillation between
-    it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, and has had
-    ``settled_s`` to come to rest one held position ahead. It takes the first step as line 0 begins.
+    Calibration takes away the way that one in steady motion lies behind; the free oscillation from rest remains.
+    Before a sweep it has flown back by the sweep's length, and has had ``settled_s`` to come to rest one held position
+    ahead. It takes the first step as line 0 begins.
     """
 
     name = "lag"
@@ -314,8 +311,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
     """Return the responses to a unit impulse and to a unit step, of a system with natural frequency 1 rad/s.
 
     ``time`` (...) is times that frequency, from 0 on [rad]. With g the first and h the second, the matrix exponential
-    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. Computed by expm1 and sinc, it is right to 1e-15 below,
-    at and above damping 1.
+    of the free system is [[1 - h, g], [-g, 1 - h - 2 zeta g]]. They are right to 1e-15 below, at and above damping 1.
     """
     with np.errstate(under="ignore"):
         if damping <= 1:
@@ -336,8 +332,7 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:
     """Return state (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
 
-    A mirror in steady motion has the errors of all steps before, a geometric series over lines. Its denominator is I -
-    exp(A period), whose determinant h^2 + 2 zeta h g + g^2 is a sum.
+    Steady motion has the errors of all steps before, a geometric series over lines with the denominator I - exp(A p).
     """
     damping = mirror.damping
     times, height, every = _steps(mirror, sweep, period, held)
@@ -351,12 +346,9 @@ def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) ->
 
 
 def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tuple[Floats, float, float]:
-    """Return times from a pattern's steps before the sweep to its start, the steps' heights, and the pattern's length.
-
-    A pattern is a line with its number of positions, rounded, or one position that is held for several lines.
-    """
-    wanted = mirror.positions_per_line * sweep.positions
-    if wanted < 1:
+    """Return times from the steps of the pattern before a sweep to its start, their heights, and its length."""
+    wanted = mirror.positions_per_line * sweep.positions  # of a line, rounded
+    if wanted < 1:  # one position is held for several lines
         return np.array([period / wanted]), sweep.step / wanted, period / wanted
     count = min(max(round(wanted), 1), _RAMP)
     return period - np.arange(count) * (held * sweep.positions) / count, sweep.step / count, period

@@ -27,8 +27,8 @@ Real = TypeVar("Real", np.float32, np.float64)
 class Probe:
     """Maxima over a scene, band by band, as the footprint of slit and pixel alone shows it.
 
-    All but the electrons are over the unit of the tolerance. That is one standard deviation of the noise of the stored
-    number, or one DN of it. Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
+    All but the electrons are over the unit of the tolerance: a standard deviation of the stored number's noise, or one
+    DN of it. Axis 0 of ``slope`` and ``curvature`` is (along the line, along the scan).
     """
 
     unit: Unit
@@ -45,7 +45,7 @@ class Probe:
     unit_least_dn: float  # the smallest unit met, in DN of a sample: turns electrons into the unit, on the safe side
     lines: int  # of all sweeps
     seconds: float  # from the first line to the last
-    white_e: Floats | None = None  # (band,) electrons of the white reference in one exposure; None where not known
+    white_e: Floats | float = 0.0  # (band,) electrons of the white reference in one exposure
     slit_errors: Mapping[str, float] = field(default_factory=dict)  # measured change by variant of the slit, or off
 
     def moved(self, along_px: float, scan_px: float) -> float:
@@ -82,10 +82,9 @@ def _times(steep: Floats, way: Floats | float) -> Floats:
 
 def noise_electrons(signal: NDArray[np.floating], rig: Rig) -> Radiance:
     """Return one standard deviation of shot noise, read noise and quantisation at each signal; never 0. [e-]"""
-    quantised = rig.camera.electrons_per_dn**2 / 12
     if rig.detector.noiseless:
-        return np.full_like(signal, np.sqrt(quantised))
-    noise: Radiance = np.sqrt(np.maximum(signal, 0) + np.float32(rig.camera.read_noise_e**2 + quantised))
+        return np.full_like(signal, np.sqrt(rig.camera.electrons_per_dn**2 / 12))
+    noise: Radiance = np.sqrt(np.maximum(signal, 0) + np.float32(fixed_variance(rig.camera)))
     return noise
 
 

@@ -36,17 +36,17 @@ class Response(LightChange):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I' sqrt(v); 0 where the scene's bands are as wide."""
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
-        variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
+        known = probe.fwhm_nm
+        variance = missing_variance(rig.optics.fwhm_nm, known, len(wavelength))
         if not difference_rates(wavelength).any():
             return Bound(0.0, "no band has a neighbour on either side")
+        if known is None or not np.isfinite(known).any():
+            return Bound(0.0, "the width of the scene's bands is not known; they are taken as they are")
         if not variance.any():
-            if probe.fwhm_nm is None or not np.isfinite(probe.fwhm_nm).any():
-                return Bound(0.0, "the width of the scene's bands is not known; they are taken as they are")
             return Bound(0.0, f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider")
         near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
         steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
-        known = probe.fwhm_nm
-        why = f"bands widen from {0.0 if known is None else np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
+        why = f"bands widen from {np.nanmin(known):.3g} to {rig.optics.fwhm_nm:.3g} nm"
         return Bound(float(steep.max()), f"{why}: {np.sqrt(variance.max()):.2g} nm sd more")
 
     def change(self, light: Radiance, block: SweepBlock, variant: str) -> Radiance:
@@ -56,11 +56,8 @@ class Response(LightChange):
 def widen_bands(spectra: Radiance, wavelength_nm: Floats, fwhm_nm: Floats | None, wanted_nm: float) -> Radiance:
     """Return spectra as bands of width ``wanted_nm`` see them; any linear measure of light, (..., band).
 
-    Factors of light serve as well as light: (component, band) electrons.
-
     ``wavelength_nm``, ``fwhm_nm``: (band,) centres, and widths of the spectra's own bands; None or NaN where not known,
-    and then nothing is done. Returns array of the same shape and type; ``spectra`` itself where its bands are all as
-    wide already.
+    and then nothing is done. Returns the same shape and type; ``spectra`` itself where its bands are all as wide.
     """
     variance = missing_variance(wanted_nm, fwhm_nm, spectra.shape[-1])
     if not variance.any():
@@ -83,10 +80,7 @@ def missing_variance(wanted_nm: float, fwhm_nm: Floats | None, bands: int) -> Fl
 def _band_groups(
     wavelength_nm: tuple[float, ...], variance: tuple[float, ...]
 ) -> tuple[tuple[slice, slice, Radiance], ...]:
-    """Cut the kernel into products of few bands each: most of its weights are 0.
-
-    A product is the bands made, the bands that they are made of, and their weights (taken, made).
-    """
+    """Cut the kernel into products of few bands: the bands made, those taken, and weights (taken, made)."""
     kernel = np.zeros((len(wavelength_nm), len(wavelength_nm)))
     for run in rising_runs(np.array(wavelength_nm)):
         kernel[run, run] = _heat_kernel(np.array(wavelength_nm[run]), np.array(variance[run]))
@@ -102,8 +96,7 @@ def _band_groups(
 def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
     """Return the rows of exp(v/2 D), (band, band), each with its own variance v.
 
-    D leaves straight lines and both ends as they are. So a spectrum is parted into the line through its ends, which
-    stays, and a rest that is 0 there. On the rest D is a symmetric matrix after scaling by the root of the gaps.
+    D keeps the line through a spectrum's ends. On the rest it is a symmetric matrix, scaled by the root of the gaps.
     """
     bands = len(wavelength_nm)
     if bands < 3:
@@ -257,9 +250,8 @@ class StrayLight(LightChange):
     """A fraction of all the light in a line is scattered over its detector: (1 - f) S + f K S. A band is a row.
 
     A fraction ``stray_even`` of it falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the
-    detector's edges. K has no weight below 0 and keeps all light.
-
-    The Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
+    detector's edges. K has no weight below 0 and keeps all light. The Gaussian passes only the slowest cosines of a
+    frame, so it is a product with few of them.
     """
 
     name = "stray-light"

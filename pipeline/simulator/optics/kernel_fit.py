@@ -40,8 +40,8 @@ def disc_contrast(along: Floats, scan: Floats, axes: Axes) -> Floats:
 def disc_points(axes: Axes) -> tuple[Floats, Floats]:
     """Return points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
 
-    All count alike. Together with the Gaussians they have the disc's mean and variance, a sixteenth of its diameters
-    squared. Small discs are one Gaussian; of very wide ones the edge is blurred.
+    All count alike, and with the Gaussians have the disc's mean and variance, a sixteenth of its diameters squared.
+    Small discs are one Gaussian; of very wide ones the edge is blurred.
     """
     radii = _rings(max(axes))
     counts = [1, *(6 * (ring + 1) for ring in range(len(radii)))]
@@ -234,10 +234,7 @@ def _wanted(moments: Floats, own: Floats) -> Transfer:
 
 
 def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
-    """Return the fractions (kernel, band), none negative and of sum 1.
-
-    They are a least squares fit of what kernels and bands pass of waves.
-    """
+    """Return the fractions (kernel, band), none negative and of sum 1: a least squares fit of the waves passed."""
     system = np.concatenate([passed.real, passed.imag, np.full((1, passed.shape[1]), _SUM)])
     right = np.concatenate([wanted.real, wanted.imag, np.full((1, wanted.shape[1]), _SUM)])
     basis, triangle = np.linalg.qr(system)
@@ -250,10 +247,9 @@ def _fractions(passed: Transfer, wanted: Transfer) -> Floats:
 class Moments:
     """Moments of a blur in each band, (2, band) each: along the line and the scan.
 
-    They are a shift [px] and a Gaussian's variance [px^2]. ``waves`` is for diffraction at an elliptic pupil: the
-    wavelength over the pupil's widths [px], None without any. The pattern of a pupil has no variance: no Gaussian
-    stands for it. ``disc`` are the diameters along line and scan of what a point out of focus is imaged to, in all
-    bands alike [px].
+    They are a shift [px] and a Gaussian's variance [px^2]. ``waves`` is for diffraction at an elliptic pupil, whose
+    pattern has no variance: the wavelength over the pupil's widths [px], None without any. ``disc`` are the diameters
+    along line and scan of what a point out of focus is imaged to, in all bands alike [px].
     """
 
     shift: Floats
@@ -277,23 +273,17 @@ class Moments:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Kernels of a footprint and how much each counts in each band. All widths in px of the camera, or of the level.
-
-    ``shift`` and ``variance`` are (2, kernel) along the line and the scan. ``fractions`` (kernel, node) are those of
-    some bands; ``between`` (node, band) says between which two each band lies. ``parts`` is the number of boxes across
-    and along that stand for one that lies turned. ``level`` (kernel,) says which pixels each looks at: 1 is all, 2
-    every second, and so on. ``disc`` are the diameters along line and scan of a disc that blurs each kernel.
-    """
+    """Kernels of a footprint and how much each counts in each band. All widths in px of the camera, or of the level."""
 
     box: tuple[float, float]  # across and along; 0 is none
-    parts: tuple[int, int]
+    parts: tuple[int, int]  # boxes across and along that stand for one that lies turned
     held: int  # positions 1 px apart along the scan
-    shift: Floats
-    variance: Floats
-    fractions: Floats
-    between: Floats
-    level: NDArray[np.intp]
-    disc: Axes = (0.0, 0.0)
+    shift: Floats  # (2, kernel) along the line and the scan
+    variance: Floats  # (2, kernel)
+    fractions: Floats  # (kernel, node), of some bands
+    between: Floats  # (node, band): between which two of these each band lies
+    level: NDArray[np.intp]  # (kernel,) which pixels each looks at: 1 is all, 2 every second, and so on
+    disc: Axes  # diameters along line and scan of a disc that blurs each kernel
 
     @property
     def kernels(self) -> int:
@@ -312,10 +302,7 @@ class Footprint:
         return found
 
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
-        """Return some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
-
-        Blur of the scene from leaving out pixels is taken off the Gaussians.
-        """
+        """Return some kernels in px of a level, without the blur of left-out pixels; beyond 1 boxes lie upright."""
         some = replace(self, fractions=self.fractions[which], level=self.level[which])
         shift, variance = self.shift[:, which], self.variance[:, which]
         if level == 1:
@@ -329,9 +316,8 @@ class Footprint:
 
 
 def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Moments) -> Footprint:
-    """Fold a box, held positions and the blurs of all bands into few kernels that the bands share.
+    """Fold a box, held positions and the blurs of all bands into few kernels that the bands share (see `Footprint`).
 
-    ``box``: widths of slit and pixel, across and along, 0 for none [px]. ``held``: positions 1 px apart along the scan.
     Returns the fewest kernels that change no wave of any band by more than `NEGLIGIBLE` of its amplitude, or the best
     that were tried. No share is below 0, and they sum to 1.
     """
@@ -348,6 +334,7 @@ _WORKED_OUT = 16  # every so many of them are worked out, those between are line
 # Fraction of a kernel's weight that may lie beyond its taps; what is left is scaled to sum 1. No tap beyond has more
 # than that either: weights jump by so much where a tap comes in.
 TAIL = 5e-6
+TABULATED = 2e-5  # fraction of the light, by size, that a table of either axis misplaces at most, but for what follows
 BETWEEN_ROWS = 1 / (4 * PER_PX**2)  # variance that a kernel gains between two rows at most: half of either [px^2]
 _SDS = 6.5  # of a Gaussian: nothing beyond
 

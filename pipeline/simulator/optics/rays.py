@@ -1,8 +1,8 @@
 """Rays of the camera over the mirror: where they meet the scene plane, how they spread there, and the pupil they pass.
 
-The aperture is the mirror's disc, foreshortened in the plane of incidence and only there. At rest that plane holds the
-scan. The pupil is then an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan.
-Diffraction is then wider along the scan, defocus wider along the line.
+The aperture is the mirror's disc, foreshortened in the plane of incidence, which holds the scan at rest. The pupil is
+then an ellipse: the whole diameter along the line, and |n_z| of it, 0.71, along the scan. So diffraction is wider along
+the scan, defocus wider along the line.
 """
 
 from __future__ import annotations
@@ -22,21 +22,16 @@ REST_NORMAL: Floats = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5)])
 
 @dataclass(frozen=True)
 class RayViews:
-    """Directions of samples, and how far the scene point moves per px of the camera, along and across; (n,) each.
+    """Directions of samples, and how far the scene point moves per px of the camera, along and across; (n,) each."""
 
-    ``along`` and ``scan`` are tangents or px. The others are px of the scene over px of the camera. ``along_run`` and
-    ``scan_run`` are for a ray moved along the line, ``along_turn`` and ``scan_turn`` for one moved across it.
-    """
-
-    along: Floats
+    along: Floats  # tangent or px
     scan: Floats
-    along_run: Floats
+    along_run: Floats  # px of the scene over px of the camera, for a ray moved along the line
     scan_run: Floats
-    along_turn: Floats
+    along_turn: Floats  # for one moved across it
     scan_turn: Floats
 
     def __getitem__(self, which: slice | NDArray[np.intp]) -> RayViews:
-        """Return some of the samples."""
         return RayViews(*(getattr(self, one.name)[which] for one in fields(self)))
 
     def thinned(self, level: int, before: int) -> RayViews:
@@ -56,8 +51,8 @@ class RayViews:
 def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayViews:
     """Return the points of the scene that camera rays (across, slope, 1) meet after the mirror, as tangents.
 
-    ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents; the ray's
-    length cancels. Their derivatives follow by the rule for quotients.
+    ``normal`` is (..., 3), of arrays that broadcast. The reflection is written out for the two tangents, whose
+    derivatives follow by the rule for quotients.
     """
     x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
     twice = 2 * (x * across + y * slopes + z)
@@ -75,12 +70,11 @@ def exact_views(normal: Floats, across: Floats | float, slopes: Floats) -> RayVi
 
 
 def spread_of_waves(normal: Floats | None = None) -> Floats:
-    """Return the variance that diffraction has along (line, scan), over that of a round pupil of the mirror's diameter.
+    """Return the variance that diffraction has along (line, scan), (..., 2), over that of a round pupil.
 
     A pupil |n_z| wide along (n_x, n_y) and 1 across spreads waves by 1 / n_z^2 and 1. On the camera's own axes that is
     1 + n_y^2 / n_z^2 and 1 + n_x^2 / n_z^2. The covariance n_x n_y / n_z^2 is left out: it is 0 at rest.
-
-    ``normal``: (..., 3) mirror normals in the camera frame; None is the mirror at rest. Returns (..., 2).
+    ``normal``: (..., 3) mirror normals in the camera frame; None is the mirror at rest.
     """
     n = REST_NORMAL if normal is None else np.asarray(normal, np.float64)
     return 1 + (n[..., 1::-1] / n[..., 2:]) ** 2
@@ -99,8 +93,7 @@ def pupil_contrast(u: Floats) -> Floats:
     """Return the transmission of u cycles per lambda / D by a round pupil: its autocorrelation, 0 from u = 1 on.
 
     2 / pi (acos u - u sqrt(1 - u^2)) (Goodman, Introduction to Fourier Optics, section 6.3). An elliptic pupil passes a
-    wave as a round one does when u is counted along its own axes. The 6 nm of a band are too few to matter. They change
-    u by 1 %, evenly to both sides, and no contrast by more than 1e-5.
+    wave as a round one does when u is counted along its own axes. A band's 6 nm change no contrast by more than 1e-5.
     """
     inside = np.minimum(np.abs(u), 1.0)
     return np.asarray(2 / np.pi * (np.arccos(inside) - inside * np.sqrt(1 - inside * inside)))
@@ -109,8 +102,7 @@ def pupil_contrast(u: Floats) -> Floats:
 def extreme_normals(sweeps: Iterable[Sweep], camera: LineCamera) -> Floats:
     """Return the mirror's normals at rest and at both ends of every sweep, (n, 3).
 
-    Both spreads are monotonic along a sweep, so the ends hold the extremes. In scene tangents n_x / n_z = 1 / (eta -
-    sqrt(1 + xi^2 + eta^2)).
+    Both spreads are monotonic along a sweep: in scene tangents n_x / n_z = 1 / (eta - sqrt(1 + xi^2 + eta^2)).
     """
     ends = [(sweep.swath_px, scan) for sweep in sweeps if sweep.lines > 0 for scan in sweep.held_px().ravel()[[0, -1]]]
     tangents = np.array(ends, np.float64).reshape(-1, 2) * camera.ifov_rad

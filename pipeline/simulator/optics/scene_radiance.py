@@ -10,22 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.pipeline.simulator import compiled_loops
 from spectralzoom.pipeline.simulator.optics.kernel_fit import TAIL, Floats, Footprint, TapTable, disc_points
 from spectralzoom.pipeline.simulator.optics.rays import RayViews
 from spectralzoom.pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
-if TYPE_CHECKING:
-    from spectralzoom.pipeline.simulator import compiled_loops
-
 Radiance = NDArray[np.float32]
 MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
 LEAST_BANDS = 16  # that are mixed by themselves: fewer cost as much
-TABULATED = 2e-5  # fraction of the light, by size, that a table of either axis misplaces at most, but for what follows
 
 
 @dataclass(frozen=True)
@@ -39,8 +35,6 @@ class _Mixing:
     @staticmethod
     def of(fractions: Radiance, between: Floats, spectra: Radiance) -> _Mixing:
         """Return the mixing of spectra (component, band): bands between the same nodes are made at once."""
-        from spectralzoom.pipeline.simulator import compiled_loops
-
         bands = spectra.shape[1]
         cuts = [0]
         for cut in (np.flatnonzero(np.diff((between > 0).argmax(axis=0))) + 1).tolist():
@@ -56,8 +50,6 @@ class _Mixing:
 
     def write(self, parts: Radiance, light: Radiance) -> None:
         """Write light (n, band) of components through kernels, (kernel, n, component)."""
-        from spectralzoom.pipeline.simulator import compiled_loops
-
         nodes = np.empty((len(self.fractions), *parts.shape[1:]), np.float32)
         if self.fractions.size == 1:
             np.multiply(parts, self.fractions[0, 0], out=nodes)
@@ -84,10 +76,7 @@ class SceneSampler:
     def scan_pass(
         self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposure_ratio: float
     ) -> Radiance:
-        """Return the light (n, band) of samples that look so at each of the held positions. [e-]
-
-        A sample's light does not depend on the others.
-        """
+        """Return the light (n, band) of samples that look so at each held position, whatever the others see. [e-]"""
         spectra = scene.electrons * np.float32(exposure_ratio)
         levels = np.unique(self.footprint.level).tolist()
         planes = {level: np.ascontiguousarray(scene.raster.thinned(level), np.float32) for level in levels}
@@ -125,13 +114,10 @@ class SceneSampler:
         *,
         along_y: bool,
     ) -> None:
-        """Add the components that samples see through every kernel to ``out`` (number, n, component).
+        """Add what samples see through kernels, times gains (kernel, component), to ``out`` (number, n, component).
 
-        They are sums over the parts, times ``gains`` (kernel, component). ``planes`` (y, x, component), by level, are
-        C-contiguous. ``numbers`` (kernel,) say where in ``out`` kernels belong.
+        ``planes`` (y, x, component), by level, are C-contiguous; ``numbers`` (kernel,) are the places in ``out``.
         """
-        from spectralzoom.pipeline.simulator import compiled_loops
-
         for views in steps:
             for level, some, one in self.tables:
                 pixels = planes[level]
@@ -148,8 +134,6 @@ class KernelTables:
 
     def __init__(self, footprint: Footprint, views: RayViews) -> None:
         """Take ``views`` that include the extremes of all that will be sampled."""
-        from spectralzoom.pipeline.simulator import compiled_loops
-
         self.kernels = kernels_of(footprint)
         self.parts = int(self.kernels.place.shape[1])  # boxes that each kernel is summed over
         table = views.table()
@@ -170,8 +154,6 @@ class KernelTables:
 
 def kernels_of(footprint: Footprint) -> compiled_loops.PartedKernels:
     """Return a footprint's kernels and the parts of its box as the compiled loops take them."""
-    from spectralzoom.pipeline.simulator import compiled_loops
-
     across, along = footprint.parts
     slit, pixel = footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12

@@ -22,7 +22,6 @@ from spectralzoom.pipeline.simulator.effects.line import BOXES, SLIT, UPRIGHT, b
 from spectralzoom.pipeline.simulator.effects.probe import Probe, Unit, steepest_difference, unit_at
 from spectralzoom.pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal
-from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.selection.extrema import CHOSEN_BANDS, band_groups, find_extrema
@@ -183,6 +182,8 @@ def light_seen(
 
     Rays are turned and points moved (along, scan) by shifts [px].
     """
+    from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
+
     exposure_ratio = camera.exposure_ms / DEFAULT_EXPOSURE_MS
     ifov = camera.ifov_rad
     light = np.empty((len(shifts), len(views.slope), len(scene.wavelength_nm)), np.float32)

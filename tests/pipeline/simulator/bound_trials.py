@@ -13,7 +13,7 @@ from spectralzoom.pipeline.simulator.effects.counting import READOUT
 from spectralzoom.pipeline.simulator.effects.effect import OFF, Effect, Radiance
 from spectralzoom.pipeline.simulator.effects.line import SLIT, SMEAR
 from spectralzoom.pipeline.simulator.effects.probe import noise_electrons
-from spectralzoom.pipeline.simulator.optics.scene_radiance import TABULATED
+from spectralzoom.pipeline.simulator.optics.kernel_fit import TABULATED
 from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.selection.options import SAFETY, list_options

@@ -61,14 +61,6 @@ def test_light_equal_to_the_horizon_is_unchanged() -> None:
     np.testing.assert_allclose(seen, light, rtol=1e-6)
 
 
-def test_no_path_radiance_without_a_white_reference() -> None:
-    """Only the transmission changes the light."""
-    rig = rig_with(HAZY_300_M)
-    seen = PATH_RADIANCE.change(np.ones((1, 640, BANDS), np.float32), block_of(rig, range(1), white_e=None), "range")
-    passed = np.exp(-300 * extinction_per_m(rig.air, WAVELENGTH))
-    np.testing.assert_allclose(seen, np.broadcast_to(passed, seen.shape), rtol=1e-5)
-
-
 @pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(math.inf), SLOPING])
 @pytest.mark.parametrize("black", [slice(1, 2), slice(None)], ids=["one band", "all bands"])
 def test_bands_without_light_have_a_finite_bound(air: Air, black: slice, monkeypatch: pytest.MonkeyPatch) -> None:
