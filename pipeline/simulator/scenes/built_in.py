@@ -21,36 +21,11 @@ import numpy as np
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import (
-    Canvas,
-    FarmPlan,
-    Ground,
-    Painting,
-    check_land,
-    draw_tramlines,
-    land_size,
-    moist_soil,
-    plan_field,
-)
-from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import (
-    FARM_LAW,
-    FARM_NAMES,
-    FARM_SHAPE,
-    USUAL_DAY,
-    USUAL_HOUR,
-    farm_scene,
-    planned_scene,
-)
+from spectralzoom.pipeline.simulator.scenes.farm import farm_scene as farm
+from spectralzoom.pipeline.simulator.scenes.farm import land
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import FarmPlan, Painting, Tramlines, land_of, plan_field
 from spectralzoom.pipeline.simulator.scenes.farm.fields import draw_weeds, field_weeds, paint_fields, plant_weeds
-from spectralzoom.pipeline.simulator.scenes.farm.land import (
-    CROPS,
-    Field,
-    Parcel,
-    Points,
-    smooth_noise,
-    stream,
-    sun_over_farm,
-)
+from spectralzoom.pipeline.simulator.scenes.farm.land import Field, Points
 from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene
 
 SCOUTING_LAW = "scouting@1"
@@ -67,13 +42,13 @@ DENSE = 350.0  # weeds of a patch per 1000 px
 EVEN = 0.4  # vigour's sd over the farm's
 POOR = 4.2  # by how much vigour is less in poor growth
 LODGED = 0.5  # of a field in the end, at the middle of a patch's edge
-BUILT_IN_NAMES = (*FARM_NAMES, *SCOUTING_NAMES)
-LAWS = dict.fromkeys(FARM_NAMES, FARM_LAW) | dict.fromkeys(SCOUTING_NAMES, SCOUTING_LAW)  # by the names of scenes
+BUILT_IN_NAMES = (*farm.FARM_NAMES, *SCOUTING_NAMES)
+LAWS = dict.fromkeys(farm.FARM_NAMES, farm.FARM_LAW) | dict.fromkeys(SCOUTING_NAMES, SCOUTING_LAW)
 
 
 def built_in_scene(name: str, seed: int, *args: Any, **moment: Any) -> RasterScene:
     """Draw the built-in scene of a name; arguments and errors are those of `farm_scene` and `scouting_scene`."""
-    make = farm_scene if LAWS[name] == FARM_LAW else scouting_scene
+    make = farm.farm_scene if LAWS[name] == farm.FARM_LAW else scouting_scene
     return make(seed, *args, **moment)
 
 
@@ -85,7 +60,7 @@ def built_in_laws(names: str) -> tuple[str, ...]:
 
 def scouting_scene(
     seed: int,
-    shape: tuple[int, int] = FARM_SHAPE,
+    shape: tuple[int, int] = farm.FARM_SHAPE,
     bands: int = 270,
     camera: LineCamera | None = None,
     *,
@@ -102,46 +77,46 @@ def scouting_scene(
     """
     if interest is not None and not 0 <= interest <= 1:
         raise SceneError(f"the share of interest is from 0 to 1, got {interest:g}")
-    plan = scouting_plan(seed, shape, day=USUAL_DAY if day is None else day, hour=USUAL_HOUR if hour is None else hour)
+    day, hour = farm.USUAL_DAY if day is None else day, farm.USUAL_HOUR if hour is None else hour
+    plan = scouting_plan(seed, shape, day=day, hour=hour)
     more = "" if interest is None else f"/interest={interest:g}"
-    return planned_scene(
+    return farm.planned_scene(
         "scouting", SCOUTING_LAW, plan, bands, camera or LineCamera(), lambda: _draw(plan, interest), more
     )
 
 
-def scouting_plan(seed: int, shape: tuple[int, int] = FARM_SHAPE, *, day: int, hour: float) -> FarmPlan:
+def scouting_plan(seed: int, shape: tuple[int, int] = farm.FARM_SHAPE, *, day: int, hour: float) -> FarmPlan:
     """Plan the field; raises what `farm_plan` does."""
-    check_land(seed, shape)
-    rng = stream(seed, "scouted field")
+    whole = land_of(seed, shape)
+    rng = land.stream(seed, "scouted field")
     use = SCOUTED[rng.integers(len(SCOUTED))]
     field = replace(
-        plan_field(rng, Parcel(np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(land_size(shape)) / 2), use),
+        plan_field(rng, whole, use),
         row_angle_deg=float(rng.uniform(0, 180)),
-        tramlines=draw_tramlines(rng),
-        late_days=float(rng.uniform(-3, 3)) + (0.0 if CROPS[use].lodging else EARLY),
+        tramlines=Tramlines.draw(rng),
+        late_days=float(rng.uniform(-3, 3)) + (0.0 if land.CROPS[use].lodging else EARLY),
         gap_rate=float(rng.uniform(0.001, 0.005)),
         weeds=float(rng.uniform(0.05, 0.2)),
-        lodging=LODGED if CROPS[use].lodging else 0.0,
+        lodging=LODGED if land.CROPS[use].lodging else 0.0,
     )
-    return FarmPlan(seed, shape, day, hour, sun_over_farm(day, hour), (field,), ())
+    return FarmPlan(seed, shape, day, hour, land.sun_over_farm(day, hour), (field,), ())
 
 
 def patches_of(plan: FarmPlan, interest: float | None = None) -> dict[str, Field]:
     """Cover of the scene by each kind of patch, (y, x) each, 0 to 1; the same on all days."""
     shape = plan.shape
-    rng = stream(plan.seed, "patches")
+    rng = land.stream(plan.seed, "patches")
     drawn = rng.uniform(*USUAL_INTEREST)
     side = float(np.sqrt(shape[0] * shape[1]))
     y, x = np.ogrid[: shape[0], : shape[1]]
     centre = rng.uniform(0.2, 0.8, 2) * shape
-    score = RAGGED * smooth_noise(rng, shape, RAGGED_PX) - np.hypot(y - centre[0], x - centre[1]) / side
+    score = RAGGED * land.smooth_noise(rng, shape, RAGGED_PX) - np.hypot(y - centre[0], x - centre[1]) / side
     least = np.quantile(score, 1 - (drawn if interest is None else interest))
     cover = np.asarray(np.clip(EDGE * (score - least) + 0.5, 0, 1), np.float32)
     cover *= np.float32(interest != 0)
     kinds = {name: ahead for name, ahead in KINDS.items() if name != "lodged" or plan.fields[0].lodging}
-    noise = [
-        ahead + smooth_noise(stream(plan.seed, f"patches {name}"), shape, KIND_PX) for name, ahead in kinds.items()
-    ]
+    streams = [land.stream(plan.seed, f"patches {name}") for name in kinds]
+    noise = [ahead + land.smooth_noise(one, shape, KIND_PX) for one, ahead in zip(streams, kinds.values(), strict=True)]
     kind = np.argmax(noise, axis=0)
     return {name: np.where(kind == number, cover, np.float32(0)) for number, name in enumerate(kinds)}
 
@@ -149,16 +124,15 @@ def patches_of(plan: FarmPlan, interest: float | None = None) -> dict[str, Field
 def _draw(plan: FarmPlan, interest: float | None) -> Drawn:
     """Return abundances (y, x, material) and labels (y, x)."""
     patches = patches_of(plan, interest)
-    ground = Ground.draw(stream(plan.seed, "ground"), plan.shape)
-    ground = replace(ground, vigour=EVEN * ground.vigour - POOR * patches["poor"])
-    work = Painting(plan, ground, Canvas(plan.shape, plan.materials))
+    work = Painting.of(plan)
+    work = replace(work, ground=replace(work.ground, vigour=EVEN * work.ground.vigour - POOR * patches["poor"]))
     paint_fields(work, 6 * patches["lodged"] - 3 if "lodged" in patches else None)
     plant_weeds(work)
     bare = np.flatnonzero(patches["bare"])
-    soil = moist_soil(plan, ground.at(bare), plan.fields[0].wetter)
+    soil = plan.soil(work.ground.at(bare), plan.fields[0].wetter)
     work.canvas.over(bare, patches["bare"].ravel()[bare], soil, "soil")
     draw_weeds(work, _weeds_within(plan, patches["weeds"]))
-    return work.canvas.drawn(ground.light)
+    return work.drawn()
 
 
 def _weeds_within(plan: FarmPlan, cover: Field) -> dict[str, Points]:
@@ -168,8 +142,8 @@ def _weeds_within(plan: FarmPlan, cover: Field) -> dict[str, Points]:
     middle = (np.array(cover.shape) - 1) / 2
     there = np.argwhere(cover)
     (top, left), (bottom, right) = there.min(axis=0) - middle - 1, there.max(axis=0) - middle + 1
-    box = Parcel(np.array([[top, left], [top, right], [bottom, right], [bottom, left]]))
-    rng = stream(plan.seed, "weeds of patches")
+    box = land.Parcel(np.array([[top, left], [top, right], [bottom, right], [bottom, left]]))
+    rng = land.stream(plan.seed, "weeds of patches")
     kept: dict[str, Points] = {}
     for name, plants in field_weeds(rng, replace(plan.fields[0], parcel=box, weeds=DENSE), plan.day).items():
         y, x = np.clip(np.rint(plants[:, :2] + middle), 0, np.array(cover.shape) - 1).astype(int).T

@@ -6,8 +6,10 @@ One is made of any image: without a radiance law it is relative, linear light of
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from tempfile import TemporaryFile
 from threading import Lock
 
 import numpy as np
@@ -19,10 +21,10 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
 from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.readings import MOST_VALUE, find_beyond
-from spectralzoom.pipeline.simulator.scenes.scratch import scratch
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
+MOST_BYTES = 2**28  # of an array in memory; larger ones are in a file
 _ROWS_AT_ONCE = 4  # of what is halved: they stay in the processor's cache
 THINNED_MARGIN = 4  # pixels of a level beside the scene: as far as the binomial kernel reaches
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
@@ -78,6 +80,19 @@ class SceneRaster:
         if planes.shape != self.shape or size != (self.shape[:2] if self.labelled else None):
             raise SceneError(f"the scene is {self.shape} px, its planes {planes.shape}, its labels {size}; crop or pad")
         return planes, labels
+
+
+def scratch(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return an array of zeros; a large one is in a file without a name, which the system reads and writes by pages.
+
+    Raises OSError: the disk is full. The folder is that of TMPDIR, by default /var/tmp, since /tmp may be memory.
+    """
+    if 4 * np.prod(shape) <= MOST_BYTES:
+        return np.zeros(shape, np.float32)
+    with TemporaryFile(dir=os.environ.get("TMPDIR", "/var/tmp")) as file:
+        if hasattr(os, "posix_fallocate"):  # not on macOS; a full disk would end the process later
+            os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))
+        return np.asarray(np.memmap(file, np.float32, "r+", shape=shape))
 
 
 def _halved(planes: NDArray[np.float32], before: int) -> NDArray[np.float32]:

@@ -26,11 +26,7 @@ UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
 
 @dataclass(frozen=True)
 class Treatment:
-    """Decision on one effect, and its reason.
-
-    ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
-    others.
-    """
+    """Option taken. ``small``: off within the tolerance; ``needed``: beyond it alone; ``spent``: with others."""
 
     menu: Menu
     option: Option
@@ -47,16 +43,13 @@ class Treatment:
 
 @dataclass(frozen=True)
 class Decision:
-    """For every effect an option, in the order of the chain. Errors and tolerance are in ``unit``.
-
-    ``px_bands`` is how many numbers all sweeps have, from which costs are estimated.
-    """
+    """For every effect an option, in the order of the chain. Errors and tolerance are in ``unit``."""
 
     taken: tuple[Treatment, ...]
     tolerance: float
     unit: Unit
     asked: str
-    px_bands: int
+    px_bands: int  # numbers of all sweeps, from which costs are estimated
 
     @property
     def chosen(self) -> dict[Effect, str]:
@@ -90,11 +83,10 @@ def decide(
     """Choose off or a variant for every effect, so that the sum of their errors stays within the tolerance.
 
     Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
-    and saturation are never off; what the rig has none of always is. ``probes``: one for each exposure of the
-    survey; the worst counts. ``effects``: in the order of the chain, which does not change what is chosen.
-    ``tolerance``: greatest change of any stored number, in the unit of the probes. ``asked``: ``auto``; ``all``: on and
-    exact; ``none``; or names with commas: those on, in the variants that the tolerance lets them have, the others off.
-
+    and saturation are never off; what the rig has none of always is. ``probes``: one for each exposure of the survey;
+    the worst counts. ``effects``: in the order of the chain, which does not change what is chosen. ``tolerance``:
+    greatest change of any stored number, in the unit of the probes. ``asked``: ``auto``; ``all``: on and exact;
+    ``none``; or names with commas: those on, in the variants that the tolerance lets them have, the others off.
     Raises SettingsError: the tolerance is negative or no number, or an asked name is not known.
     """
     if not tolerance >= 0:
@@ -200,9 +192,9 @@ def _reason(menu: Menu, option: Option, tolerance: float, named: frozenset[str] 
 def list_effects(decision: Decision) -> list[dict[str, Any]]:
     """Return one plain row for every effect, in the order of the chain.
 
-    ``bound`` is on the change of any stored number, with the factor of safety, in ``unit``. It is 0 where exact or
-    absent, None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``reason`` is
-    that of `Treatment`. ``left_out`` is the bound on leaving it out, and ``magnitude`` the words of that bound.
+    ``bound`` is on the change of any stored number, with the factor of safety, in ``unit``: 0 where exact or absent,
+    None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``reason`` is that of `Treatment`.
+    ``left_out`` is the bound on leaving it out, and ``magnitude`` the words of that bound.
     """
     return [
         {
@@ -221,10 +213,7 @@ def list_effects(decision: Decision) -> list[dict[str, Any]]:
 
 
 def sum_up(decision: Decision) -> dict[str, Any]:
-    """Return the totals: bound beside tolerance, and the CPU seconds that were saved against everything exact.
-
-    They are without the rays through the footprint that every simulation takes.
-    """
+    """Return the totals: bound beside tolerance, and CPU seconds saved, without rays that every simulation takes."""
     cost, exact = (ns * 1e-9 * decision.px_bands for ns in (decision.cost_ns, decision.exact_cost_ns))
     return {
         "asked": decision.asked,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise, zip_longest
 
 import numpy as np
@@ -34,12 +33,11 @@ _STRIP_PX = 2**21  # of which a strip of more tiles has less
 def find_extrema(scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], most: int) -> Floats:
     """Return the pixels where light changes most over its noise, and where it is greatest and least.
 
-    Returns (place, 2) rows and columns [px], at most ``most``, the worst of every
-    measure first. Each is in a tile of its own for one measure and band. Raises SceneError: the scene holds a number
-    that is not finite.
+    Returns (place, 2) rows and columns [px], at most ``most``, the worst of every measure first, each in a tile of its
+    own for one measure and band. Raises SceneError: the scene holds a number that is not finite.
     """
     spectra = scene.electrons * np.float32(camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    optics = PixelOptics.of(camera, tuple(sorted({sweep.along == "y" for sweep in sweeps})))
+    optics = PixelOptics(camera, sorted({sweep.along == "y" for sweep in sweeps}))
     tile = max(8, math.ceil(math.sqrt(scene.shape[0] * scene.shape[1] / _TILES)))
     ranking = Ranking()
     own_planes = spectra.ndim == 1
@@ -70,10 +68,10 @@ def chosen_bands(spectra: Radiance) -> NDArray[np.intp]:
 def telling_bands(
     scene: RasterScene, spectra: Radiance, optics: PixelOptics, tile: int, ranking: Ranking
 ) -> NDArray[np.intp]:
-    """Return of each group of bands the brightest, the darkest and the steepest, of a scene with a plane for each.
+    """Return the brightest, darkest and steepest of each group of bands, of a scene with a plane for each.
 
-    They are the steepest from pixel to pixel, and from one mean of some pixels to the next. Places where light differs
-    most from band to band are offered as they are found.
+    Steepest is from pixel to pixel and from mean to mean of some pixels. Places where light differs most from band to
+    band are offered as they are found.
     """
     groups = band_groups(len(spectra))
     starts = [one.start for one in groups]
@@ -120,7 +118,7 @@ class Ranking:
         self._offers: dict[tuple[int, int], list[Floats]] = {}  # by measure, and band or group of bands
 
     def offer(self, measure: int, values: Radiance, first: int, tile: int, kinds: Sequence[int]) -> None:
-        """Offer the greatest of every tile and band; ``values`` (row, column, band) of the strip that begins at a row.
+        """Offer the greatest of every tile and band of a strip, (row, column, band), that begins at the row ``first``.
 
         ``kinds`` (band,) say with which other bands each is ranked.
         """
@@ -150,36 +148,23 @@ class Ranking:
         return np.array(list(found)[:most], np.float64).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
 class PixelOptics:
-    """Kernels of slit and pixel over a scene's pixels, and the part of the noise that light does not change [e-^2].
+    """Kernels of slit and pixel over a scene's pixels, for lines that lie along y or not."""
 
-    ``turned`` are the orientations of the lines: whether they lie along y.
-    """
-
-    slit: NDArray[np.float32]
-    pixel: NDArray[np.float32]
-    fixed_noise: float
-    turned: tuple[bool, ...]
-
-    @staticmethod
-    def of(camera: LineCamera, turned: tuple[bool, ...]) -> PixelOptics:
-        slit, pixel = _short_kernel(camera.slit_px), _short_kernel(1.0)
-        return PixelOptics(slit, pixel, fixed_variance(camera), turned)
-
-    @property
-    def halo(self) -> int:
-        """Return the reach of kernels and differences [px]."""
-        return len(self.slit) // 2 + len(self.pixel) // 2 + 1
+    def __init__(self, camera: LineCamera, along_y: Sequence[bool]) -> None:
+        self.slit, self.pixel = _short_kernel(camera.slit_px), _short_kernel(1.0)
+        self.halo = len(self.slit) // 2 + len(self.pixel) // 2 + 1  # reach of kernels and differences [px]
+        self.along_y = along_y
+        self._fixed = np.float32(fixed_variance(camera))
 
     def noise(self, light: Radiance) -> Radiance:
         """Return one standard deviation at each light [e-]."""
-        return np.sqrt(np.maximum(light, 0) + np.float32(self.fixed_noise))
+        return np.sqrt(np.maximum(light, 0) + self._fixed)
 
     def measures(self, light: Radiance) -> Iterator[Radiance]:
         """Yield measures of light without its halo, (row, column, band) each: higher ones are probed first."""
         inner = (slice(self.halo, -self.halo), slice(self.halo, -self.halo))
-        for along_y in self.turned:
+        for along_y in self.along_y:
             line = 0 if along_y else 1
             seen = _blurred(_blurred(light, self.slit, 1 - line), self.pixel, line)
             level = seen[inner]

@@ -1,10 +1,10 @@
 """Options of the decision: for every effect, off and each variant with its error and cost.
 
-A bound is the change of a stored number in units of its noise (or in DN). If a
-drawn displacement or gain moves the light (jitter, turbulence, wind), it is on the change with the same draws. If the
-draw is the noise itself (shot, read, dark), the total variation between the distributions of a number with and without
-it counts. Noise that changes it by ``t`` counts ``2 t`` deviations, as much as a change that could be detected as
-often. Total variation is a metric and no later stage increases it: so all bounds may be summed.
+A bound is the change of a stored number in units of its noise (or in DN). If a drawn displacement or gain moves the
+light (jitter, turbulence, wind), it is on the change with the same draws. If the draw is the noise itself (shot, read,
+dark), the total variation between the distributions of a number with and without it counts. Noise that changes it by
+``t`` counts ``2 t`` deviations, as much as a change that could be detected as often. Total variation is a metric and no
+later stage increases it: so all bounds may be summed.
 
 Kernels that are not negative and sum to 1 have gain 1 at most, readout none. Gains of light (vignetting, drift, ...)
 multiply the errors of all other effects in the light, each by its own greatest factor, and change the unit. With
@@ -67,9 +67,7 @@ def acts_on_light(effect: Effect) -> bool:
 
 
 def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
-    """Ask every effect for the bounds of its options; errors are in the unit of the probes.
-
-    Every option has the error of the worst probe; a survey has one for each exposure.
+    """Ask every effect for the bounds of its options, by the worst probe (one for each exposure), in its unit.
 
     Raises SettingsError: a bound is negative or not a number; names it.
     """
@@ -107,9 +105,8 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
             arriving = light_read(probe, rig, [one for one in ranges if one is not None])
         growth = 1.0
         if acts_on_light(effect):
-            greatest = [
-                np.maximum(one.greatest, 1.0) for one in ranges[:place] + ranges[place + 1 :] if one is not None
-            ]
+            apart = [one for one in ranges[:place] + ranges[place + 1 :] if one is not None]
+            greatest = [np.maximum(one.greatest, 1.0) for one in apart]
             others = float(np.prod(greatest, axis=0).max(initial=1.0)) if greatest else 1.0
             growth = error_growth(probe, rig, ranges[place], others)
         menus.append(_menu(effect, arriving, rig, present[place], growth))
@@ -118,7 +115,7 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> list[Menu]
 
 def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) -> Menu:
     def option(variant: str) -> Option:
-        """Bound and price one variant of the effect, or its absence; SettingsError: a bound that is no number."""
+        """Bound and price one variant of the effect, or its absence."""
         bound = effect.bound(probe, rig, variant)
         if not bound.value >= 0:  # refuses NaN
             raise SettingsError(
@@ -152,8 +149,7 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
 def error_growth(probe: Probe, rig: Rig, own: GainRange | None, others: float) -> float:
     """Return the most that gains multiply an error, with the unit that follows the light.
 
-    ``others`` is the greatest product of the other gains, 1 or more. ``own`` is the range of an effect's own gain: its
-    error is made in light without it.
+    ``others`` is the greatest product of the other gains, 1 or more; ``own`` is the range of an effect's own gain.
     """
     low, high = (1.0, 1.0) if own is None else (float(own.least.min(initial=1.0)), float(own.greatest.max(initial=1.0)))
     off = max(abs(high - 1), abs(low - 1))
@@ -202,10 +198,7 @@ def light_after(probe: Probe, rig: Rig, gains: Sequence[GainRange], blurred: flo
 
 
 def light_read(probe: Probe, rig: Rig, gains: Sequence[GainRange]) -> Probe:
-    """Return the probe of light after all gains, which the readout gets: the darkest and the brightest that they make.
-
-    Each sample is counted by the greatest product of the gains, or by the least.
-    """
+    """Return the probe of light after all gains, which the readout gets: by their greatest product, or by the least."""
     greatest = math.prod(float(np.maximum(one.greatest, 1.0).max(initial=1.0)) for one in gains)
     after = light_after(probe, rig, gains)
     return replace(

@@ -6,8 +6,8 @@ The whole scene is probed, whatever part of it the sweeps see: blurs and shifts 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,9 +58,7 @@ def probe_survey(
     unit: Unit = "sigma",
     cost: CostModel = CostModel(),  # noqa: B008 - a value
 ) -> tuple[Probe, ...]:
-    """Return a probe for each exposure of the sweeps, the shortest first.
-
-    They have time and lines in common. ``cost`` says how long slewing, setting up and reloading take.
+    """Return a probe for each exposure of the sweeps, the shortest first, with time (by ``cost``) and lines of all.
 
     Raises SceneError, SettingsError, PoseError as `probe_scene`.
     """
@@ -70,16 +68,15 @@ def probe_survey(
         alike.setdefault(exposing(rig.camera, sweep).exposure_ms, []).append(sweep)
     probes = [probe_scene(scene, rig, some, unit) for _, some in sorted(alike.items())]
     lines = sum(one.lines for one in probes)
-    seconds = cost.seconds(list(taken), rig.camera)
-    return tuple(replace(one, lines=lines, seconds=seconds) for one in probes)
+    return tuple(replace(one, lines=lines, seconds=cost.seconds(list(taken), rig.camera)) for one in probes)
 
 
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Return the maxima of the scene through slit and pixel, at its extrema.
 
     They are found on the scene's own pixels, so that the maxima hold for the whole image. Sweeps are of one exposure.
-    Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take;
-    PoseError: a sweep is out of the mirror's reach.
+    Raises SceneError: the scene holds a number that is not finite; SettingsError: no line to take; PoseError: a sweep
+    is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     rig = rig.taking(taken[0])
@@ -90,9 +87,8 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     places = find_extrema(scene, camera, taken, max(most, 1))
     views = views_of_places(places, scene, camera, taken)
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _PROBE, None, scene), SHIFTS)
-    found = replace(
-        sum_up_light(seen, scene, rig, taken, unit), slit_errors=_slit_errors(scene, rig, views, taken, unit)
-    )
+    errors = _slit_errors(scene, rig, views, taken, unit)
+    found = replace(_sum_up_light(seen, scene, rig, taken, unit), slit_errors=errors)
     return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > CHOSEN_BANDS else found
 
 
@@ -103,8 +99,7 @@ def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
     return taken
 
 
-@dataclass(frozen=True)
-class SampleViews:
+class SampleViews(NamedTuple):
     """Samples at any place of any sweep, (view,) each: the line's centre and the camera's slope."""
 
     swath_px: Floats
@@ -113,13 +108,13 @@ class SampleViews:
     along_y: NDArray[np.bool_]
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
-        return SampleViews(self.swath_px[which], self.scan_px[which], self.slope[which], self.along_y[which])
+        return self._make(values[which] for values in self)
 
 
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
     """Return patches about places, in the view of the most oblique sweep of each orientation that sees them.
 
-    A place that no sweep sees is looked at as if the lines and samples of the least oblique continued.
+    For a place that no sweep sees, lines and samples of the least oblique continue.
     """
     centred = places - (np.array(scene.shape) - 1) / 2
     found: list[SampleViews] = []
@@ -133,11 +128,7 @@ def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, swee
             line, sample = scene_to_sweep(_held(sweeps[number]), camera, along[which], scan[which]).T
             reached = np.isfinite(line) & np.isfinite(sample)
             found.append(_patches(sweeps[number], camera, line[reached], sample[reached]))
-    values: dict[str, Any] = {
-        name: np.concatenate([getattr(one, name) for one in found])
-        for name in ("swath_px", "scan_px", "slope", "along_y")
-    }
-    return replace(found[0], **values)
+    return SampleViews._make(map(np.concatenate, zip(*found, strict=True)))
 
 
 def _first_seeing(
@@ -172,16 +163,9 @@ def _patches(sweep: Sweep, camera: LineCamera, line: Floats, sample: Floats) -> 
 
 
 def light_seen(
-    scene: RasterScene,
-    camera: LineCamera,
-    views: SampleViews,
-    footprint: Footprint,
-    shifts: Sequence[tuple[Way, Way]] = ((_STILL, _STILL),),
+    scene: RasterScene, camera: LineCamera, views: SampleViews, footprint: Footprint, shifts: Sequence[tuple[Way, Way]]
 ) -> Radiance:
-    """Return light (shift, view, band) through a footprint [e-].
-
-    Rays are turned and points moved (along, scan) by shifts [px].
-    """
+    """Return light (shift, view, band) through a footprint [e-]; shifts turn rays or move points (along, scan) [px]."""
     from spectralzoom.pipeline.simulator.optics.scene_radiance import SceneSampler
 
     exposure_ratio = camera.exposure_ms / DEFAULT_EXPOSURE_MS
@@ -209,7 +193,7 @@ def _rays_of(views: SampleViews, camera: LineCamera, turned: Way) -> RayViews:
     return exact_views(normal, turned[1] * ifov, views.slope + turned[0] * ifov)
 
 
-def sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
+def _sum_up_light(seen: Radiance, scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit) -> Probe:
     """Return the maxima of light (shift, view, band) [e-]."""
     camera = rig.camera
     least, most = seen.min(axis=0), seen.max(axis=0)
@@ -276,10 +260,7 @@ def worst_of_groups(probe: Probe) -> Probe:
 def _slit_errors(
     scene: RasterScene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit
 ) -> dict[str, float]:
-    """Return the greatest change by every variant of the slit, and by leaving it out, over the unit.
-
-    It is against the finest variant, with the rig's blurs.
-    """
+    """Return the greatest change from the finest slit, with the rig's blurs, by each other variant and without it."""
     rough = _roughest(scene, rig, views, unit)
     views = views.chosen(rough)
     moments = _least_blurs(rig, scene.wavelength_nm, sweeps)

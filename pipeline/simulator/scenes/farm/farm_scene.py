@@ -32,38 +32,16 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.once import Once
-from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import (
-    CLASS_COLOURS,
-    CLASSES,
-    Canvas,
-    FarmPlan,
-    Ground,
-    Mixture,
-    Painting,
-    farm_plan,
-    grass,
-)
+from spectralzoom.pipeline.simulator.scenes.farm import land
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES, FarmPlan, Painting, farm_plan
 from spectralzoom.pipeline.simulator.scenes.farm.fields import paint_fields, plant_weeds
-from spectralzoom.pipeline.simulator.scenes.farm.land import (
-    ROWS_AT_ONCE,
-    Band,
-    Points,
-    Sun,
-    band_pixels,
-    disc_pixels,
-    edge,
-    foliage,
-    scene_points,
-    smooth_noise,
-    stream,
-)
+from spectralzoom.pipeline.simulator.scenes.farm.land import Points, Sun
 from spectralzoom.pipeline.simulator.scenes.farm.spectra import (
     WHITE_REFERENCE_REFLECTANCE,
     band_centres,
     spectral_library,
 )
-from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster
-from spectralzoom.pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene, SceneRadiance, SceneRaster, scratch
 
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW = "farm@2"
@@ -130,16 +108,14 @@ def planned_scene(
     )
 
 
-def _draw(plan: FarmPlan) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return abundances (y, x, material) and labels (y, x)."""
-    ground = Ground.draw(stream(plan.seed, "ground"), plan.shape)
-    work = Painting(plan, ground, Canvas(plan.shape, plan.materials))
+def _draw(plan: FarmPlan) -> Drawn:
+    work = Painting.of(plan)
     paint_fields(work)
     plant_weeds(work)
     paint_borders(work)
     dig_ponds(work)
     plant_trees(work)
-    return work.canvas.drawn(ground.light)
+    return work.drawn()
 
 
 def paint_borders(work: Painting) -> None:
@@ -147,9 +123,9 @@ def paint_borders(work: Painting) -> None:
     for kind in ("margin", "hedge", "ditch", "road"):
         for number, (border, its_kind) in enumerate(work.plan.borders):
             if its_kind == kind:
-                rng = stream(work.plan.seed, f"border {number}")
+                rng = land.stream(work.plan.seed, f"border {number}")
                 canvas = work.canvas
-                band = band_pixels(border, 12.0, canvas.shape)
+                band = land.band_pixels(border, 12.0, canvas.shape)
                 phases = rng.uniform(0, 2 * np.pi, 2)
                 bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
                 way = np.float32((0.8 if kind == "road" else 1.6) / 2)
@@ -159,40 +135,34 @@ def paint_borders(work: Painting) -> None:
                 dryness = rng.uniform(0.25, 0.55)
                 swath = rng.uniform() < 0.5
                 inner = rng.uniform(0.8, 1.2)
-                _cover(canvas, band, half + bank, grass(here, dryness), "grass")
+                work.canvas.stripe(band, half + bank, here.grass(dryness), "grass")
                 if kind == "ditch":
                     full = half * (0.75 + 1.4 * work.plan.moisture)
-                    _cover(canvas, band, full, {"water": np.ones_like(band.across)}, "water")
+                    work.canvas.stripe(band, full, {"water": np.ones_like(band.across)}, "water")
                 if kind == "road":
                     stone = np.clip(0.75 + 0.08 * here.tuft + 0.05 * here.grain, 0, 1)  # trodden into dry soil
                     ground = {"gravel": stone, "soil_dry": 0.85 * (1 - stone), "soil_wet": 0.15 * (1 - stone)}
-                    _cover(canvas, band, half, ground, "track")
+                    work.canvas.stripe(band, half, ground, "track")
                     if swath:
-                        _cover(canvas, band, inner, grass(here, 0.5), "grass")
-
-
-def _cover(canvas: Canvas, band: Band, half: float, mixture: Mixture, label: str) -> None:
-    cover = edge(half - np.abs(band.across))
-    hit = np.flatnonzero(cover)
-    canvas.over(band.index[hit], cover[hit], {name: part[hit] for name, part in mixture.items()}, label)
+                        work.canvas.stripe(band, inner, here.grass(0.5), "grass")
 
 
 def dig_ponds(work: Painting) -> None:
     """Paint ponds with grass round them, in meadows where there are any: one, and one more for every 650 000 px."""
     plan = work.plan
     shape = plan.shape
-    rng = stream(plan.seed, "ponds")
-    shore = smooth_noise(rng, shape, 14).ravel()
+    rng = land.stream(plan.seed, "ponds")
+    shore = land.smooth_noise(rng, shape, 14).ravel()
     meadows = [one.parcel for one in plan.fields if one.use == "grass"] or [one.parcel for one in plan.fields]
     ponds = []
     for _ in range(1 + shape[0] * shape[1] // 650_000):
         corners = meadows[rng.integers(len(meadows))].corners
         centre = corners.mean(axis=0) + 0.5 * (corners[rng.integers(len(corners))] - corners.mean(axis=0))
         radius = rng.uniform(14, 24)
-        for index, _, _ in disc_pixels(centre[None], np.array([34.0]), shape):
-            inside = radius + 1.8 * shore[index] - np.hypot(*(scene_points(index, shape) - centre).T)
-            work.canvas.over(index, edge(inside + 4), grass(work.ground.at(index), 0.15), "grass")
-            ponds.append((index, edge(inside)))
+        for index, _, _ in land.disc_pixels(centre[None], np.array([34.0]), shape):
+            inside = radius + 1.8 * shore[index] - np.hypot(*(land.scene_points(index, shape) - centre).T)
+            work.canvas.over(index, land.edge(inside + 4), work.ground.at(index).grass(0.15), "grass")
+            ponds.append((index, land.edge(inside)))
     for index, cover in ponds:  # after every bank: two ponds may meet
         work.canvas.over(index, cover, {"water": np.ones_like(cover)}, "water")
 
@@ -200,7 +170,7 @@ def dig_ponds(work: Painting) -> None:
 def crowns_of(work: Painting) -> Points:
     """Return the crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
-    rng = stream(plan.seed, "trees")
+    rng = land.stream(plan.seed, "trees")
     trees = [np.zeros((0, 3))]
     for border, _ in plan.borders:
         count = rng.poisson(border.length / 320)
@@ -211,7 +181,7 @@ def crowns_of(work: Painting) -> Points:
     crowns = [np.concatenate(trees)]
     for number, (border, kind) in enumerate(plan.borders):
         if kind == "hedge":
-            rng = stream(plan.seed, f"hedge {number}")
+            rng = land.stream(plan.seed, f"hedge {number}")
             along = np.arange(0.0, border.length, 5.0)
             along = along[rng.uniform(size=along.size) > 0.05]
             step = (border.end - border.start) / max(border.length, 1e-9)
@@ -225,15 +195,15 @@ def plant_trees(work: Painting) -> None:
     plan = work.plan
     crowns = crowns_of(work)
     centres, radius = crowns[:, :2], crowns[:, 2]
-    leaves = {name: fraction for name, fraction in foliage(plan.day).items() if fraction > 0}
+    leaves = {name: fraction for name, fraction in land.foliage(plan.day).items() if fraction > 0}
     opaque = 1 - (1 - BARE_CROWN) * leaves.get("twigs", 0.0)
     shadow = crown_shadows(centres, radius, plan.sun, plan.shape)
-    for rows in cuts(plan.shape[0], ROWS_AT_ONCE):
+    for rows in cuts(plan.shape[0], land.ROWS_AT_ONCE):
         dark = np.flatnonzero(shadow[rows]) + rows.start * plan.shape[1]
         depth = np.asarray(SHADOW * opaque * shadow.ravel()[dark], np.float32)
         work.canvas.over(dark, depth, {"shade": np.ones_like(depth)}, None)
-    for index, cover, disc in disc_pixels(centres, radius, plan.shape):
-        away = ((scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
+    for index, cover, disc in land.disc_pixels(centres, radius, plan.shape):
+        away = ((land.scene_points(index, plan.shape) - centres[disc]) / radius[disc, None]) @ plan.sun.cast
         away /= np.hypot(*plan.sun.cast)
         here = work.ground.at(index)
         shade = np.asarray(np.clip(0.18 + 0.18 * away + 0.08 * here.tuft + 0.05 * here.grain, 0, 0.6), np.float32)

@@ -10,34 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import (
-    TWINS,
-    UNEVEN_DAYS,
-    FieldPlan,
-    Ground,
-    Mixture,
-    Painting,
-    blend,
-    grass,
-    moist_soil,
-)
-from spectralzoom.pipeline.simulator.scenes.farm.land import (
-    YEAR_DAYS,
-    Crop,
-    Field,
-    Points,
-    canopy_cover,
-    days_since_turned,
-    disc_pixels,
-    edge,
-    lodged_fraction,
-    parcel_pixels,
-    polygon_area,
-    smooth_noise,
-    stage_fractions,
-    stream,
-    stripes,
-)
+from spectralzoom.pipeline.simulator.scenes.farm import land
+from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import TWINS, FieldPlan, Ground, Mixture, Painting, blend
+from spectralzoom.pipeline.simulator.scenes.farm.land import Crop, Field, Points
 
 Floats = NDArray[np.float64]
 ON_ROW = 0.97  # greatest cover
@@ -70,36 +45,36 @@ def paint_fields(work: Painting, lodging: Field | None = None) -> None:
     """Draw every field; ``lodging`` (y, x), of sd about 1, is highest where plants lie first, by default anywhere."""
     plan = work.plan
     standing = any(one.lodging > 0 and one.land_on(plan.day).phase == "crop" for one in plan.fields)
-    if lodging is None and lodged_fraction(plan.day) > 0 and standing:
-        lodging = smooth_noise(stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
+    if lodging is None and land.lodged_fraction(plan.day) > 0 and standing:
+        lodging = land.smooth_noise(land.stream(plan.seed, "lodging"), plan.shape, LODGED_PATCH_PX)
     for number, field in enumerate(plan.fields):
-        index, cover, centres = parcel_pixels(field.parcel, plan.shape)
+        index, cover, centres = land.parcel_pixels(field.parcel, plan.shape)
         if not index.size:
             continue
         down = np.zeros(index.size, np.float32) if lodging is None else _lodged(lodging.ravel()[index], field, plan.day)
-        content = _content(work, stream(plan.seed, f"paint {number}"), field, centres, work.ground.at(index), down)
+        content = _content(work, land.stream(plan.seed, f"paint {number}"), field, centres, work.ground.at(index), down)
         work.canvas.add(index, cover, *content)
 
 
 def _content(
     work: Painting, rng: np.random.Generator, field: FieldPlan, centres: Points, here: Ground, down: Field
 ) -> Content:
-    land = field.land_on(work.plan.day)
+    state = field.land_on(work.plan.day)
     crop = field.crop
     salt = int(rng.integers(2**31))
     rows = rows_of(rng, field, centres)
-    if land.phase == "grass":
-        winter = 0.5 + 0.5 * np.cos(2 * np.pi * (work.plan.day - 25) / YEAR_DAYS)
-        dryness = float(0.18 + 0.34 * np.exp(-land.days / 12) + 0.24 * winter)
-        bands = stripes(rows.across, field.row_period_px, field.row_period_px / 2)
-        return Content(blend(grass(here, dryness), grass(here, dryness + 0.16), bands), {"grass": np.ones_like(bands)})
-    soil = moist_soil(work.plan, here, field.wetter)
-    if land.phase == "soil":
-        furrow = stripes(rows.place, field.row_period_px if crop is None else 10.5, 3.0)
+    if state.phase == "grass":
+        winter = 0.5 + 0.5 * np.cos(2 * np.pi * (work.plan.day - 25) / land.YEAR_DAYS)
+        dryness = float(0.18 + 0.34 * np.exp(-state.days / 12) + 0.24 * winter)
+        bands = land.stripes(rows.across, field.row_period_px, field.row_period_px / 2)
+        return Content(blend(here.grass(dryness), here.grass(dryness + 0.16), bands), {"grass": np.ones_like(bands)})
+    soil = work.plan.soil(here, field.wetter)
+    if state.phase == "soil":
+        furrow = land.stripes(rows.place, field.row_period_px if crop is None else 10.5, 3.0)
         content = Content(blend(soil, {"shade": np.ones_like(furrow)}, 0.15 * furrow), {"soil": np.ones_like(furrow)})
         return _with_wheel_marks(content, field, rows, soil) if crop is None else content
-    if crop is None or land.phase == "stubble":
-        return _stubble_field(rows, field, here, soil, land.days)
+    if crop is None or state.phase == "stubble":
+        return _stubble_field(rows, field, here, soil, state.days)
     return _standing_crop(work, field, crop, rows, here, soil, row_gaps(salt, field, rows, here), down)
 
 
@@ -107,9 +82,9 @@ def _standing_crop(
     work: Painting, field: FieldPlan, crop: Crop, rows: Rows, here: Ground, soil: Mixture, gaps: Field, down: Field
 ) -> Content:
     age = field.land_on(work.plan.day).days
-    local = age + np.clip(4 * here.vigour + 1.5 * here.tuft, -UNEVEN_DAYS, UNEVEN_DAYS)
+    local = age + np.clip(4 * here.vigour + 1.5 * here.tuft, -land.UNEVEN_DAYS, land.UNEVEN_DAYS)
     period = field.row_period_px
-    closed = canopy_cover(crop, local)
+    closed = land.canopy_cover(crop, local)
     width = np.minimum(closed * period / ON_ROW, CLOSED * period)
     between = np.clip((closed * period - width * ON_ROW) / (period - width), 0, ON_ROW)
     row = stripes_of(rows.place, period, width)
@@ -131,8 +106,8 @@ def _standing_crop(
 
 
 def _stand(field: FieldPlan, crop: Crop, here: Ground, local: Points, down: Field) -> Mixture:
-    """Return plants alone, by stage; wheat stands and lies, and 0.80 of a pixel has its own variety's red edge."""
-    fractions = stage_fractions(crop, local)
+    """Return plants alone, by stage; wheat stands and lies, and 0.80 of a pixel has its own variety's red land.edge."""
+    fractions = land.stage_fractions(crop, local)
     if field.use not in TWINS:
         return fractions
     if down.max(initial=0) > 0:
@@ -154,18 +129,18 @@ def _with_wheel_marks(content: Content, field: FieldPlan, rows: Rows, soil: Mixt
     if trams is None:
         return content
     shift = rows.across + trams.shift
-    pair = stripes(shift, trams.spacing, trams.width) + stripes(shift + trams.gauge, trams.spacing, trams.width)
+    pair = sum(land.stripes(shift + wheel, trams.spacing, trams.width) for wheel in (0.0, trams.gauge))
     middle = field.headland_px / 2
-    turn = edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
-    inside = edge(rows.ends - middle - trams.gauge / 2)
+    turn = land.edge(trams.width / 2 - np.abs(np.abs(rows.ends - middle) - trams.gauge / 2))
+    inside = land.edge(rows.ends - middle - trams.gauge / 2)
     marks: Field = np.asarray(np.clip(np.maximum(pair * inside, turn), 0, 1), np.float32)
     mixture = blend(content.mixture, blend(soil, {"gravel": np.ones_like(marks)}, np.full_like(marks, 0.22)), marks)
     return Content(mixture, blend(content.fractions, {"track": np.ones_like(marks)}, marks))
 
 
 def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, days: float) -> Content:
-    row = stripes(rows.place, field.row_period_px, CLOSED * field.row_period_px)
-    swath = stripes(rows.across, 44.0, 12.0) * np.float32(days < 9)
+    row = land.stripes(rows.place, field.row_period_px, CLOSED * field.row_period_px)
+    swath = land.stripes(rows.across, 44.0, 12.0) * np.float32(days < 9)
     lying = 0.52 + 0.17 * row + 0.22 * swath + 0.05 * here.tuft + 0.03 * here.grain
     fresh = np.clip(0.17 + 0.10 * here.vigour + 0.05 * here.tuft, 0.01, 0.5)
     green = np.asarray(fresh * (1 - np.exp(-days / 60)), np.float32)
@@ -177,7 +152,7 @@ def _stubble_field(rows: Rows, field: FieldPlan, here: Ground, soil: Mixture, da
 
 
 def _lodged(noise: Field, field: FieldPlan, day: int) -> Field:
-    fraction = field.lodging * lodged_fraction(day)
+    fraction = field.lodging * land.lodged_fraction(day)
     if fraction <= 0 or field.crop is None or field.land_on(day).phase != "crop" or field.land_on(day).days < 150:
         return np.zeros_like(noise)
     return np.asarray(np.clip((noise - NormalDist().inv_cdf(1 - fraction)) / 0.2 + 0.5, 0, 1), np.float32)
@@ -227,11 +202,12 @@ def row_gaps(salt: int, field: FieldPlan, rows: Rows, here: Ground) -> Field:
     length = PIECE_PX * (0.15 + 0.85 * _scatter(number, piece, salt + 1) ** 2)
     fails = _scatter(number, piece, salt + 2) < field.gap_rate * np.clip(1 - 0.6 * here.vigour, 0.2, 3)
     onto = np.abs(rows.place - number * field.row_period_px) / field.row_period_px  # 0 on the row, 0.5 between rows
-    return np.asarray(edge(np.minimum(inside, length - inside)) * fails * np.clip(2.2 - 3.4 * onto, 0, 1), np.float32)
+    cover = land.edge(np.minimum(inside, length - inside)) * fails * np.clip(2.2 - 3.4 * onto, 0, 1)
+    return np.asarray(cover, np.float32)
 
 
 def stripes_of(place: Floats, period: float, width: Floats) -> Field:
-    """Return the cover of each pixel by stripes whose width differs from pixel to pixel (``land.stripes``)."""
+    """Return the cover of each pixel by land.stripes whose width differs from pixel to pixel (``land.stripes``)."""
     start = place + (width - 1) / 2
     whole, rest = np.divmod(start, period)
     last, left = np.divmod(start + 1, period)
@@ -251,7 +227,7 @@ def plant_weeds(work: Painting) -> None:
     """Draw the weeds of every field."""
     grown: dict[str, list[NDArray[np.float64]]] = {}
     for number, field in enumerate(work.plan.fields):
-        for name, plants in field_weeds(stream(work.plan.seed, f"weeds {number}"), field, work.plan.day).items():
+        for name, plants in field_weeds(land.stream(work.plan.seed, f"weeds {number}"), field, work.plan.day).items():
             grown.setdefault(name, []).append(plants)
     draw_weeds(work, {name: np.concatenate(parts) for name, parts in grown.items()})
 
@@ -259,7 +235,7 @@ def plant_weeds(work: Painting) -> None:
 def draw_weeds(work: Painting, grown: Mapping[str, Points]) -> None:
     """Draw plants, each a disc of one spectrum: y, x and radius (n, 3) by spectrum."""
     for name, plants in sorted(grown.items()):
-        for index, cover, _ in disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape):
+        for index, cover, _ in land.disc_pixels(plants[:, :2], plants[:, 2], work.plan.shape):
             work.canvas.over(index, 0.92 * cover, {name: np.ones_like(cover)}, "weed")
 
 
@@ -271,7 +247,7 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     [1] Thomas, "A generalization of Poisson's binomial limit for use in ecology", Biometrika 36, 1949.
     """
     corners = field.parcel.corners
-    area = polygon_area(corners)
+    area = land.polygon_area(corners)
     count, single = rng.poisson(field.weeds * area / 1000), rng.poisson(VOLUNTEERS * area)
     places = _clustered(rng, field, count)
     radius = rng.uniform(0.9, 2.4, count)
@@ -282,10 +258,10 @@ def field_weeds(rng: np.random.Generator, field: FieldPlan, day: int) -> dict[st
     places = np.concatenate([places, points_within(rng, corners, single)])
     radius = np.append(radius, rng.uniform(1.0, 2.0, single))
     emergence = np.append(emergence, rng.uniform(110, 190, single))
-    turned = np.full(count + single, days_since_turned(field.use, day, field.late_days))
-    age = (day - emergence) % YEAR_DAYS
-    land = field.land_on(day)
-    cut = np.where((age > land.days) & (land.phase in ("grass", "stubble")), 0.5, 1.0)  # saw mowing or harvest
+    turned = np.full(count + single, land.days_since_turned(field.use, day, field.late_days))
+    age = (day - emergence) % land.YEAR_DAYS
+    state = field.land_on(day)
+    cut = np.where((age > state.days) & (state.phase in ("grass", "stubble")), 0.5, 1.0)  # saw mowing or harvest
     alive = (age < turned) & (age < 170)  # tillage kills a weed, and so does its age; it grows to 63 % in 22 days
     size = radius * np.where(alive, 1 - np.exp(-age / 22), 0.0) * cut
     flowers = (kinds == "mustard") & (age >= FLOWERING[0]) & (age < FLOWERING[1])
@@ -313,7 +289,7 @@ def _clustered(rng: np.random.Generator, field: FieldPlan, count: int) -> Points
 def points_within(rng: np.random.Generator, corners: Points, count: int) -> Points:
     """Return points spread evenly over a convex polygon, (n, 2)."""
     fans = [corners[[0, number, number + 1]] for number in range(1, len(corners) - 1)]
-    areas = np.array([polygon_area(fan) for fan in fans])
+    areas = np.array([land.polygon_area(fan) for fan in fans])
     chosen = np.array(fans)[rng.choice(len(fans), count, p=areas / areas.sum())]
     u, v = rng.uniform(size=(2, count, 1))
     over = u + v > 1

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.grid import cuts
-from spectralzoom.pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.simulator.scenes.scene import scratch
 
 Field = NDArray[np.float32]
 Points = NDArray[np.float64]
@@ -67,9 +67,14 @@ def stream(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),)))
 
 
-def divide_land(rng: np.random.Generator, size: tuple[float, float], area: float) -> tuple[list[Parcel], list[Border]]:
-    """Split a rectangle about the origin until every parcel has about ``area`` px; also the lines that split it."""
-    waiting = [Parcel(np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array(size) / 2)]
+def rectangle(height: float, width: float) -> Parcel:
+    """Return a rectangle about the origin [px]."""
+    return Parcel(np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * np.array([height, width]) / 2)
+
+
+def divide_land(rng: np.random.Generator, whole: Parcel, area: float) -> tuple[list[Parcel], list[Border]]:
+    """Split a piece of land until every parcel has about ``area`` px; also return the lines that split it."""
+    waiting = [whole]
     turn = rng.uniform(-0.6, 0.6)
     parcels: list[Parcel] = []
     borders: list[Border] = []
@@ -238,6 +243,7 @@ def _spline(knots: Field, position: Points) -> Field:
 LATITUDE_DEG = 52.0
 LOWEST_SUN_DEG = 5.0
 YEAR_DAYS = 366
+UNEVEN_DAYS = 9.0  # by which plants of one field are at most ahead of or behind the rest
 LEAF_OUT, LEAF_TURN, LEAF_FALL = (105.0, 125.0), (270.0, 295.0), (300.0, 318.0)
 MOWN_ON = (141.0, 192.0, 248.0)
 HARROWED_ON = (62.0, 148.0, 238.0)

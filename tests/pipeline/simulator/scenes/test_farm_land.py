@@ -14,13 +14,14 @@ from spectralzoom.pipeline.simulator.scenes.farm.land import (
     divide_land,
     parcel_pixels,
     polygon_area,
+    rectangle,
     stream,
 )
 
 
 def test_parcels_cover_the_land_once() -> None:
     """The parcels' coverages sum to 1 in every pixel, and their areas to the land's."""
-    parcels, _ = divide_land(stream(4, "land"), (700, 640), 20_000)
+    parcels, _ = divide_land(stream(4, "land"), rectangle(700, 640), 20_000)
     assert sum(polygon_area(parcel.corners) for parcel in parcels) == pytest.approx(700 * 640)
     cover = np.zeros(300 * 280)
     for parcel in parcels:

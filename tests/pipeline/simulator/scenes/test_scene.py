@@ -15,13 +15,17 @@ from spectralzoom.pipeline.errors import SceneError, ShapeError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.rig_model import Sky
-from spectralzoom.pipeline.simulator.scenes import scratch as scratch_module
+from spectralzoom.pipeline.simulator.scenes import scene as scene_module
 from spectralzoom.pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
-from spectralzoom.pipeline.simulator.scenes.farm import farm_plan, land
-from spectralzoom.pipeline.simulator.scenes.farm import farm_scene as farm_scene_module
+from spectralzoom.pipeline.simulator.scenes.farm import land
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
-from spectralzoom.pipeline.simulator.scenes.scratch import scratch
+from spectralzoom.pipeline.simulator.scenes.scene import (
+    RasterScene,
+    SceneRadiance,
+    SceneRaster,
+    raster_from_values,
+    scratch,
+)
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)
@@ -219,7 +223,7 @@ def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
 def test_large_array_is_stored_in_a_file(monkeypatch: pytest.MonkeyPatch):
     """The array is zero at first, and keeps written values."""
     assert scratch((4, 5)).base is None
-    monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
+    monkeypatch.setattr(scene_module, "MOST_BYTES", 64)
     held = scratch((4, 5))
     assert held.base is not None
     assert not held.any()
@@ -230,7 +234,7 @@ def test_large_array_is_stored_in_a_file(monkeypatch: pytest.MonkeyPatch):
 def test_a_full_disk_is_an_error(monkeypatch: pytest.MonkeyPatch):
     """Space is allocated before anything is written: a sparse file would end the process later, with a signal."""
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(scratch_module, "MOST_BYTES", 64)
+    monkeypatch.setattr(scene_module, "MOST_BYTES", 64)
     monkeypatch.setattr(os, "posix_fallocate", Mock(side_effect=full))
     with pytest.raises(OSError, match="No space left"):
         scratch((4, 5))
@@ -240,8 +244,7 @@ def test_farm_does_not_depend_on_the_rows_drawn_at_once(monkeypatch: pytest.Monk
     """Noise, weeds, ponds, shadows and trees cross the borders of row blocks; each block fills its own pixels."""
     whole, parted = farm_scene(3, (300, 400)), farm_scene(3, (300, 400))
     for rows, scene in ((300, whole), (7, parted)):
-        for module in (land, farm_plan, farm_scene_module):
-            monkeypatch.setattr(module, "ROWS_AT_ONCE", rows)
+        monkeypatch.setattr(land, "ROWS_AT_ONCE", rows)
         scene.raster.drawn()
     np.testing.assert_array_equal(parted.planes, whole.planes)
     np.testing.assert_array_equal(parted.labels, whole.labels)
@@ -252,7 +255,7 @@ def test_farm_stored_in_files_equals_one_in_memory(monkeypatch: pytest.MonkeyPat
     """Planes, labels and thinned planes have the same values."""
     here, there = farm_scene(3, (300, 200)), farm_scene(3, (300, 200))
     want = here.planes, here.labels, here.raster.thinned(2)
-    monkeypatch.setattr(scratch_module, "MOST_BYTES", 1000)
+    monkeypatch.setattr(scene_module, "MOST_BYTES", 1000)
     found = there.planes, there.labels, there.raster.thinned(2)
     assert found[0].base is not None
     assert all(np.array_equal(one, other) for one, other in zip(want, found, strict=True))
