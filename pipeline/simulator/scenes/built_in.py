@@ -71,9 +71,8 @@ def scouting_scene(
     """Return a scouted field on a day: equal arguments give the same scene, bit for bit. It is drawn when needed.
 
     Arguments are those of `farm_scene`; ``interest`` is the share of the scene in patches, 0 to 1, by the seed if None.
-    Another day of the same seed, shape and interest is the same land with the same patches.
-
-    Raises SceneError: an interest that is not 0 to 1, and what `farm_scene` raises.
+    Another day of the same seed, shape and interest is the same land with the same patches. Raises SceneError: an
+    interest that is not 0 to 1, and what `farm_scene` raises.
     """
     if interest is not None and not 0 <= interest <= 1:
         raise SceneError(f"the share of interest is from 0 to 1, got {interest:g}")

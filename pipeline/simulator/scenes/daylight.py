@@ -38,9 +38,7 @@ def relative_daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Float
     """Return the light on level ground over that at the survey's start, (time, band).
 
     It is 0 with the sun at the horizon or below. No exposure fits the night: a survey that starts in less light than
-    the sun gives from 1 deg is relative to that light. So the ratio is finite and goes to 0 evenly.
-
-    Raises SettingsError: the sky has no time of day.
+    the sun gives from 1 deg is relative to that light. Raises SettingsError: the sky has no time of day.
     """
     start = _started(sky)
     first = _irradiance(sky, np.array([start]), wavelength_nm)

@@ -189,17 +189,13 @@ class RasterScene:
         return self.raster.shape[:2]
 
     def in_light(self, fraction: float) -> RasterScene:
-        """Return the same scene in a fraction of the light that it is in now.
-
-        Scene and white reference give less electrons, by the same factor; scene values stay.
-        """
+        """Return the same scene in a fraction of its light: scene and white reference give less electrons alike."""
         if fraction == 1:
             return self
 
         def light() -> SceneRadiance:
-            return SceneRadiance(
-                self.electrons * np.float32(fraction), self.white_reference_electrons * np.float32(fraction)
-            )
+            less = np.float32(fraction)
+            return SceneRadiance(self.electrons * less, self.white_reference_electrons * less)
 
         whole = self.light_fraction * fraction
         return replace(self, key=f"{self.clear_key}{_DIMMED}{whole:g}", light=Once(light), light_fraction=whole)
@@ -267,7 +263,6 @@ def raster_from_values(
     positive light takes 1 in its place. Values that are not finite get the band's median, and ``filled_px`` counts
     their pixels. A pixel without finite values in more than half of the bands is ``missing`` and loses its label.
     Negative values give no electrons. ``key``: identity of the content, by default the hash of the values.
-
     Raises SceneError: not three axes, empty, no finite value, one that is no reading (`pipeline.readings`), or labels
     that do not fit.
     """
@@ -286,16 +281,12 @@ def raster_from_values(
     if missing is not None and labels is not None:
         labels = np.where(missing, np.uint8(UNLABELLED), labels)
     bands = planes.shape[2]
+    electrons = np.full(bands, WELL_FRACTION * camera.full_scale_e / bright, np.float32)
     return RasterScene(
         name=name,
         key=key or content_key(planes),
         raster=SceneRaster.of(planes, labels),
-        light=Once.of(
-            SceneRadiance(
-                np.full(bands, WELL_FRACTION * camera.full_scale_e / bright, np.float32),
-                np.full(bands, camera.full_scale_e, np.float32),
-            )
-        ),
+        light=Once.of(SceneRadiance(electrons, np.full(bands, camera.full_scale_e, np.float32))),
         white_reference=np.full(bands, bright / WELL_FRACTION, np.float32),
         wavelength_nm=np.asarray(wavelength_nm, np.float64),
         fwhm_nm=fwhm_nm,

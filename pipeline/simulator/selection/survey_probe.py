@@ -108,7 +108,7 @@ class SampleViews(NamedTuple):
     along_y: NDArray[np.bool_]
 
     def chosen(self, which: NDArray[np.intp]) -> SampleViews:
-        return self._make(values[which] for values in self)
+        return SampleViews._make(values[which] for values in self)
 
 
 def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:

@@ -70,7 +70,6 @@ def farm_scene(
     1 [px], ``bands`` equally spaced from 400 to 1000 nm, at least 2. The camera's full well sets the electrons. ``day``
     is of the year, 1 to 366, ``hour`` true solar time, the sun in the south at 12 [h]. Planes are abundances of
     ``farm_plan(...).materials``; scene values are reflectance; every pixel is labelled.
-
     Raises SceneError: a negative seed, an empty shape, no such day, the sun below 5 degrees; WavelengthError: one band.
     """
     plan = farm_plan(seed, shape, day=USUAL_DAY if day is None else day, hour=USUAL_HOUR if hour is None else hour)
@@ -120,31 +119,28 @@ def _draw(plan: FarmPlan) -> Drawn:
 
 def paint_borders(work: Painting) -> None:
     """Draw the lines between parcels, roads last."""
-    for kind in ("margin", "hedge", "ditch", "road"):
-        for number, (border, its_kind) in enumerate(work.plan.borders):
-            if its_kind == kind:
-                rng = land.stream(work.plan.seed, f"border {number}")
-                canvas = work.canvas
-                band = land.band_pixels(border, 12.0, canvas.shape)
-                phases = rng.uniform(0, 2 * np.pi, 2)
-                bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
-                way = np.float32((0.8 if kind == "road" else 1.6) / 2)
-                band = replace(band, across=band.across + way * bend.astype(np.float32))
-                here = work.ground.at(band.index)
-                half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
-                dryness = rng.uniform(0.25, 0.55)
-                swath = rng.uniform() < 0.5
-                inner = rng.uniform(0.8, 1.2)
-                work.canvas.stripe(band, half + bank, here.grass(dryness), "grass")
-                if kind == "ditch":
-                    full = half * (0.75 + 1.4 * work.plan.moisture)
-                    work.canvas.stripe(band, full, {"water": np.ones_like(band.across)}, "water")
-                if kind == "road":
-                    stone = np.clip(0.75 + 0.08 * here.tuft + 0.05 * here.grain, 0, 1)  # trodden into dry soil
-                    ground = {"gravel": stone, "soil_dry": 0.85 * (1 - stone), "soil_wet": 0.15 * (1 - stone)}
-                    work.canvas.stripe(band, half, ground, "track")
-                    if swath:
-                        work.canvas.stripe(band, inner, here.grass(0.5), "grass")
+    order = ("margin", "hedge", "ditch", "road")
+    for number, (border, kind) in sorted(enumerate(work.plan.borders), key=lambda one: order.index(one[1][1])):
+        rng = land.stream(work.plan.seed, f"border {number}")
+        band = land.band_pixels(border, 12.0, work.canvas.shape)
+        phases = rng.uniform(0, 2 * np.pi, 2)
+        bend = np.sin(band.along / 37 + phases[0]) + np.sin(band.along / 61 + phases[1])
+        way = np.float32((0.8 if kind == "road" else 1.6) / 2)
+        band = replace(band, across=band.across + way * bend.astype(np.float32))
+        here = work.ground.at(band.index)
+        half, bank = rng.uniform(*WIDTHS[kind]), rng.uniform(*BANKS[kind])
+        dryness = rng.uniform(0.25, 0.55)
+        swath, inner = rng.uniform() < 0.5, rng.uniform(0.8, 1.2)
+        work.canvas.stripe(band, half + bank, here.grass(dryness), "grass")
+        if kind == "ditch":
+            full = half * (0.75 + 1.4 * work.plan.moisture)
+            work.canvas.stripe(band, full, {"water": np.ones_like(band.across)}, "water")
+        if kind == "road":
+            stone = np.clip(0.75 + 0.08 * here.tuft + 0.05 * here.grain, 0, 1)  # trodden into dry soil
+            ground = {"gravel": stone, "soil_dry": 0.85 * (1 - stone), "soil_wet": 0.15 * (1 - stone)}
+            work.canvas.stripe(band, half, ground, "track")
+            if swath:
+                work.canvas.stripe(band, inner, here.grass(0.5), "grass")
 
 
 def dig_ponds(work: Painting) -> None:
@@ -171,23 +167,19 @@ def crowns_of(work: Painting) -> Points:
     """Return the crowns of hedges and of trees beside the lines: y, x and radius, (n, 3)."""
     plan = work.plan
     rng = land.stream(plan.seed, "trees")
-    trees = [np.zeros((0, 3))]
-    for border, _ in plan.borders:
-        count = rng.poisson(border.length / 320)
-        step = (border.end - border.start) / max(border.length, 1e-9)
-        aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * np.array([-step[1], step[0]])
-        places = border.start + rng.uniform(0, border.length, (count, 1)) * step + aside
-        trees.append(np.column_stack([places, rng.uniform(5, 12, count)]))
-    crowns = [np.concatenate(trees)]
+    trees, hedges = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for number, (border, kind) in enumerate(plan.borders):
+        count = rng.poisson(border.length / 320)
+        aside = rng.choice([-1.0, 1.0], (count, 1)) * rng.uniform(7, 14, (count, 1)) * border.step[::-1] * [-1, 1]
+        places = border.start + rng.uniform(0, border.length, (count, 1)) * border.step + aside
+        trees.append(np.column_stack([places, rng.uniform(5, 12, count)]))
         if kind == "hedge":
-            rng = land.stream(plan.seed, f"hedge {number}")
+            own = land.stream(plan.seed, f"hedge {number}")
             along = np.arange(0.0, border.length, 5.0)
-            along = along[rng.uniform(size=along.size) > 0.05]
-            step = (border.end - border.start) / max(border.length, 1e-9)
-            centres = border.start + along[:, None] * step + rng.normal(0, 1.0, (along.size, 2))
-            crowns.append(np.column_stack([centres, rng.uniform(4, 7, along.size)]))
-    return np.concatenate(crowns)
+            along = along[own.uniform(size=along.size) > 0.05]
+            centres = border.start + along[:, None] * border.step + own.normal(0, 1.0, (along.size, 2))
+            hedges.append(np.column_stack([centres, own.uniform(4, 7, along.size)]))
+    return np.concatenate(trees + hedges)
 
 
 def plant_trees(work: Painting) -> None:

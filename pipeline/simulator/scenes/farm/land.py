@@ -52,6 +52,11 @@ class Border:
     def length(self) -> float:
         return float(np.hypot(*(self.end - self.start)))
 
+    @property
+    def step(self) -> Points:
+        """Return the way of 1 px along it, (2,)."""
+        return (self.end - self.start) / max(self.length, 1e-9)
+
 
 @dataclass(frozen=True)
 class Band:
@@ -120,8 +125,8 @@ def polygon_area(corners: Points) -> float:
 
 def visible_area(parcel: Parcel, shape: tuple[int, int]) -> float:
     corners = parcel.corners
-    for axis in ((1.0, 0.0, shape[0]), (-1.0, 0.0, shape[0]), (0.0, 1.0, shape[1]), (0.0, -1.0, shape[1])):
-        corners = clip_polygon(corners, (axis[0], axis[1], -axis[2] / 2))
+    for ny, nx in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+        corners = clip_polygon(corners, (ny, nx, -shape[0 if ny else 1] / 2))
     return polygon_area(corners)
 
 
@@ -163,7 +168,7 @@ def parcel_pixels(parcel: Parcel, shape: tuple[int, int]) -> tuple[NDArray[np.in
 
 def band_pixels(border: Border, reach: float, shape: tuple[int, int]) -> Band:
     """Return the pixels within ``reach`` of a line, and a little more at its ends, row by row or column by column."""
-    step = (border.end - border.start) / max(border.length, 1e-9)
+    step = border.step
     major = int(abs(step[1]) >= abs(step[0]))
     middle = (np.array(shape) - 1) / 2
     ends = np.sort([border.start[major], border.end[major]]) + middle[major]
@@ -321,9 +326,8 @@ class Sun:
 def sun_over_farm(day: int, hour: float) -> Sun:
     """Return the sun's place: declination by Spencer's series [1], hour angle 15 degrees an hour.
 
-    Right to 0.7 degrees in the years about 2025; refraction is left out.
-
-    Raises SceneError: the day is not 1 to 366, or the sun is lower than 5 degrees at the hour.
+    Right to 0.7 degrees in the years about 2025; refraction is left out. Raises SceneError: the day is not 1 to 366, or
+    the sun is lower than 5 degrees at the hour.
 
     [1] Spencer, "Fourier series representation of the position of the sun", Search 2 (5), 1971.
     """

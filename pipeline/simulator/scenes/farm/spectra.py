@@ -32,9 +32,7 @@ FIRST_NM, LAST_NM = 400.0, 1000.0
 FWHM_NM = 6.0  # assumed
 WHITE_REFERENCE_REFLECTANCE = 0.99
 FILL = 0.95  # of the full well, by a perfect white in the brightest band
-TWIN_CENTRE_NM = 715.0
-TWIN_HALF_WIDTH_NM = 25.0
-TWIN_CONTRAST = 0.10
+TWIN_CENTRE_NM, TWIN_HALF_WIDTH_NM, TWIN_CONTRAST = 715.0, 25.0, 0.10
 RIPE_CONTRAST = 0.4  # of the twins' contrast, in ripe wheat (law of this project)
 MOISTURE_EXPONENT = 5.0  # law of this project; 80 % of the darkening is done at 0.32 by volume
 
@@ -95,14 +93,10 @@ MATERIALS: tuple[str, ...] = (*_LASTING, *STAGES, *_TWINS, "straw_grey", "twigs"
 
 @dataclass(frozen=True)
 class SpectralLibrary:
-    """Materials as the camera sees them under the stated sun.
+    """Materials as the camera sees them under the stated sun."""
 
-    ``reflectance`` is (material, band), weighted in each band by light and response. ``light`` is (band,), the signal
-    of a perfect white, at most 1 over the bands.
-    """
-
-    reflectance: NDArray[np.float64]
-    light: Spectrum
+    reflectance: NDArray[np.float64]  # (material, band), weighted in each band by light and response
+    light: Spectrum  # (band,) the signal of a perfect white, at most 1 over the bands
 
     def electrons(self, camera: LineCamera) -> NDArray[np.float32]:
         """Return expected electrons of each pure material in one default exposure, (material, band) [e-].
@@ -176,9 +170,8 @@ def _known_spectra() -> dict[str, Spectrum]:
     for name, other in _TWINS.items():
         known[name] = known[other] * (1 + (RIPE_CONTRAST if name.endswith("ripe") else 1.0) * (factor - 1))
     iron = 1 - 0.5 / (1 + np.exp((GRID_NM - 545) / 40))  # grey soil to brown loam: 0.5 in the violet, 1 beyond 700 nm
-    dry, wet = (
-        iron * soil[: len(GRID_NM)] for soil in (prosail.spectral_lib.soil.rsoil1, prosail.spectral_lib.soil.rsoil2)
-    )
+    soils = prosail.spectral_lib.soil
+    dry, wet = (iron * soil[: len(GRID_NM)] for soil in (soils.rsoil1, soils.rsoil2))
     hump = 0.020 * np.exp(-(((GRID_NM - 555) / 70) ** 2)) + 0.008 * np.exp(-(((GRID_NM - 705) / 18) ** 2))
     straw = 0.08 + 0.42 / (1 + np.exp(-(GRID_NM - 620) / 90))  # bleached cereal straw: 0.10 at 400 nm to 0.50
     petals = 0.05 + 0.47 / (1 + np.exp(-(GRID_NM - 512) / 9))  # of mustard: they absorb below 510 nm
