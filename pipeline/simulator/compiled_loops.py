@@ -28,9 +28,8 @@ _ENDLESS = 0x7F800000  # bits of an infinite float32; of what is no number they 
 def draw_pairs(words: NDArray[np.uint32], piece: int, drawn: Radiance) -> None:
     """Write standard normal deviates, a piece after the other: of each, words for radii, then as many for turns.
 
-    A radius r = sqrt(-2 ln u) and a turn t give r cos t and r sin t. The logarithm is that of 2^e m with m about 1: a
-    polynomial of m - 1, right to 1e-7. Sine and cosine are polynomials within an eighth of a turn. The quarter says
-    which of them, and with which sign.
+    A radius r = sqrt(-2 ln u) and a turn t give r cos t and r sin t. The logarithm of 2^e m is a polynomial of m - 1,
+    right to 1e-7. Sine and cosine are polynomials within an eighth of a turn; the quarter says which, with which sign.
     """
     radius, rest = np.empty(_AT_ONCE, np.float32), np.empty(_AT_ONCE, np.float32)
     bits = radius.view(np.int32)
@@ -134,7 +133,7 @@ SAMPLES_AT_ONCE = 32  # whose weights stay in the processor's cache while lines 
 def mix_neighbours(light: Radiance, weights: Radiance, first: int, made: Radiance) -> None:
     """Write light (line, sample, band) times weights (tap, sample, band) of bands ``first``, ``first`` + 1, ... beside.
 
-    Bands beyond the first and the last are left out. The tap of the band itself is among them.
+    The tap of the band itself is among them; bands beyond the ends are left out.
     """
     lines, samples, bands = light.shape
     for start in range(0, samples, SAMPLES_AT_ONCE):
@@ -186,9 +185,9 @@ def sum_nodes(parts: Radiance, fractions: Radiance, nodes: Radiance) -> None:
 
 @compiled(_LIGHT3, OFFSETS, OFFSETS, OFFSETS, _LIGHT2, _ROWS)
 def _take_terms(nodes: Radiance, start: int, lower: int, upper: int, taken: Radiance, rows: Places) -> int:
-    """Write what four samples have of components that any of them has, (sample, term), and their rows of the mixing.
+    """Write four samples' components that any of them has, (sample, term), and their rows of the mixing; count them.
 
-    Gives how many that are; the last sample stands for those beyond it, nothing for terms beyond the last.
+    The last sample stands for those beyond it, nothing for terms beyond the last.
     """
     last = nodes.shape[1] - 1
     components = nodes.shape[2]
@@ -330,10 +329,7 @@ def place_parts(
 def read_weights(
     table: TapTable, kernel: int, scale: Floats, off: Radiance, axis: int, part: int, weight: Radiance
 ) -> None:
-    """Write the weights (tap, n) of a kernel at places ``off`` px beside their pixel, linear between rows.
-
-    ``scale`` is (axis, n), ``off`` (axis, part, n): by axis and part.
-    """
+    """Write the weights (tap, n) of a kernel, linear between rows, at places ``off`` (axis, part, n) from the pixel."""
     taps = table.weight.shape[1]
     last_scale = table.scales - 1
     last_row = np.float32(table.rows - 2)

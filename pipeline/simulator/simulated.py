@@ -117,14 +117,12 @@ class SimulatedSource:
     @property
     def record(self) -> None:
         """Return nothing: the manifest of the effects has it all."""
-        return None
 
     def references(self, sweep: Sweep) -> References:
-        """Return means of dark and white frames (sample, band), free of noise. [DN]
+        """Return means of dark and white frames (sample, band), free of noise [DN]; dead and hot elements are bad.
 
-        The white frame is scaled from a shorter exposure, so that it does not saturate. It is taken with the mirror at
-        rest, by the light of the survey's start. Dead and hot elements count as bad; the white reference's values are
-        in the rig's bands.
+        The white frame is scaled from a shorter exposure, so that it does not saturate, and taken with the mirror at
+        rest, by the light of the survey's start. The white reference's values are in the rig's bands.
         """
         rig = self.rig.taking(sweep)
         block = sweep_block(self.scene, rig, AT_REST, range(1))
@@ -191,8 +189,7 @@ def sweep_starts(
     """Return when the first line of each sweep begins, by the sweep's name, since the survey's start. [s]
 
     ``sweeps`` are in the order in which they are taken, ``after_s`` is what the survey has spent before. The sweeps
-    before, a set-up for each and the loads of the vector memory come first. A load in the midst of a sweep delays the
-    next one only.
+    before, their set-ups and loads of the vector memory come first; a load within a sweep delays the next one only.
     """
     loads_before: dict[int, int] = {}
     for number, load in enumerate(memory_loads(sweeps, cost.vector_pairs), 1):

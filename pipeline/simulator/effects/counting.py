@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.simulator.effects.effect import Bound, Effect, Radiance, unit_stream
+from spectralzoom.pipeline.simulator.effects.effect import Bound, Effect, Radiance, stream_of
 from spectralzoom.pipeline.simulator.effects.probe import Probe
 from spectralzoom.pipeline.simulator.rig_model import Rig
 
@@ -231,7 +231,7 @@ def most_hot_electrons(rig: Rig) -> float:
 
 @lru_cache(maxsize=8)
 def _mask(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -> Mask:
-    mask: Mask = np.ascontiguousarray((unit_stream(unit, kind).random((bands, samples)) < fraction).T)
+    mask: Mask = np.ascontiguousarray((stream_of(unit, kind).random((bands, samples)) < fraction).T)
     mask.setflags(write=False)
     return mask
 

@@ -29,13 +29,10 @@ Chosen = Mapping[Any, str]  # effects that are on, each with its variant, in the
 
 @dataclass(frozen=True)
 class Bound:
-    """The most that leaving an effect out, or taking a variant for the exact one, changes any number; and why.
+    """The most that leaving an effect out, or taking a variant for the exact one, changes any number; and why."""
 
-    ``value`` is in the unit of the probe that it was asked with. ``why`` is for the user: the magnitude in numbers.
-    """
-
-    value: float
-    why: str
+    value: float  # in the unit of the probe that it was asked with
+    why: str  # for the user: the magnitude in numbers
 
 
 class Effect(Protocol):
@@ -109,18 +106,15 @@ class LightChange(Effect, Protocol):
 
 @dataclass(frozen=True)
 class SweepBlock:
-    """Lines ``lines`` (numbers within the sweep), with all samples of the camera.
-
-    A result never depends on which other lines are in the block. ``started_s`` is since the survey's start.
-    """
+    """Lines with all samples of the camera. A result never depends on which other lines are in the block."""
 
     rig: Rig
     sweep: Sweep
-    lines: range
+    lines: range  # numbers within the sweep
     wavelength_nm: Floats  # (band,)
     shape: tuple[int, int]  # of the scene [px]
     seed: int = 0
-    started_s: float = 0.0
+    started_s: float = 0.0  # since the survey's start
     fwhm_nm: Floats | None = None  # (band,) of the scene's own bands; None where not known
     white_e: Floats | float = 0.0  # (band,) electrons of the white reference in one exposure
 
@@ -153,8 +147,7 @@ class SweepBlock:
     def normals(self) -> Floats:
         """Return the mirror's normals at mid exposure, as planned, (line, 3); ``-n_z`` is the cosine of incidence."""
         # for the whole sweep: the product with the axes rounds otherwise for a single line than for several.
-        whole: Floats = position_to_normal(line_positions(self.sweep, self.rig.camera))
-        return whole[self.numbers]
+        return np.asarray(position_to_normal(line_positions(self.sweep, self.rig.camera))[self.numbers])
 
     @property
     def scan_px(self) -> Floats:
@@ -163,20 +156,18 @@ class SweepBlock:
 
     def stream(self, effect: str, number: int) -> np.random.Generator:
         """Return an effect's random stream at one line: blocks, order and other effects never change it."""
-        return _stream(self.seed, self.sweep.name, effect, number)
+        return stream_of(self.seed, self.sweep.name, effect, number)
 
 
 def survey_stream(seed: int, effect: str) -> np.random.Generator:
     """Return the stream of one effect for a whole survey: under no sweep's name."""
-    return _stream(seed, "", effect)
+    return stream_of(seed, "", effect)
 
 
-def unit_stream(unit: int, effect: str) -> np.random.Generator:
-    """Return the stream of what belongs to one copy of the rig, whatever it looks at: its fixed patterns."""
-    return _stream(unit, effect)
+def stream_of(entropy: int, *key: str | int) -> np.random.Generator:
+    """Return a stream by a survey's seed, or by the unit of a rig for its fixed patterns, and the hash of a key.
 
-
-def _stream(entropy: int, *key: str | int) -> np.random.Generator:
-    """Return a stream whose key is hashed to its state; words of SFC64 take half the time of a counter-based Philox."""
+    Words of SFC64 take half the time of a counter-based Philox.
+    """
     words = [zlib.crc32(one.encode()) if isinstance(one, str) else one for one in key]
     return np.random.Generator(np.random.SFC64(np.random.SeedSequence(entropy=entropy, spawn_key=words)))

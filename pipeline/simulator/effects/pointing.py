@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import position_to_normal
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, line_positions, points_of_scan
-from spectralzoom.pipeline.simulator.effects.effect import Aim, Bound, SweepBlock, unit_stream
+from spectralzoom.pipeline.simulator.effects.effect import Aim, Bound, SweepBlock, stream_of
 from spectralzoom.pipeline.simulator.effects.probe import Probe
 from spectralzoom.pipeline.simulator.rig_model import MirrorMotion, Rig
 
@@ -157,7 +157,7 @@ def pointing_field(unit: int, position: Floats) -> Floats:
     """
     x, y = position[..., 0], position[..., 1]
     modes = np.stack([np.ones_like(x), x, y, 2 * (x * x + y * y) - 1, x * x - y * y, 2 * x * y], axis=-1)
-    weights = unit_stream(unit, Hysteresis.name).standard_normal((_MODES, 2))
+    weights = stream_of(unit, Hysteresis.name).standard_normal((_MODES, 2))
     return np.asarray((modes[..., None] * (weights / np.abs(weights).sum(axis=0))).sum(axis=-2))
 
 
@@ -169,7 +169,7 @@ def _course(rig: Rig, sweep: Sweep, position: Floats) -> Floats:
 
 
 def _along_and_scan(rig: Rig) -> tuple[float, float]:
-    turn = unit_stream(rig.detector.unit, ThermalDrift.name).uniform(0, 2 * math.pi)
+    turn = stream_of(rig.detector.unit, ThermalDrift.name).uniform(0, 2 * math.pi)
     return math.cos(turn), math.sin(turn)
 
 

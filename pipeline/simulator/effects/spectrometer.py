@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.simulator.effects.counting import EXACT, Floats, normal_deviates
-from spectralzoom.pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, unit_stream
+from spectralzoom.pipeline.simulator.effects.effect import Bound, Gain, LightChange, Radiance, SweepBlock, stream_of
 from spectralzoom.pipeline.simulator.effects.probe import GainRange, Probe, difference_rates, rising_gaps, rising_runs
 from spectralzoom.pipeline.simulator.rig_model import Rig
 
@@ -239,7 +239,7 @@ class SensorGain(Gain):
 
 @lru_cache(maxsize=8)
 def _gains(unit: int, kind: str, samples: int, bands: int, *, fraction: float) -> Radiance:
-    stream = unit_stream(unit, kind)
+    stream = stream_of(unit, kind)
     drawn = np.stack([normal_deviates(stream, samples) for _ in range(bands)], axis=1)
     gains: Radiance = np.maximum(1 + np.float32(fraction) * drawn, 0)
     gains.setflags(write=False)

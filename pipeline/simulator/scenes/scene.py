@@ -130,58 +130,40 @@ class RasterScene:
 
     No light is below 0, and none is lost or gained. It is the sharpest such interpolation whose slope has no jump
     behind a pixel or a slit. Slopes and curvatures bound what is left out. A wave of f cycles per px keeps sinc^2 f,
-    0.81 at a quarter, of what the pixels have of it.
-
-    ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
-    plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
-    band. ``missing`` (y, x) are pixels without one in most bands (None: no such pixel). ``white_reference`` is the
-    scene value of the white reference. ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the bands. All are
-    (band,); widths are None where not known. Equal keys give equal light. ``geobox`` is the place of the pixels on the
-    earth, None where the scene's file has none. ``pixel_m`` is the size of a pixel on the ground of a scene without
-    one, where its law states it. ``regridded`` says that the labels came on another grid and were brought to the
-    scene's. ``content`` are hashes of the files that it was read from, whatever bands of them are taken.
-    ``light_fraction`` is the light on the scene over that of a clear sky; electrons have it in them, scene values do
-    not. Planes, labels and electrons may be made when they are first asked for; all else is known at once.
+    0.81 at a quarter, of what the pixels have of it. Planes, labels and electrons may be made when they are first asked
+    for; all else is known at once.
     """
 
     name: str
-    key: str
+    key: str  # equal keys give equal light
     raster: SceneRaster
     light: Once[SceneRadiance]
-    white_reference: NDArray[np.float32]
-    wavelength_nm: NDArray[np.float64]
-    fwhm_nm: NDArray[np.float64] | None = None
+    white_reference: NDArray[np.float32]  # (band,) scene value of the white reference
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None = None  # (band,) widths; None where not known
     class_names: tuple[str, ...] = ()
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
-    filled_px: int = 0
-    missing: NDArray[np.bool_] | None = None
-    geobox: GeoBox | None = None
-    pixel_m: float | None = None
-    regridded: bool = False
-    content: tuple[str, ...] = ()
-    light_fraction: float = 1.0
+    filled_px: int = 0  # pixels that came without a value in a band
+    missing: NDArray[np.bool_] | None = None  # (y, x) pixels without a value in most bands; None: no such pixel
+    geobox: GeoBox | None = None  # place of the pixels on the earth; None where the scene's file has none
+    pixel_m: float | None = None  # size of a pixel on the ground of a scene without a place, where its law states it
+    regridded: bool = False  # the labels came on another grid and were brought to the scene's
+    content: tuple[str, ...] = ()  # hashes of the files that it was read from, whatever bands of them are taken
+    light_fraction: float = 1.0  # over a clear sky's light; electrons have it in them, scene values do not
 
     def __post_init__(self) -> None:
         if self.light.is_made():
             self._checked_light()
-        self._check_bands("white_reference", self.white_reference)
 
     def _checked_light(self) -> SceneRadiance:
         light = self.light()
-        bands = len(self.wavelength_nm)
-        components = self.raster.shape[2]
-        wanted = {(components, bands)} | ({(bands,)} if bands == components else set())
-        if light.electrons.shape not in wanted:
+        bands, components = len(self.wavelength_nm), self.raster.shape[2]
+        if light.electrons.shape not in {(components, bands), *([(bands,)] if bands == components else [])}:
             raise ShapeError(
                 f"scene {self.name}: electrons {light.electrons.shape} do not map {components} components "
                 f"to {bands} bands"
             )
-        self._check_bands("white_reference_electrons", light.white_reference_electrons)
         return light
-
-    def _check_bands(self, what: str, values: NDArray[np.float32]) -> None:
-        if values.shape != self.wavelength_nm.shape:
-            raise ShapeError(f"scene {self.name}: {what} {values.shape}, expected ({len(self.wavelength_nm)},)")
 
     @property
     def shape(self) -> tuple[int, int]:
