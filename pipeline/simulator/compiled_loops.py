@@ -185,11 +185,8 @@ def sum_nodes(parts: Radiance, fractions: Radiance, nodes: Radiance) -> None:
 
 @compiled(_LIGHT3, OFFSETS, OFFSETS, OFFSETS, _LIGHT2, _ROWS)
 def _take_terms(nodes: Radiance, start: int, lower: int, upper: int, taken: Radiance, rows: Places) -> int:
-    """Write four samples' components that any of them has, (sample, term), and their rows of the mixing; count them.
-
-    The last sample stands for those beyond it, nothing for terms beyond the last.
-    """
-    last = nodes.shape[1] - 1
+    """Write four samples' components that any of them has, (sample, term), and their rows of the mixing; count them."""
+    last = nodes.shape[1] - 1  # stands for the samples beyond it
     components = nodes.shape[2]
     count = 0
     n0, n1, n2, n3 = start, min(start + 1, last), min(start + 2, last), min(start + 3, last)

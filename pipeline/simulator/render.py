@@ -66,10 +66,7 @@ def _doing(chosen: Chosen, action: str) -> tuple[tuple[Any, str], ...]:
 
 
 def _views(block: SweepBlock, chosen: Chosen, shape: tuple[int, int]) -> Iterator[RayViews]:
-    """Yield where the samples look at each held position, (line, sample) each. [px of the scene]
-
-    The mirror holds each position, aims included, for as long as the others.
-    """
+    """Yield where the samples look at each held position, aims included, (line, sample) each. [px of the scene]"""
     position = smeared_positions(block, chosen.get(SMEAR, OFF))
     for aim, variant in _doing(chosen, "aim"):
         shift = aim.aim(block, variant)

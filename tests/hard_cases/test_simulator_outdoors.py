@@ -79,13 +79,11 @@ def test_light_ends_at_sunset() -> None:
     assert (read_out(light, block, {}) == 64).all()
 
 
-@pytest.mark.parametrize("variant", DRIFT.variants)
-def test_drift_of_a_survey_into_the_night_is_bounded_by_the_level(variant: str) -> None:
-    """Leaving out drift errs by the whole level, and no variant by more; drift is on, with an error within 0.1."""
+def test_drift_of_a_survey_into_the_night_is_bounded_by_the_level() -> None:
+    """Leaving out drift errs by the whole level; drift is on, with an error within 0.1."""
     rig = replace(RIG, sky=EVENING)
     probe = replace(probed(FLAT, rig), seconds=2 * 3600.0)
     assert DRIFT.bound(probe, rig).value == pytest.approx(probe.level.max())
-    assert DRIFT.bound(probe, rig, variant).value <= probe.level.max() * (1 + 1e-9)
     decision = decide(probe, rig, EFFECTS, 0.1)
     assert DRIFT in decision.chosen
     assert decision.error <= 0.1

@@ -172,10 +172,7 @@ _ALUMINIUM = np.array([  # [2]
 
 
 class Vignetting(Gain):
-    """Light goes with the mirror's area as the camera sees it: |n_z| over |n_z| at rest, one factor for each line.
-
-    It is the mean over the positions of an exposure.
-    """
+    """Light goes with the mirror's area as the camera sees it: |n_z| over |n_z| at rest, in the mean of an exposure."""
 
     name = "vignetting"
     cost_ns = MappingProxyType({"held": 0.2})

@@ -108,10 +108,7 @@ def _sigma_px(rig: Rig) -> float:
 
 
 class Hysteresis(Aim):
-    """A smooth error over the mirror's disk, one field of at most ``hysteresis_px`` for each copy of the rig.
-
-    A scan the other way meets it with the other sign.
-    """
+    """A smooth error over the disk, at most ``hysteresis_px``, for each copy of the rig; its sign is the scan's."""
 
     name = "hysteresis"
     cost_ns = MappingProxyType({"exact": 0.07})
@@ -330,11 +327,8 @@ def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:
 
 
 def _at_start(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> Floats:
-    """Return state (place [px], rate) as line 0 begins: at rest, less steady motion; and what is left of the way back.
-
-    Steady motion has the errors of all steps before, a geometric series over lines with the denominator I - exp(A p).
-    """
-    damping = mirror.damping
+    """Return state (place [px], rate) as line 0 begins: at rest, less steady motion; and the rest of the way back."""
+    damping = mirror.damping  # steady motion has the errors of all steps before, a geometric series over lines
     times, height, every = _steps(mirror, sweep, period, held)
     impulse, rise = responses(times, damping)
     place, rate = height * float((1 - rise).sum()), -height * float(impulse.sum())

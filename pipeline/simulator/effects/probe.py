@@ -100,15 +100,12 @@ def fixed_variance(camera: LineCamera) -> float:
 
 @dataclass(frozen=True)
 class GainRange:
-    """Factors of light that a gain has anywhere in a survey, (band,) each.
-
-    ``uneven`` is the greatest difference of two factors within one line. ``added_e`` is light that is added.
-    """
+    """Factors of light that a gain has anywhere in a survey, (band,) each."""
 
     least: Floats
     greatest: Floats
-    uneven: float
-    added_e: Floats
+    uneven: float  # greatest difference of two factors within one line
+    added_e: Floats  # light that is added
 
     @staticmethod
     def between(least: float, greatest: float, bands: int, *, uneven: float = 0.0) -> GainRange:

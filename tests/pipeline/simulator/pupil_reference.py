@@ -1,15 +1,15 @@
 """An independent reference with all effects on: the pupil's own integral, dense in frequency, instead of few kernels.
 
 The light of a sample of random tiles on even ground is summed over all waves that the pupil passes. The sum contains
-linear pixels, slit, pixel, held positions, blurs, and the autocorrelation of the elliptic pupil by quadrature. No
-kernel is fitted, no weight is tabulated, no tail is cut; only the geometry of rays is the renderer's. A tile repeats
-after `PERIOD_PX`, where almost nothing of the pattern is left.
+linear pixels, slit, pixel, held positions, blurs, and the autocorrelation of the elliptic pupil. No
+kernel is fitted, no weight is tabulated, no tail is cut; only the geometry of rays and the pupil's contrast, which a
+test transforms from the pattern, are the renderer's. A tile repeats after `PERIOD_PX`, where almost nothing of the
+pattern is left.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from spectralzoom.pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, D
 from spectralzoom.pipeline.simulator.effects.effect import Effect
 from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from spectralzoom.pipeline.simulator.effects.probe import noise_electrons
-from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views
+from spectralzoom.pipeline.simulator.optics.rays import RayViews, exact_views, pupil_contrast
 from spectralzoom.pipeline.simulator.render import expected_light
 from spectralzoom.pipeline.simulator.rig_model import Air, Optics, Rig
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
@@ -127,7 +127,7 @@ def _transfer(run: Floats, turn: Floats, rig: Rig, nm: Floats, normal: Floats, w
     """Return the transfer of pixel, slit, lens, disc and pupil for waves along and across the line, in camera px."""
     n_x, n_y, n_z = normal
     steep = (n_y * run + n_x * turn) / n_z
-    contrast = np.interp(waves * np.sqrt(run**2 + turn**2 + steep**2), *autocorrelation(), right=0.0)
+    contrast = pupil_contrast(waves * np.sqrt(run**2 + turn**2 + steep**2))
     blur = np.exp(-2 * np.pi**2 * rig.optics.aberration_px**2 * (run**2 + turn**2))
     shift = np.exp(2j * np.pi * float(keystone_shift(rig, nm)[0]) * run)
     disc = 1.0
@@ -137,15 +137,3 @@ def _transfer(run: Floats, turn: Floats, rig: Rig, nm: Floats, normal: Floats, w
         v = np.pi * wide * np.sqrt(np.maximum(run**2 + turn**2 - (n_y * run + n_x * turn) ** 2, 0.0))
         disc = np.where(v > 1e-6, 2 * j1(np.maximum(v, 1e-6)) / np.maximum(v, 1e-6), 1.0)
     return np.sinc(run) * np.sinc(rig.camera.slit_px * turn) * contrast * blur * shift * disc
-
-
-@cache
-def autocorrelation() -> tuple[Floats, Floats]:
-    """Return shifts u over a pupil's width, and a round pupil's overlap with its copy shifted by u, by quadrature."""
-    u = np.linspace(0, 1, 4001)
-    node, weight = np.polynomial.legendre.leggauss(400)
-    turn = (node + 1) * np.pi / 4  # heights of chords, dense near their ends
-    high = np.sqrt(1 - u**2)[:, None] / 2
-    chord = np.sqrt(np.maximum(0.25 - (high * np.sin(turn)) ** 2, 0)) * 2 - u[:, None]
-    area = (np.maximum(chord, 0) * high * np.cos(turn) * weight).sum(axis=1) * np.pi / 4 * 2
-    return u, area / (np.pi / 4)

@@ -22,6 +22,7 @@ from spectralzoom.pipeline.simulator.effects.probe import Probe
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
+from spectralzoom.pipeline.simulator.simulated import sweep_block
 
 Floats = NDArray[np.float64]
 LONG_PX, WIDE_PX = 640, 160  # of a scene
@@ -50,21 +51,10 @@ class Case:
 
     def blocks(self, probe: Probe) -> list[SweepBlock]:
         """Return the measured lines of every sweep: the first sweep starts the survey, the others end it."""
-        scene = self.scene
-        rig = self.rig
-        white = scene.white_reference_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-        ends = [0.0, *(probe.seconds - rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
+        ends = [0.0, *(probe.seconds - self.rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
         return [
-            SweepBlock(
-                rig,
-                sweep,
-                self.measured or range(sweep.lines),
-                scene.wavelength_nm,
-                scene.shape,
-                seed=self.seed,
-                started_s=start,
-                fwhm_nm=scene.fwhm_nm,
-                white_e=white,
+            sweep_block(
+                self.scene, self.rig, sweep, self.measured or range(sweep.lines), seed=self.seed, started_s=start
             )
             for sweep, start in zip(self.sweeps, ends, strict=True)
         ]
@@ -75,7 +65,7 @@ def random_case(number: int) -> Case:
     rng = np.random.default_rng([6, number])
     rig = random_rig(rng)
     upright = bool(rng.random() < 0.3)
-    scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
+    scene = _scene(rng, rig.camera, upright=upright)
     far = float(rng.choice([0.0, rng.uniform(-LONG_PX / 2 + 40, LONG_PX / 2 - 40)]))
     step = int(rng.choice([1, 1, 1, 4]))
     count = int(rng.integers(LINES[0], LINES[1] + 1))
@@ -89,9 +79,9 @@ def random_case(number: int) -> Case:
     return Case(scene, rig, sweeps, seconds, number)
 
 
-def _scene(rng: np.random.Generator, camera: LineCamera, *, upright: bool, long_px: int) -> RasterScene:
+def _scene(rng: np.random.Generator, camera: LineCamera, *, upright: bool) -> RasterScene:
     bands = int(rng.choice(BANDS))
-    planes = np.stack([_plane(rng, (long_px, WIDE_PX)) for _ in range(_COMPONENTS)], axis=-1)
+    planes = np.stack([_plane(rng, (LONG_PX, WIDE_PX)) for _ in range(_COMPONENTS)], axis=-1)
     planes = np.swapaxes(planes, 0, 1) if upright else planes
     nm = np.linspace(400.0, 1000.0, bands) if bands > 2 else np.linspace(550.0, 600.0, bands)
     brightest = float(np.exp(rng.uniform(np.log(50), np.log(20_000))))

@@ -141,7 +141,6 @@ def test_tails_of_diffraction_match_the_pupil() -> None:
     np.testing.assert_allclose(light, 2 / np.pi**3 * waves / (px[:, None]), rtol=0.25)
 
 
-CAMERA = LineCamera()
 FINE = Sweep("fine", "fine", "x", swath_px=900.0, start_px=-700.0, lines=20)
 PLAIN = {ROTATION: "rays", SMEAR: "positions", SLIT: "3x1"}
 

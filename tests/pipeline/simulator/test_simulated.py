@@ -20,7 +20,7 @@ from spectralzoom.pipeline.simulator.effects.counting import SHOT, dark_electron
 from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, STRIPING
 from spectralzoom.pipeline.simulator.rig_model import Detector, Rig, Sky
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block, sweep_starts
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
 from spectralzoom.pipeline.source import Source
 from tests.pipeline.simulator.small_scenes import effects_on, image_scene, made_scene
 
@@ -122,14 +122,6 @@ def test_sweep_ends_before_the_next_starts(sizes: list[int], step: int) -> None:
     starts = [*sweep_starts(sweeps, CAMERA, COST).values(), COST.seconds(sweeps, CAMERA) + 1e-9]
     for sweep, start, following in zip(sweeps, starts, starts[1:], strict=False):
         assert start + CAMERA.scan_seconds(sweep.lines) <= following
-
-
-def test_block_times_are_mid_exposure() -> None:
-    """Times count from the survey's start: line 3 of a sweep that starts after 60 s is exposed from 60.3 to 60.4 s."""
-    source = SimulatedSource(image_scene(np.ones((8, 8, 1)), CAMERA, [500.0]), Rig(CAMERA), clock={"a": 60.0})
-    sweep = Sweep("a", "fine", "x", 0.0, 0.0, 9)
-    block = sweep_block(source.scene, source.rig, sweep, range(3, 5), started_s=source.started_s(sweep))
-    assert block.time_s == pytest.approx([60.35, 60.45])
 
 
 def test_light_follows_the_clock() -> None:

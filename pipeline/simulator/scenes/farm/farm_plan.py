@@ -121,10 +121,7 @@ class Painting:
         return cls(plan, ground, Canvas(plan.shape, plan.materials))
 
     def drawn(self) -> Drawn:
-        """Return abundances (y, x, material), summing to 1, and the class that covers most of each pixel (y, x).
-
-        Shade replaces what a pixel lacks of full light.
-        """
+        """Return abundances (y, x, material), summing to 1 with the missing light as shade, and main classes (y, x)."""
         canvas, light = self.canvas, self.ground.light
         materials, classes = (one.reshape(*canvas.shape, -1) for one in (canvas.materials, canvas.classes))
         labels = np.empty(canvas.shape, np.uint8)

@@ -18,7 +18,7 @@ from spectralzoom.pipeline.simulator.optics.rays import pupil_contrast
 from spectralzoom.pipeline.simulator.render import expected_light
 from spectralzoom.pipeline.simulator.rig_model import Optics, Rig
 from tests.pipeline.simulator.made_up_effects import SWEEP, steep_probe
-from tests.pipeline.simulator.pupil_reference import autocorrelation, distances, random_tile
+from tests.pipeline.simulator.pupil_reference import distances, random_tile
 from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig()
@@ -111,12 +111,6 @@ def test_bound_covers_every_tilt_of_the_sweeps():
     steep, flat = (replace(SWEEP, start_px=start) for start in (4000.0, -5000.0))
     assert DIFFRACTION.bound(replace(probe, sweeps=(steep,)), RIG).value > rest
     assert DIFFRACTION.bound(replace(probe, sweeps=(flat,)), RIG).value == pytest.approx(rest, rel=2e-3)
-
-
-def test_quadrature_over_chords_matches_the_closed_form() -> None:
-    """The integrated contrast of a round pupil is Goodman's formula."""
-    u, passed = autocorrelation()
-    np.testing.assert_allclose(passed, pupil_contrast(u), atol=1e-6)
 
 
 @pytest.mark.parametrize(("number", "focus_m"), [(23, None), (32, math.inf)], ids=["sharp", "out of focus"])

@@ -27,9 +27,9 @@ def sweep_at(swath_px, start_px, lines, step=1):
 RIG = replace(rig_with(), mirror=MirrorMotion(coating="aluminium"))
 
 
-def factors(sweep, effect=POLARISATION, variant="exact", rig=RIG, nm=NM):
+def factors(sweep, effect=POLARISATION, rig=RIG, nm=NM):
     """Return the factor of every line, (line, band)."""
-    gain = effect.gain(SweepBlock(rig, sweep, range(sweep.lines), nm, (640, 640)), variant)
+    gain = effect.gain(SweepBlock(rig, sweep, range(sweep.lines), nm, (640, 640)), effect.variants[0])
     assert gain.shape == (sweep.lines, 1, len(nm))
     assert gain.dtype == np.float32
     return gain[:, 0].astype(np.float64)
@@ -60,20 +60,19 @@ VIGNETTING_RIG = Rig()
 VIGNETTING_NM = np.array([700.0])
 
 
-@pytest.mark.parametrize(("variant", "at"), [("held", "positions"), ("middle", "middle")])
-def test_vignetting_equals_the_throughput_of_the_calibration(variant, at):
+def test_vignetting_equals_the_throughput_of_the_calibration():
     """Lines are multiplied by the throughput that calibration divides by, at any place of the field."""
     sweep = sweep_at(-2300, 1700, 50, 4)
     block = SweepBlock(VIGNETTING_RIG, sweep, range(50), VIGNETTING_NM, (640, 640))
-    fractions = mirror_throughput(getattr(block, at)).reshape(50, -1)
-    found = factors(sweep, VIGNETTING, variant, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
+    fractions = mirror_throughput(block.positions).reshape(50, -1)
+    found = factors(sweep, VIGNETTING, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
     np.testing.assert_allclose(found, fractions.mean(axis=1), rtol=1e-7)
 
 
 def test_vignetting_changes_by_138_dn_over_640_lines():
     """The change is 3.4 %, 138 of 4095 DN (139 if rounded first); the bound counts the difference from rest."""
     sweep = sweep_at(0, -320, 640)
-    held = factors(sweep, VIGNETTING, "held", VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
+    held = factors(sweep, VIGNETTING, VIGNETTING_RIG, VIGNETTING_NM)[:, 0]
     assert 4095 * np.ptp(held) == pytest.approx(138.5, abs=0.5)
     flat = np.full((2, 8, 1), 10_000, np.float32)
     bound = VIGNETTING.bound(probe_of(flat, VIGNETTING_NM, "dn", sweep=sweep), VIGNETTING_RIG)

@@ -107,6 +107,3 @@ def test_coloured_edges_keep_the_stated_slope(px: float):
     blurred = sum(blur.bound(grey, COLOURED_RIG).value for blur in (DIFFRACTION, KEYSTONE))
     said = light_after(grey, RIG, [], blurred)
     assert (steepest_difference(light, NM).max(axis=0) <= said.spectral_slope).all()
-
-
-STORED_LIGHT_RIG = Rig()
