@@ -16,13 +16,13 @@ from scipy.ndimage import gaussian_filter
 
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
 from spectralzoom.pipeline.simulator.effects.probe import Probe
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Relief, Rig, Sky
-from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from spectralzoom.pipeline.simulator.simulated import sweep_block
+from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]
 LONG_PX, WIDE_PX = 640, 160  # of a scene
@@ -88,17 +88,9 @@ def _scene(rng: np.random.Generator, camera: LineCamera, *, upright: bool) -> Ra
     spectra = np.stack([_spectrum(rng, nm) for _ in range(_COMPONENTS)])
     spectra *= brightest / np.einsum("yxc,cb->yxb", planes[::4, ::4], spectra).max()
     at_default = (DEFAULT_EXPOSURE_MS / camera.exposure_ms * spectra).astype(np.float32)
-    white_reference = (at_default.sum(axis=0) * rng.uniform(0.5, 2)).astype(np.float32)
+    white = at_default.sum(axis=0) * rng.uniform(0.5, 2)
     width = rng.choice([0.0, 2.0, 6.0])
-    return RasterScene(
-        "random",
-        "random",
-        SceneRaster.of(np.ascontiguousarray(planes, np.float32)),
-        Once.of(SceneRadiance(at_default, white_reference)),
-        np.ones(bands, np.float32),
-        nm,
-        fwhm_nm=np.full(bands, width) if width else None,
-    )
+    return made_scene(planes, at_default, nm, white, fwhm_nm=np.full(bands, width) if width else None)
 
 
 def _plane(rng: np.random.Generator, shape: tuple[int, int]) -> Floats:

@@ -22,11 +22,13 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadia
 from spectralzoom.pipeline.simulator.selection import survey_probe
 
 
-def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
+def made_scene(
+    planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, white: ArrayLike | None = None, **more: Any
+) -> RasterScene:
     """Return a scene of planes (y, x, component) and electrons (component, band); white is their maximum."""
     light = np.asarray(electrons, np.float32)
-    white = light if light.ndim == 1 else light.max(axis=0)
-    radiance = Once.of(SceneRadiance(light, white))
+    brightest = light if light.ndim == 1 else light.max(axis=0)
+    radiance = Once.of(SceneRadiance(light, brightest if white is None else np.asarray(white, np.float32)))
     nm = np.asarray(wavelength_nm, np.float64)
     raster = SceneRaster.of(np.ascontiguousarray(planes, np.float32))
     return RasterScene("made", "made", raster, radiance, np.ones(len(nm), np.float32), nm, **more)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.rig_model import Rig
-from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from tests.pipeline.simulator.random_cases import Case, random_rig
+from tests.pipeline.simulator.small_scenes import made_scene
 
 Floats = NDArray[np.float64]
 SHAPE = (150, 130)  # of a scene [px]
@@ -48,15 +48,8 @@ def _scene(rng: np.random.Generator, values: Floats, rig: Rig) -> RasterScene:
     brightest = float(np.exp(rng.uniform(np.log(500), np.log(20_000)))) * DEFAULT_EXPOSURE_MS / rig.camera.exposure_ms
     light = np.full(bands, brightest / max(values.max(), 1e-9), np.float32)
     nm = np.linspace(400.0, 1000.0, bands) if bands > 1 else np.array([600.0])
-    return RasterScene(
-        "sparse",
-        "sparse",
-        SceneRaster.of(np.ascontiguousarray(values, np.float32)),
-        Once.of(SceneRadiance(light, light * np.float32(values.max()))),
-        np.ones(bands, np.float32),
-        nm,
-        fwhm_nm=None if rng.random() < 0.5 else np.full(bands, 2.0),
-    )
+    fwhm_nm = None if rng.random() < 0.5 else np.full(bands, 2.0)
+    return made_scene(values, light, nm, light * np.float32(values.max()), fwhm_nm=fwhm_nm)
 
 
 def _cube(rng: np.random.Generator, kind: str) -> Floats:

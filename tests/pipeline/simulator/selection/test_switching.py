@@ -11,16 +11,15 @@ import pytest
 
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.pipeline.once import Once
 from spectralzoom.pipeline.simulator.effects.probe import Probe, noise_electrons
 from spectralzoom.pipeline.simulator.render import EFFECTS, expected_light
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, SceneRadiance, SceneRaster
+from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.selection.choice import Decision, decide
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
 from spectralzoom.pipeline.simulator.simulated import sweep_block
 from tests.pipeline.simulator.bound_trials import ROUNDING, misplaced_fraction
-from tests.pipeline.simulator.small_scenes import looking_at_less
+from tests.pipeline.simulator.small_scenes import looking_at_less, made_scene
 
 TOLERANCE = 0.1
 CAMERA = LineCamera()
@@ -50,9 +49,8 @@ def scene_of(case: Case) -> RasterScene:
     if case.roof_e:
         plane[490:510, 70:90] = case.roof_e
     spectra = np.full((1, 3), DEFAULT_EXPOSURE_MS / case.rig.camera.exposure_ms, np.float32)
-    light = SceneRadiance(spectra, 2 * case.electrons * spectra[0])  # the scene reflects about half
-    raster = SceneRaster.of(plane[..., None].astype(np.float32))
-    return RasterScene("case", "case", raster, Once.of(light), np.ones(3, np.float32), WAVELENGTHS)
+    white = 2 * case.electrons * spectra[0]  # the scene reflects about half
+    return made_scene(plane[..., None], spectra, WAVELENGTHS, white)
 
 
 @cache
