@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Literal
 
 from spectralzoom.pipeline.errors import SettingsError
@@ -164,8 +164,3 @@ class Rig:
         """Return nearest and farthest part of the scene [m]; None for a scene without a distance."""
         air = self.air
         return None if air.distance_m is None else (air.nearest_m or air.distance_m, air.farthest_m or air.distance_m)
-
-    def moment(self, seconds: float) -> datetime | None:
-        """Return time of day so many seconds after the survey's start; None where it has none."""
-        started = self.sky.started
-        return None if started is None else datetime.fromtimestamp(started.timestamp() + seconds, UTC)

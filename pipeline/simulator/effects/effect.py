@@ -38,13 +38,8 @@ class Bound:
 class Effect(Protocol):
     """Interface of an effect to the decision, by name. Variants go from exact to cheap; off is none of them."""
 
-    @property
-    def name(self) -> str:
-        """Return the effect's name in flags, manifest and streams."""
-
-    @property
-    def cost_ns(self) -> Mapping[str, float]:
-        """Return measured cost of each variant per px and band, the exact one first [ns]."""
+    name: str  # in flags, manifest and streams
+    cost_ns: Mapping[str, float]  # measured cost of each variant per px and band, the exact one first [ns]
 
     @property
     def variants(self) -> tuple[str, ...]:
