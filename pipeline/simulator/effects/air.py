@@ -38,6 +38,7 @@ RISK = 1e-3  # fraction of the surveys in which a line may stray further than th
 _REST = math.sqrt(0.5)
 GUST_M = 3.0  # length of the waves that run over a canopy; assumed
 FARTHEST_M = 1e7  # infinity: nothing passes so much air
+NOTHING = (0.0, 0.0)  # reach of air before a scene without a distance
 
 
 class Turbulence(Aim):
@@ -244,10 +245,7 @@ class Absorption(Gain):
         return Bound(probe.scaled(fraction), f"oxygen and water vapour take at most {most} over {format_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
-        reach = reach_m(rig)
-        if reach is None:
-            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
-        passed = transmission(np.array(reach), rig, probe.wavelength_nm)
+        passed = transmission(np.array(reach_m(rig) or NOTHING), rig, probe.wavelength_nm)
         return GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Radiance:
@@ -255,9 +253,7 @@ class Absorption(Gain):
 
         Every sample's is read off a table over the logarithm of the distance, by straight lines.
         """
-        reach = reach_m(block.rig)
-        if reach is None:
-            return np.ones((1, 1, 1), np.float32)
+        reach = reach_m(block.rig) or NOTHING
         if reach[0] == reach[1]:
             return transmission(np.array(reach[:1]), block.rig, block.wavelength_nm)[:, None].astype(np.float32)
         table = transmission(np.geomspace(*reach, _KNOTS), block.rig, block.wavelength_nm).astype(np.float32)
@@ -311,10 +307,7 @@ class PathRadiance(LightChange):
 
         Added light is the airlight's fraction of the white reference's, times what the daylight grows by.
         """
-        reach = reach_m(rig)
-        if reach is None:
-            return GainRange.between(1.0, 1.0, len(probe.wavelength_nm))
-        passed = np.exp(-np.array(reach)[:, None] * extinction_per_m(rig.air, probe.wavelength_nm))
+        passed = np.exp(-np.array(reach_m(rig) or NOTHING)[:, None] * extinction_per_m(rig.air, probe.wavelength_nm))
         alone = GainRange.of(passed, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
         most = DRIFT.gain_range(probe, rig).greatest.max(initial=1.0)
         return replace(alone, added_e=rig.air.airlight_fraction * probe.white_e * (1 - passed[1]) * most)

@@ -11,7 +11,7 @@ from spectralzoom.pipeline.geometry.camera import LineCamera, footprint_kernel
 from spectralzoom.pipeline.geometry.mirror import position_to_direction
 from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
 from spectralzoom.pipeline.simulator.effects.effect import SweepBlock
-from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, smeared_positions
+from spectralzoom.pipeline.simulator.effects.line import ROTATION, SLIT
 from spectralzoom.pipeline.simulator.render import expected_light
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_scene
@@ -36,15 +36,6 @@ def test_point_is_spread_by_the_closed_form_of_the_box(variant: str) -> None:
     down, across = len(slit) // 2, len(pixel) // 2
     got = light[16 - down : 17 + down, 30 - across : 31 + across]
     np.testing.assert_allclose(got, np.outer(slit, pixel), atol=3e-5)
-
-
-def test_lines_with_one_position_have_no_smear() -> None:
-    """Fine lines stand still: the bound is 0 and the position is that of mid-exposure."""
-    sweep = Sweep("s", "fine", "x", swath_px=0.0, start_px=0.0, lines=4)
-    scene = image_scene(np.random.default_rng(0).uniform(0, 1, (30, 60, 1)), RIG.camera, [550.0])
-    assert SMEAR.bound(probe_scene(scene, RIG, [sweep]), RIG).value == 0
-    block = SweepBlock(RIG, sweep, range(4), scene.wavelength_nm, scene.shape)
-    np.testing.assert_array_equal(smeared_positions(block, "positions"), block.middle[:, None])
 
 
 def test_folded_smear_counts_motion_within_an_exposure() -> None:
