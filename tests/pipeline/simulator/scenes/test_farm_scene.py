@@ -9,22 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES, farm_plan
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from spectralzoom.pipeline.simulator.scenes.farm.spectra import MATERIALS
-from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 SIZE, LONG, WIDE = (420, 520), (400, 1000), (720, 1000)
-
-
-def labels_of(scene: RasterScene) -> NDArray[np.uint8]:
-    """Return the labels, which every farm has."""
-    assert scene.labels is not None
-    return scene.labels
 
 
 @pytest.mark.parametrize(
@@ -38,7 +30,7 @@ def labels_of(scene: RasterScene) -> NDArray[np.uint8]:
 def test_law_gives_the_same_farms(seed: int, when: dict[str, Any], labels: str, mixed: float, lit: float) -> None:
     """Land, days, hours and spectra of law farm@2 match stored values: labels by their hash, the rest by sums."""
     scene = farm_scene(seed, (160, 200), bands=5, **when)
-    assert hashlib.sha256(labels_of(scene).tobytes()).hexdigest().startswith(labels)
+    assert hashlib.sha256(scene.labels.tobytes()).hexdigest().startswith(labels)
     sums = [float(one.ravel() @ np.cos(np.arange(one.size))) for one in (scene.planes, scene.electrons)]
     assert sums == pytest.approx([mixed, lit], abs=2e-3)
 
@@ -52,7 +44,7 @@ def test_abundances_are_fractions(seed: int, height: int, width: int, day: int) 
     assert scene.planes.shape[2] <= 40
     assert scene.planes.min() >= 0
     np.testing.assert_allclose(scene.planes.sum(axis=-1), 1, atol=2e-6)
-    assert labels_of(scene).max() < len(CLASSES)
+    assert scene.labels.max() < len(CLASSES)
 
 
 def test_key_contains_law_and_day() -> None:
@@ -74,7 +66,7 @@ def test_land_is_the_same_on_another_day() -> None:
         np.testing.assert_array_equal(one.parcel.corners, other.parcel.corners)
         assert (one.use, one.row_angle_deg, one.row_period_px) == (other.use, other.row_angle_deg, other.row_period_px)
     assert [kind for _, kind in june.borders] == [kind for _, kind in april.borders]
-    scenes = [labels_of(farm_scene(4, SIZE, bands=2, day=day)) for day in (110, 172)]
+    scenes = [farm_scene(4, SIZE, bands=2, day=day).labels for day in (110, 172)]
     for label in ("tree", "water"):
         masks = [scene == CLASSES.index(label) for scene in scenes]
         assert (masks[0] & masks[1]).sum() > 0.75 * (masks[0] | masks[1]).sum()

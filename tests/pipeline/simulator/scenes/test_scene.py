@@ -26,6 +26,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import (
     raster_from_values,
     scratch,
 )
+from tests.pipeline.simulator.small_scenes import made_scene
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)
@@ -120,10 +121,9 @@ def test_scene_returns_the_values_it_was_made_of() -> None:
     """A scene made of values returns them; a scene of components returns their mixture."""
     scene = raster_from_values(picture(), CAMERA, name="p", wavelength_nm=WAVELENGTH)
     np.testing.assert_allclose(scene.values(), picture(), rtol=1e-6)
-    raster = SceneRaster.of(np.ones((4, 5, 3), np.float32))
-    light = Once.of(SceneRadiance(np.full((3, 2), 100, np.float32), np.full(2, 200, np.float32)))
-    mixed = RasterScene("m", "k", raster, light, np.full(2, 0.5, np.float32), WAVELENGTH)
-    np.testing.assert_allclose(mixed.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
+    mixed = made_scene(np.ones((4, 5, 3)), np.full((3, 2), 100), WAVELENGTH, white=np.full(2, 200))
+    half = replace(mixed, white_reference=np.full(2, 0.5, np.float32))
+    np.testing.assert_allclose(half.values(), np.full((4, 5, 2), 300 / 200 * 0.5))
 
 
 def test_gaps_are_filled_and_counted() -> None:
@@ -211,9 +211,7 @@ def test_pixels_without_most_bands_are_missing_and_unlabelled() -> None:
     labels = np.zeros((4, 5), np.uint8)
     values[0, 0], values[1, 1, 0], values[2, 2] = np.nan, np.nan, np.inf
     scene = raster_from_values(values, CAMERA, name="p", wavelength_nm=WAVELENGTH, labels=labels)
-    assert scene.missing is not None
     assert np.argwhere(scene.missing).tolist() == [[0, 0], [2, 2]]
-    assert scene.labels is not None
     assert np.argwhere(scene.labels == 255).tolist() == [[0, 0], [2, 2]]
     assert scene.filled_px == 3
     assert not labels.any()

@@ -15,7 +15,6 @@ from spectralzoom.pipeline.simulator.scenes.built_in import (
     scouting_scene,
 )
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASS_COLOURS, CLASSES
-from tests.pipeline.simulator.scenes.test_farm_scene import labels_of
 
 SIZE = (320, 400)
 SEEDS = (0, 1, 2, 3, 33)
@@ -39,7 +38,7 @@ def test_land_is_the_same_on_another_day() -> None:
     for name, cover in patches[0].items():
         np.testing.assert_array_equal(cover, patches[1][name])
     for day in (140, 172, 190):
-        bare = labels_of(scouting_scene(5, SIZE, 2, day=day))[patches[0]["bare"] > 0.9]
+        bare = scouting_scene(5, SIZE, 2, day=day).labels[patches[0]["bare"] > 0.9]
         assert (bare == CLASSES.index("soil")).mean() > 0.97
 
 
@@ -75,7 +74,7 @@ def test_classes_are_those_of_the_farm() -> None:
         scene = scouting_scene(seed, SIZE, 2)
         assert scene.class_names == CLASSES
         np.testing.assert_array_equal(scene.class_colours, CLASS_COLOURS)
-        shares = {name: float((labels_of(scene) == number).mean()) for number, name in enumerate(CLASSES)}
+        shares = {name: float((scene.labels == number).mean()) for number, name in enumerate(CLASSES)}
         crop = scouting_plan(seed, SIZE, day=172, hour=11.0).fields[0].use
         uses.add(crop)
         assert shares[crop] > 0.8
