@@ -32,7 +32,7 @@ Raw = NDArray[np.uint16]
 REFERENCE_FRAMES = 32  # of whole numbers, of which a dark or white frame is the mean
 BLOCK_LINES = 16  # rendered at a time: 11 MB of light with 640 samples and 270 bands
 Frame = NDArray[np.float32]
-SEEN = frozenset({RESPONSE.name, SMILE.name, PRNU.name, STRIPING.name})  # by light of the white reference
+SEEN = frozenset({RESPONSE, SMILE, PRNU, STRIPING})  # by light of the white reference
 
 
 @dataclass(frozen=True)
@@ -128,13 +128,11 @@ class SimulatedSource:
         block = sweep_block(self.scene, rig, AT_REST, range(1))
         dark = dark_frame(block, self.effects)
         light = np.full((1, rig.camera.samples, len(block.wavelength_nm)), block.white_e, np.float32)
-        for effect, variant in self.effects.items():
-            if effect.name not in SEEN:
-                continue
+        for effect in (one for one in self.effects if one in SEEN):
             if hasattr(effect, "gain"):
-                light = light * effect.gain(block, variant)
-            elif hasattr(effect, "change"):
-                light = effect.change(light, block, variant)
+                light = light * effect.gain(block, self.effects[effect])
+            else:
+                light = effect.change(light, block, self.effects[effect])
         seen: Frame = light[0]
         bad = None
         if DEFECTS in self.effects:

@@ -26,7 +26,7 @@ UNIT_NAMES: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
 
 @dataclass(frozen=True)
 class Treatment:
-    """Option taken. ``small``: off within the tolerance; ``needed``: beyond it alone; ``spent``: with others."""
+    """Option taken. ``small``: off within the tolerance; ``needed``: beyond it alone; ``spent``: with the others."""
 
     menu: Menu
     option: Option
