@@ -25,12 +25,11 @@ from spectralzoom.flows.training.data import (
     open_training_data,
     scene_notes,
 )
-from spectralzoom.flows.training.observed_scenes import observe_scene
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.spectral import patches_of
 from spectralzoom.models.policies.policies import POLICIES
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
-from spectralzoom.models.training.examples import normalised
+from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
 from spectralzoom.models.weights.files import Description, Weights, describe_weights
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.terminal.figures import counted
 from spectralzoom.flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
-from spectralzoom.flows.training.observed_scenes import observe_scene
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import Example, normalised
+from spectralzoom.models.training.examples import Example, normalised, observe_scene
 from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
