@@ -108,7 +108,6 @@ class Candidate:
 class ObservedFrame:
     """One frame in the spectral features of some weights, with their coarse prediction."""
 
-    name: str
     seen: CoarsePrediction
     fine: NDArray[np.float32]  # (patch, p, p, column) normalised, every patch of the padded grid
     labels: NDArray[np.uint8]  # (y, x) in the weights' classes
@@ -165,7 +164,7 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     assert labels is not None  # sort_frames
     seen = coarse_prediction_of_columns(weights, example.columns, grid)
     fine = patches_of(example.columns, config.patch).astype(np.float32)
-    return ObservedFrame(name, seen, fine, labels, len(scene.wavelength_nm))
+    return ObservedFrame(seen, fine, labels, len(scene.wavelength_nm))
 
 
 @dataclass(frozen=True)
