@@ -118,10 +118,11 @@ def _choices(folder: Path) -> dict[str, Any]:
 
 def _open(folder: Path) -> Split:
     files = load_data_set(folder / SCENE, **_choices(folder))
-    train, test = files.load(Path(SCENE).stem, "train"), files.load(Path(SCENE).stem, "test")
+    train, every = (files.load(Path(SCENE).stem, training=part) for part in (True, False))
     assert train.labels is not None
-    assert test.labels is not None
-    return Split(np.asarray(train.values, np.float32), train.labels, test.labels, len(train.class_names))
+    assert every.labels is not None
+    test = np.where(train.labels == UNLABELLED, every.labels, np.uint8(UNLABELLED))
+    return Split(np.asarray(train.values, np.float32), train.labels, test, len(train.class_names))
 
 
 def halves(labels: Labels) -> NDArray[np.int64]:
