@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import Row, data_folder, not_run
+from measure import Row, data_folder, not_run, print_rows
 from numpy.typing import NDArray
 from scipy.ndimage import label, uniform_filter
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
@@ -237,15 +237,7 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
     return found
 
 
-def main() -> int:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
     parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
-    flags = parser.parse_args()
-    for row in rows(flags.weights):
-        met = {True: "met", False: "NOT met", None: ""}[row.met]
-        print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    print_rows(rows(parser.parse_args().weights))

@@ -101,6 +101,13 @@ def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
+def print_rows(rows: Sequence[Row]) -> None:
+    """Print one row a line."""
+    for row in rows:
+        met = {True: "met", False: "NOT met", None: ""}[row.met]
+        print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
+
+
 def markdown_lines(cells: Sequence[Sequence[str]]) -> list[str]:
     """Return the rows as lines of a Markdown table."""
     lines = [f"| {' | '.join(text.replace('|', chr(92) + '|') for text in row)} |" for row in cells]
