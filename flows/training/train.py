@@ -29,7 +29,7 @@ from spectralzoom.flows.training.train_scenes import Scenes, TrainRequest, netwo
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.policies.placement import CascadeTable
-from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
 from spectralzoom.models.training.train import PIXELS, LabelledPixels, linear_classifier, train
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
@@ -68,8 +68,8 @@ def train_weights(
     begun = None if request.start is None else load_weights(request.start)
     device = choose_device(request.device)
     settings = request.settings
-    hold_out = {"hold_out": request.hold_out, **request.choices}
-    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **hold_out)
+    choices = {"hold_out": request.hold_out, **request.choices}
+    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **choices)
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
@@ -79,12 +79,12 @@ def train_weights(
         check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    weights, training = _learned(request, scenes, normalisation, begun, checkpoint, device, report)
-    trained = _trained_on(data, scenes, settings.darkest_ms)
+    augmentation = training_capture(normalisation, settings.darkest_ms)
+    weights, training = _learned(request, scenes, normalisation, augmentation, begun, checkpoint, device, report)
     record = {
         "command": request.command,
         "data": data.law,
-        TRAINED_ON: trained.as_dict(),
+        TRAINED_ON: asdict(_trained_on(data, scenes, settings.darkest_ms)),
         "split": scenes.split | {"held_out": list(data.held_out)},
         "settings": asdict(settings),
         "camera": asdict(request.camera),
@@ -92,13 +92,8 @@ def train_weights(
         **({} if begun is None else {"started_from": begun.record.get("command", "")}),
         **training,
     }
-    scans = judge_scans(
-        with_record(weights, **record),
-        scenes.validation.examples,
-        training_capture(normalisation, settings.darkest_ms),
-        settings.seed,
-        report,
-    )
+    frames = scenes.validation.examples
+    scans = judge_scans(with_record(weights, **record), frames, augmentation, settings.seed, report)
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
@@ -110,22 +105,22 @@ def train_weights(
 
 def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
+    farm: dict[str, Any] = {}
+    if data.files is None:
+        moments = [read_farm_name(name)[1:] for name in data.train]
+        days = [day for day, _ in moments]
+        heights = [sun_over_farm(*moment).elevation_deg for moment in moments]
+        farm = {"day": (min(days), max(days)), "sun_elevation_deg": (min(heights), max(heights))}
+        farm["ground_pixel_m"] = FARM_PIXEL_M
     nm = scenes.common.wavelength_nm
-    trained = TrainedOn(
+    return TrainedOn(
         bands=len(nm),
         wavelength_nm=(float(nm.min()), float(nm.max())),
         exposure_ms=(min_exposure_ms, max(min_exposure_ms, data.camera.exposure_ms)),
         scenes=len(data.train),
         classes=scenes.common.names,
         bands_nm=tuple(nm.tolist()),
-    )
-    if data.files is not None:
-        return trained
-    moments = [read_farm_name(name)[1:] for name in data.train]
-    days = [day for day, _ in moments]
-    heights = [sun_over_farm(*moment).elevation_deg for moment in moments]
-    return replace(
-        trained, day=(min(days), max(days)), sun_elevation_deg=(min(heights), max(heights)), ground_pixel_m=FARM_PIXEL_M
+        **farm,
     )
 
 
@@ -156,6 +151,7 @@ def _learned(
     request: TrainRequest,
     scenes: Scenes,
     normalisation: Normalisation,
+    augmentation: CaptureAugmentation | None,
     begun: Weights | None,
     checkpoint: Path,
     device: str,
@@ -167,7 +163,6 @@ def _learned(
     examples = scenes.train.examples
     config = network_config(request, common)
     rng = np.random.default_rng([0x1DA])
-    augmentation = training_capture(normalisation, settings.darkest_ms)
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
     start = linear_classifier(pixels, config.classes) | (load_encoder() if config.deep else {})
     model, summary = train(
