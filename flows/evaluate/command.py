@@ -42,10 +42,8 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     with StageProgress(console) as progress:
         content = evaluate_weights(request, progress.show)
     put_out(content, print_evaluation, as_json=as_json)
-    for note in content["data_notes"]:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for path in content["files"]:
-        console.print(path, markup=False, soft_wrap=True)
+    for line in (*(f"note: {note}" for note in content["data_notes"]), *content["files"]):
+        show_text(line, console)
     return content
 
 

@@ -176,6 +176,23 @@ class Jobs:
     notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
 
+def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]:
+    """Return the indices of the weights that were not trained on a scene, or not on the same pixels of it."""
+    for one in weights:
+        check_labels(scene, one.described)
+    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
+    fit = tuple(
+        at
+        for at, one in enumerate(weights)
+        if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
+    )
+    masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
+    if other := next((at for at, mask in zip(fit, masks, strict=True) if mask != masks[0]), None):
+        both = f"{weights[other].path} and {weights[fit[0]].path}"
+        raise SettingsError(f"{both} were trained on different pixels of {scene.name}; evaluate them separately")
+    return fit
+
+
 def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
     """Assign to each frame the weights that were not trained on it.
 
@@ -188,7 +205,6 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     regridded: list[str] = []
     validated: list[str] = []
     labelled = False
-    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
         try:
@@ -202,30 +218,16 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
             )
         if (alone := only_class(scene)) is not None:
             alike[name] = alone
-        for one in weights:
-            check_labels(scene, one.described)
-        fit = [
-            at
-            for at, one in enumerate(weights)
-            if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
-        ]
+        fit = _judges(scene, weights)
         if not fit:
             jobs.left_out.append(name)
             continue
-        first = weights[fit[0]]
-        masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
-        for one, mask in zip((weights[at] for at in fit), masks, strict=True):
-            if mask != masks[0]:
-                raise SettingsError(
-                    f"{one.path} and {first.path} were trained on different pixels of {scene.name}; evaluate them "
-                    "separately"
-                )
-        jobs.frames[name] = tuple(fit)
+        jobs.frames[name] = fit
         if any(weights[at].validated_on(scene) for at in fit):
             validated.append(name)
         if scene.regridded:
             regridded.append(name)
-        labels = judged_labels(scene, first.described)
+        labels = judged_labels(scene, weights[fit[0]].described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
     if jobs.left_out and (request.frames or not jobs.frames):

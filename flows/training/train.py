@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import shlex
-import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 from spectralzoom.flows.tasks.scene import masks_contain
-from spectralzoom.flows.terminal.progress import one_after_the_other, table
+from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
 from spectralzoom.flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
 from spectralzoom.flows.training.figures import (
     FEW_PIXELS,
@@ -197,11 +196,8 @@ def _learned(
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; print and return the record."""
     check_counts(request)
-    request = replace(request, command=request.command or asked_command())
     with one_after_the_other(console) as report:
-        record = train_weights(
-            request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
-        )
+        record = train_weights(request, report, lambda note: show_text(f"note: {note}", console))
     _print_figures(record, request, console)
     return record
 
@@ -218,48 +214,34 @@ def check_counts(request: TrainRequest) -> None:
         if number is not None and number < 0:
             raise SettingsError(f"{name} must be 0 or more, got {number}")
     if not 0 < settings.darkest_ms <= REFERENCE_MS:
-        raise SettingsError(
-            f"--min-exposure-ms must be above 0 and at most {REFERENCE_MS:g}, the reference exposure, got"
-            f" {settings.darkest_ms}"
-        )
-
-
-def asked_command() -> str:
-    """Return the command without folders, for the record."""
-    return shlex.join(["spectralzoom", *[Path(word).name if "/" in word else word for word in sys.argv[1:]]])
+        limits = f"above 0 and at most {REFERENCE_MS:g}, the reference exposure"
+        raise SettingsError(f"--min-exposure-ms must be {limits}, got {settings.darkest_ms}")
 
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
-    out = request.out
-    steps = record["training"]["steps"]
-    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
+    size_mb = request.out.stat().st_size / 1e6
+    show_text(f"weights: {request.out} ({size_mb:.1f} MB), {record['training']['steps']} steps", console)
     readings = record["readings"]
     of_readings, of_baselines = (
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         for scores in (readings["miou"], record["baselines"] or {})
     )
     text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
-    console.print(f"{text}kept: {readings['kept']}", soft_wrap=True)
+    show_text(f"{text}kept: {readings['kept']}", console)
+    judged = "mIoU of classifiers of a random half of the training pixels, on the other half"
+    if of_readings:
+        judged = f"on at most {PIXELS} of their pixels at full exposure"
     if of_baselines:
-        console.print(
-            f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}"
-            if of_readings
-            else f"mIoU of classifiers of a random half of the training pixels, on the other half: {of_baselines}",
-            soft_wrap=True,
-        )
+        show_text(f"{judged}: {of_baselines}", console)
     figures = record["validation"]
     if figures is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"
-        console.print(
-            "no scene was kept for validation; to judge the weights on other scenes: "
-            f"{shlex.join(['spectralzoom', 'evaluate', str(on), '--weights', str(out)])}"
-            + ("" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"),
-            markup=False,
-            soft_wrap=True,
-        )
+        command = shlex.join(["spectralzoom", "evaluate", on, "--weights", str(request.out)])
+        more = "" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"
+        show_text(f"no scene was kept for validation; to judge the weights on other scenes: {command}{more}", console)
         if request.settings.darkest_ms < REFERENCE_MS:
-            console.print("the file has no scan performance, by which survey --seconds chooses", soft_wrap=True)
+            show_text("the file has no scan performance, by which survey --seconds chooses", console)
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
     rows = [

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from spectralzoom.flows.terminal.progress import one_after_the_other
+from spectralzoom.flows.terminal.progress import one_after_the_other, show_text
 from spectralzoom.flows.training.data import Report, check_out
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou
 from spectralzoom.models.network.spectral import LineSpec
@@ -181,9 +181,7 @@ def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``, and return the record of the file."""
     with one_after_the_other(console) as report:
         record = train_temporal(request, report)
-    console.print(
-        f"weights with a temporal reader: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
-    )
+    show_text(f"weights with a temporal reader: {request.out}, {record['steps']} steps", console)
     title = f"mIoU on {JUDGED_LANDS} lands that training did not see"
     table = Table("days later", *MAPS.values(), title=title)
     for row in record["validation"]:
