@@ -132,7 +132,9 @@ class TrainFlags(SceneFlags):
 
     def request(self, dataset: str, out: Path, command: str) -> TrainRequest:
         """Return the request of a training of all weights. Raises SettingsError: numbers are invalid."""
+        same = {name: getattr(self, name) for name in ("steps", "minutes", "seed", "crop", "batch")}
         usual = TrainingSettings.learning_rate / (3 if self.start else 1)
+        rate = usual if self.learning_rate is None else self.learning_rate
         return TrainRequest(
             dataset,
             out,
@@ -142,15 +144,7 @@ class TrainFlags(SceneFlags):
             self.patch,
             tokens={"dim": self.dim, "heads": self.heads} | ({} if self.layers is None else {"layers": self.layers}),
             choices=self.choices(),
-            settings=TrainingSettings(
-                steps=self.steps,
-                minutes=self.minutes,
-                seed=self.seed,
-                crop=self.crop,
-                batch=self.batch,
-                darkest_ms=self.min_exposure_ms,
-                learning_rate=usual if self.learning_rate is None else self.learning_rate,
-            ),
+            settings=TrainingSettings(**same, darkest_ms=self.min_exposure_ms, learning_rate=rate),
             command=command,
             device=self.device,
             start=self.start,

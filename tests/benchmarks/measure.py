@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import gc
 import math
-import multiprocessing
 import os
 import statistics
 import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TypeVar
 
 ROOT = Path(__file__).resolve().parents[2]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -79,12 +75,6 @@ def ratio(clocks: Mapping[str, Timing], of: str, to: str) -> float:
 def ns_of(clock: Timing, values: float) -> float:
     """Return the least processor time per value. [ns]"""
     return clock.cpu_min_s / values * 1e9
-
-
-def alone(call: Callable[..., T], *given: object) -> T:
-    """Call a function in a separate process, with its own memory and settings."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(call, *given).result()
 
 
 def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
