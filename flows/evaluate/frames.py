@@ -19,7 +19,7 @@ from spectralzoom.flows.tasks.scene import check_labels, judged_labels, seen_in_
 from spectralzoom.flows.training.data import (
     Report,
     TrainingData,
-    alike_notes,
+    alike_note,
     farm_test_data,
     only_class,
     open_training_data,
@@ -200,7 +200,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     SettingsError: weights were trained on different pixels of a frame.
     """
     jobs = Jobs()
-    alike: dict[str, str] = {}
+    alike: dict[str, list[str]] = {}  # by their class
     empty: list[str] = []
     regridded: list[str] = []
     validated: list[str] = []
@@ -217,7 +217,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
                 f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
         if (alone := only_class(scene)) is not None:
-            alike[name] = alone
+            alike.setdefault(alone, []).append(name)
         fit = _judges(scene, weights)
         if not fit:
             jobs.left_out.append(name)
@@ -238,7 +238,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
-    notes = [*alike_notes(alike), *scene_notes(empty, regridded)]
+    notes = [*(alike_note(*one) for one in alike.items()), *scene_notes(empty, regridded)]
     if validated:
         notes.append(
             f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"

@@ -14,15 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.evaluate.frames import EvaluateRequest, ObservedFrame
-from spectralzoom.models.evaluation.metrics import (
-    average_accuracy,
-    confusion,
-    false_pixels,
-    iou_per_class,
-    kappa,
-    mean_iou,
-    overall_accuracy,
-)
+from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.network.sizes import multiply_adds
 from spectralzoom.models.policies.placement import mixed
 from spectralzoom.models.policies.policies import score_multiply_adds, score_patches
@@ -62,7 +54,7 @@ def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights
     rows = {}
     for (policy, fraction), draws in chosen.items():
         maps = [mixed(overview, full, np.isin(every, some), grid) for some in draws]
-        counts = np.array([confusion(frame.labels, drawn, config.classes) for drawn in maps])
+        counts = np.array([metrics.confusion(frame.labels, drawn, config.classes) for drawn in maps])
         scored = 0 if policy in ENDS else score_multiply_adds(policy, config, grid)
         spent = multiply_adds(config, grid, len(draws[0]), frame.bands, score=scored).total
         rows[policy, fraction] = Row(counts, len(draws[0]), spent)
@@ -129,19 +121,19 @@ def _accuracy(counts: Counts, class_names: Sequence[str]) -> dict[str, Any]:
         """Return a figure of the summed counts, (seed, draw) or (seed, draw, class)."""
         return np.array([[figure(run.sum(axis=0)) for run in seed] for seed in counts])
 
-    miou = each(mean_iou)
+    miou = each(metrics.mean_iou)
     seeds = [_mean(draws) for draws in miou]
     repeats = seeds if len(seeds) > 1 else miou[0]
-    classes = np.moveaxis(each(iou_per_class), 2, 0)
-    false = each(false_pixels).mean(axis=(0, 1)).tolist()
+    classes = np.moveaxis(each(metrics.iou_per_class), 2, 0)
+    false = each(metrics.false_pixels).mean(axis=(0, 1)).tolist()
     return {
         "frames": counts.shape[2],
         "miou": _mean(miou),
         "spread": float(np.std(repeats, ddof=1)) if len(repeats) > 1 else None,
         "by_seed": seeds,
-        "pixel_accuracy": _mean(each(overall_accuracy)),
-        "average_accuracy": _mean(each(average_accuracy)),
-        "kappa": _mean(each(kappa)),
+        "pixel_accuracy": _mean(each(metrics.overall_accuracy)),
+        "average_accuracy": _mean(each(metrics.average_accuracy)),
+        "kappa": _mean(each(metrics.kappa)),
         "per_class_iou": dict(zip(class_names, map(_mean, classes), strict=True)),
         "false_classes": {name: pixels for name, pixels in zip(class_names, false, strict=True) if pixels},
     }

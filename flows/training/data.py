@@ -322,15 +322,11 @@ def only_class(scene: RasterScene) -> str | None:
     return scene.class_names[there[0]] if len(there) == 1 else None
 
 
-def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
-    """Return notes on scenes with a single class, which may stand for unlabelled."""
-    by_class: dict[str, list[str]] = {}
-    for name, kind in alone.items():
-        by_class.setdefault(kind, []).append(name)
-    return tuple(
+def alike_note(kind: str, names: Sequence[str]) -> str:
+    """Return the note on scenes with a single class, which may stand for unlabelled."""
+    return (
         f"all labels are {kind} in {list_some(names)}; if its value in the label files stands for no class, write"
         " unlabelled = VALUE into the scene.toml"
-        for kind, names in by_class.items()
     )
 
 

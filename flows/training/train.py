@@ -14,16 +14,8 @@ from rich.console import Console
 
 from spectralzoom.flows.tasks.scene import masks_contain
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
+from spectralzoom.flows.training import figures
 from spectralzoom.flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
-from spectralzoom.flows.training.figures import (
-    FEW_PIXELS,
-    better_reading,
-    judge_baselines,
-    judge_calibration,
-    judge_scans,
-    read_twice,
-    validate,
-)
 from spectralzoom.flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.spectral import Normalisation
@@ -92,7 +84,7 @@ def train_weights(
         **training,
     }
     frames = scenes.validation.examples
-    scans = judge_scans(with_record(weights, **record), frames, augmentation, settings.seed, report)
+    scans = figures.judge_scans(with_record(weights, **record), frames, augmentation, settings.seed, report)
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
@@ -179,17 +171,17 @@ def _learned(
     frames = scenes.validation.examples
     found: dict[str, Any] = {}
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    weights, found["readings"] = better_reading(
-        weights, start, frames, few=begun is None and labelled < FEW_PIXELS, begun=begun
+    weights, found["readings"] = figures.better_reading(
+        weights, start, frames, few=begun is None and labelled < figures.FEW_PIXELS, begun=begun
     )
-    found["baselines"] = judge_baselines(examples, frames, config.classes, settings.seed, report)
+    found["baselines"] = figures.judge_baselines(examples, frames, config.classes, settings.seed, report)
     if frames:
         report("validating", 0.0, f"{len(frames)} scenes")
-        found[CALIBRATION] = judge_calibration(weights, frames, settings.seed)
-    twice = read_twice(weights, frames)
+        found[CALIBRATION] = figures.judge_calibration(weights, frames, settings.seed)
+    twice = figures.read_twice(weights, frames)
     if twice:
         found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
-    found["validation"] = validate(twice, config.classes)
+    found["validation"] = figures.validate(twice, config.classes)
     return weights, {"training": summary, **found}
 
 
@@ -228,13 +220,13 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     )
     text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
     show_text(f"{text}kept: {readings['kept']}", console)
-    judged = "mIoU of classifiers of a random half of the training pixels, on the other half"
+    what = "mIoU of classifiers of a random half of the training pixels, on the other half"
     if of_readings:
-        judged = f"on at most {PIXELS} of their pixels at full exposure"
+        what = f"on at most {PIXELS} of their pixels at full exposure"
     if of_baselines:
-        show_text(f"{judged}: {of_baselines}", console)
-    figures = record["validation"]
-    if figures is None:
+        show_text(f"{what}: {of_baselines}", console)
+    judged = record["validation"]
+    if judged is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"
         command = shlex.join(["spectralzoom", "evaluate", on, "--weights", str(request.out)])
@@ -243,10 +235,10 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         if request.settings.darkest_ms < REFERENCE_MS:
             show_text("the file has no scan performance, by which survey --seconds chooses", console)
         return
-    title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
+    title = f"{judged['scenes']} scene{'s' if judged['scenes'] > 1 else ''} kept for validation"
     rows = [
-        [name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy"))]
+        [name, *(f"{judged[name][figure]:.1%}" for figure in ("miou", "overall_accuracy"))]
         for name in ("none", "gain", "all")
     ]
     console.print(table(("patches", "mIoU", "overall"), rows, title=title))
-    console.print(f"none: overview alone; all: every patch in full; gain: {figures['fraction']:.0%} of the patches")
+    console.print(f"none: overview alone; all: every patch in full; gain: {judged['fraction']:.0%} of the patches")

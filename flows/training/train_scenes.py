@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.terminal.figures import counted
-from spectralzoom.flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
+from spectralzoom.flows.training.data import Report, TrainingData, alike_note, only_class, scene_notes, trained_pixels
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
@@ -121,7 +121,7 @@ def _imaged(
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
     found = Imaged()
-    alike: dict[str, str] = {}
+    alike: dict[str, list[str]] = {}  # by their class
     empty: list[str] = []
     unfit: list[str] = []
     regridded: list[str] = []
@@ -150,7 +150,7 @@ def _imaged(
         if request.choices.get("train_mask") is not None:
             found.pixels[scene.key] = pack_mask(mask)
         if (alone := only_class(scene)) is not None:
-            alike[name] = alone
+            alike.setdefault(alone, []).append(name)
         if scene.regridded:
             regridded.append(name)
         if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
@@ -158,8 +158,8 @@ def _imaged(
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
-    notes = alike_notes(alike)
-    if trained is None and len(alike) == len(found.keys) and len(notes) == 1:
+    notes = [alike_note(*one) for one in alike.items()]
+    if trained is None and [*alike.values()] == [[*found.keys]]:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     for note in (*notes, *scene_notes(empty, regridded, negative)):
         tell(note)
@@ -175,8 +175,8 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if not scene.class_names:
         raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
     if len(scene.class_names) < 2:
-        notes = alike_notes({scene.name: scene.class_names[0]})
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
+        note = alike_note(scene.class_names[0], [scene.name])
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     built_in = bool(built_in_laws(request.dataset))
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns or COLUMNS[built_in])
     patch = request.patch or suggested_patch(scene.shape, built_in=built_in)
