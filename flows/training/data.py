@@ -330,15 +330,22 @@ def alike_note(kind: str, names: Sequence[str]) -> str:
     )
 
 
-def scene_notes(empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return notes on scenes without any value, with labels on another grid, and with mostly negative values."""
+def scene_notes(
+    empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = (), unfit: Sequence[str] = ()
+) -> list[str]:
+    """Return notes on scenes without any value, with labels on another grid, with mostly negative values, and unfit."""
     left_out = f"{counted(len(empty), 'scene')} without any value left out: {list_some(empty)}"
     moved = (
         f"labels of {list_some(regridded)} have another place, CRS or pixels than their images: they are brought to"
         " the images' pixels by nearest neighbour"
     )
     dark = f"most values of {list_some(negative)} are negative, thus without light; add an offset to the scene.toml"
-    return tuple(note for names, note in ((empty, left_out), (regridded, moved), (negative, dark)) if names)
+    copied = (
+        f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
+        f" training scene: {list_some(unfit)}"
+    )
+    notes = (empty, left_out), (regridded, moved), (negative, dark), (unfit, copied)
+    return [note for names, note in notes if names]
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:

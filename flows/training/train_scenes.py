@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.tasks.scene import pack_mask
-from spectralzoom.flows.terminal.figures import counted
 from spectralzoom.flows.training.data import Report, TrainingData, alike_note, only_class, scene_notes, trained_pixels
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
@@ -59,6 +58,15 @@ class Common:
     colours: NDArray[np.uint8]
     patch: int
     wavelength_nm: NDArray[np.float64]
+
+    def check(self, scene: RasterScene) -> None:
+        """Raise SceneError where a scene has other classes or bands."""
+        if scene.class_names != self.names:
+            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {self.names}")
+        if not np.array_equal(scene.wavelength_nm, self.wavelength_nm):
+            raise SceneError(
+                f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
+            )
 
 
 @dataclass(frozen=True)
@@ -122,10 +130,8 @@ def _imaged(
     """
     found = Imaged()
     alike: dict[str, list[str]] = {}  # by their class
-    empty: list[str] = []
-    unfit: list[str] = []
-    regridded: list[str] = []
-    negative: list[str] = []
+    lists: list[list[str]] = [[], [], [], []]
+    empty, regridded, negative, unfit = lists
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)
@@ -136,12 +142,7 @@ def _imaged(
             continue
         mask = trained_pixels(scene)  # raises for a scene without labels
         common = common or _common(request, scene)
-        if scene.class_names != common.names:
-            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {common.names}")
-        if not np.array_equal(scene.wavelength_nm, common.wavelength_nm):
-            raise SceneError(
-                f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
-            )
+        common.check(scene)
         if trained is not None and (scene.key in trained.keys.values() or not mask.any()):
             unfit.append(name)
             continue
@@ -161,13 +162,8 @@ def _imaged(
     notes = [alike_note(*one) for one in alike.items()]
     if trained is None and [*alike.values()] == [[*found.keys]]:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *scene_notes(empty, regridded, negative)):
+    for note in (*notes, *scene_notes(*lists)):
         tell(note)
-    if unfit:
-        tell(
-            f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
-            f" training scene: {list_some(unfit)}"
-        )
     return common, found
 
 
