@@ -264,7 +264,7 @@ def describe_weights(path: Path) -> Description:
         basis = SpectralBasis(**about["basis"])
         names = tuple(map(str, about["class_names"]))
         record = dict(about["record"])
-        checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
+        checked_wavelengths(np.array([basis.low_nm, basis.high_nm]))
         if basis.columns != config.columns or basis.low_nm > basis.high_nm:
             raise WavelengthError(
                 f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected "

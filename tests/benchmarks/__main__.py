@@ -68,7 +68,7 @@ def _machine() -> str:
     """Return processor, cores, load and versions in one line."""
     from spectralzoom.flows.tradeoff import describe_machine, mean_load
 
-    it: dict[str, Any] = describe_machine(threads=1)
+    it: dict[str, Any] = describe_machine()
     versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())
     return f"{it['processor']}, {it['cores']} cores, load {mean_load()}, one thread; python {it['python']}, {versions}"
 

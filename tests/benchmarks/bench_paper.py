@@ -143,7 +143,7 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
         observed = observe(scene, CAMERA, grid, data.weights.basis, np.random.default_rng([number, 0x9A9E]))
         _, reached = data.weights.basis.matrix(scene.wavelength_nm)
         columns = normalised(observed, data.weights.normalisation, reached).columns.astype(np.float32)
-        every = len(grid.every_patch())
+        every, bands = len(grid.every_patch()), len(scene.wavelength_nm)
         for factor in (*INPUTS, 1):
             read = read_scene(data.weights, columns, scene.labels, grid, factor)
             coarse = 0 if factor == 1 else int(np.prod([-(-n // (grid.patch * factor)) for n in scene.shape]))
@@ -155,11 +155,13 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
                 cost = 0 if policy in ("random", "ideal") else score_multiply_adds(policy, config, grid)
                 for text, k in rows.items():
                     own = cost if 0 < k < every else 0
-                    spent = multiply_adds(config, grid, k, len(scene.wavelength_nm), score=own, apart=factor > 1)
+                    spent = multiply_adds(config, grid, k, bands, score=own).total
+                    if factor > 1:  # patches are captured apart
+                        spent += k * grid.patch**2 * bands * config.columns
                     row = found.setdefault((factor, label, text), Tally())
                     row.counts.append([read.counts(select_patches(one, k)) for one in scores])
                     row.patches.append(coarse + k)
-                    row.multiply_adds.append(spent.total)
+                    row.multiply_adds.append(spent)
     return found
 
 
