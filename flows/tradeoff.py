@@ -138,7 +138,7 @@ class Result:
     points: tuple[Point, ...]
 
 
-def describe_machine(threads: int) -> dict[str, object]:
+def describe_machine() -> dict[str, object]:
     """Return processor, cores, system, threads in use and versions of the numerical packages."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -150,7 +150,7 @@ def describe_machine(threads: int) -> dict[str, object]:
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "threads": threads,
+        "threads": 1,
         "versions": {name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
     }
 
@@ -182,7 +182,7 @@ def measure_tradeoff(
                 clocks[one].append((time.perf_counter() - wall, time.process_time() - processor))
                 if turn == 0:
                     figures[one] = judge(one, result)
-        machine = describe_machine(threads=1) | {"load_before": load_before, "load_after": mean_load()}
+        machine = describe_machine() | {"load_before": load_before, "load_after": mean_load()}
     points = []
     for one, found in figures.items():
         wall, processor = (min(times) for times in zip(*clocks[one], strict=True))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -14,7 +16,7 @@ from spectralzoom.flows.evaluate.command import run_evaluate
 from spectralzoom.flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
 from spectralzoom.flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
 from spectralzoom.flows.terminal.progress import print_json, stderr
-from spectralzoom.flows.training.train import asked_command, check_counts, run_train
+from spectralzoom.flows.training.train import check_counts, run_train
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.flows.training.train_temporal import LANDS, TemporalRequest, run_remember
 from spectralzoom.models.network.machine import PROCESSOR, Device
@@ -130,7 +132,9 @@ class TrainFlags(SceneFlags):
 
     def request(self, dataset: str, out: Path, command: str) -> TrainRequest:
         """Return the request of a training of all weights. Raises SettingsError: numbers are invalid."""
+        same = {name: getattr(self, name) for name in ("steps", "minutes", "seed", "crop", "batch")}
         usual = TrainingSettings.learning_rate / (3 if self.start else 1)
+        rate = usual if self.learning_rate is None else self.learning_rate
         return TrainRequest(
             dataset,
             out,
@@ -140,15 +144,7 @@ class TrainFlags(SceneFlags):
             self.patch,
             tokens={"dim": self.dim, "heads": self.heads} | ({} if self.layers is None else {"layers": self.layers}),
             choices=self.choices(),
-            settings=TrainingSettings(
-                steps=self.steps,
-                minutes=self.minutes,
-                seed=self.seed,
-                crop=self.crop,
-                batch=self.batch,
-                darkest_ms=self.min_exposure_ms,
-                learning_rate=usual if self.learning_rate is None else self.learning_rate,
-            ),
+            settings=TrainingSettings(**same, darkest_ms=self.min_exposure_ms, learning_rate=rate),
             command=command,
             device=self.device,
             start=self.start,
@@ -214,10 +210,15 @@ def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_
     out
         Weights to write (.safetensors).
     """
-    record = run_training(dataset, out, flags, asked_command(), stderr)
+    record = run_training(dataset, out, flags, _command(), stderr)
     if as_json:
         print_json(record)
     return 0
+
+
+def _command() -> str:
+    """Return the command without folders, for the record."""
+    return shlex.join(["spectralzoom", *[Path(word).name if "/" in word else word for word in sys.argv[1:]]])
 
 
 def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, console: Console) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from spectralzoom.flows.evaluate.frames import (
     open_frames,
     sort_frames,
 )
-from spectralzoom.flows.evaluate.judge import ENDS, Record, judge_frame, seeds_of, summarise
+from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, seeds_of, summarise
 from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
@@ -42,10 +42,8 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     with StageProgress(console) as progress:
         content = evaluate_weights(request, progress.show)
     put_out(content, print_evaluation, as_json=as_json)
-    for note in content["data_notes"]:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for path in content["files"]:
-        console.print(path, markup=False, soft_wrap=True)
+    for line in (*(f"note: {note}" for note in content["data_notes"]), *content["files"]):
+        show_text(line, console)
     return content
 
 
@@ -96,11 +94,11 @@ def _judge_frames(
     candidates: Sequence[Candidate],
     frames: dict[str, tuple[int, ...]],
     show: Report,
-) -> list[list[Record]]:
-    """Judge every frame by its weights; return the records of each of the weights."""
+) -> list[dict[str, dict[Choice, Row]]]:
+    """Judge every frame by its weights; return the rows of the frames of each of the weights."""
     device = choose_device(request.device)
     loaded: dict[int, Weights] = {}
-    runs: list[list[Record]] = [[] for _ in candidates]
+    runs: list[dict[str, dict[Choice, Row]]] = [{} for _ in candidates]
     for number, (name, judges) in enumerate(frames.items()):
         scene = data.scene(name)
         for at, index in enumerate(judges):
@@ -109,7 +107,7 @@ def _judge_frames(
             if index not in loaded:
                 loaded[index] = load_weights(one.path).on(device)
             observed = observe_frame(scene, name, loaded[index], one.camera, request.seed)
-            runs[index].append(judge_frame(request, observed, loaded[index]))
+            runs[index][name] = judge_frame(request, observed, loaded[index])
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 

@@ -19,18 +19,17 @@ from spectralzoom.flows.tasks.scene import check_labels, judged_labels, seen_in_
 from spectralzoom.flows.training.data import (
     Report,
     TrainingData,
-    alike_notes,
+    alike_note,
     farm_test_data,
     only_class,
     open_training_data,
     scene_notes,
 )
-from spectralzoom.flows.training.observed_scenes import observe_scene
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.spectral import patches_of
 from spectralzoom.models.policies.policies import POLICIES
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
-from spectralzoom.models.training.examples import normalised
+from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
 from spectralzoom.models.weights.files import Description, Weights, describe_weights
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
@@ -109,7 +108,6 @@ class Candidate:
 class ObservedFrame:
     """One frame in the spectral features of some weights, with their coarse prediction."""
 
-    name: str
     seen: CoarsePrediction
     fine: NDArray[np.float32]  # (patch, p, p, column) normalised, every patch of the padded grid
     labels: NDArray[np.uint8]  # (y, x) in the weights' classes
@@ -166,7 +164,7 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     assert labels is not None  # sort_frames
     seen = coarse_prediction_of_columns(weights, example.columns, grid)
     fine = patches_of(example.columns, config.patch).astype(np.float32)
-    return ObservedFrame(name, seen, fine, labels, len(scene.wavelength_nm))
+    return ObservedFrame(seen, fine, labels, len(scene.wavelength_nm))
 
 
 @dataclass(frozen=True)
@@ -178,6 +176,23 @@ class Jobs:
     notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
 
+def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]:
+    """Return the indices of the weights that were not trained on a scene, or not on the same pixels of it."""
+    for one in weights:
+        check_labels(scene, one.described)
+    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
+    fit = tuple(
+        at
+        for at, one in enumerate(weights)
+        if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
+    )
+    masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
+    if other := next((at for at, mask in zip(fit, masks, strict=True) if mask != masks[0]), None):
+        both = f"{weights[other].path} and {weights[fit[0]].path}"
+        raise SettingsError(f"{both} were trained on different pixels of {scene.name}; evaluate them separately")
+    return fit
+
+
 def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
     """Assign to each frame the weights that were not trained on it.
 
@@ -185,12 +200,11 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
     SettingsError: weights were trained on different pixels of a frame.
     """
     jobs = Jobs()
-    alike: dict[str, str] = {}
+    alike: dict[str, list[str]] = {}  # by their class
     empty: list[str] = []
     regridded: list[str] = []
     validated: list[str] = []
     labelled = False
-    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
         try:
@@ -203,31 +217,17 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
                 f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
         if (alone := only_class(scene)) is not None:
-            alike[name] = alone
-        for one in weights:
-            check_labels(scene, one.described)
-        fit = [
-            at
-            for at, one in enumerate(weights)
-            if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
-        ]
+            alike.setdefault(alone, []).append(name)
+        fit = _judges(scene, weights)
         if not fit:
             jobs.left_out.append(name)
             continue
-        first = weights[fit[0]]
-        masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
-        for one, mask in zip((weights[at] for at in fit), masks, strict=True):
-            if mask != masks[0]:
-                raise SettingsError(
-                    f"{one.path} and {first.path} were trained on different pixels of {scene.name}; evaluate them "
-                    "separately"
-                )
-        jobs.frames[name] = tuple(fit)
+        jobs.frames[name] = fit
         if any(weights[at].validated_on(scene) for at in fit):
             validated.append(name)
         if scene.regridded:
             regridded.append(name)
-        labels = judged_labels(scene, first.described)
+        labels = judged_labels(scene, weights[fit[0]].described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
     if jobs.left_out and (request.frames or not jobs.frames):
@@ -238,7 +238,7 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
-    notes = [*alike_notes(alike), *scene_notes(empty, regridded)]
+    notes = [*(alike_note(*one) for one in alike.items()), *scene_notes(empty, regridded)]
     if validated:
         notes.append(
             f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"

@@ -1,12 +1,12 @@
 """Judge a frame by some weights, and summarise many: means and standard deviations over seeds.
 
-A record has the confusion counts and costs of every policy at each fraction of the patches. Weights without a common
-frame are folds of one training and count as one seed. Weights that share a frame are different seeds.
+Weights without a common frame are folds of one training and count as one seed. Weights that share a frame are different
+seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,15 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.evaluate.frames import EvaluateRequest, ObservedFrame
-from spectralzoom.models.evaluation.metrics import (
-    average_accuracy,
-    confusion,
-    false_pixels,
-    iou_per_class,
-    kappa,
-    mean_iou,
-    overall_accuracy,
-)
+from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.network.sizes import multiply_adds
 from spectralzoom.models.policies.placement import mixed
 from spectralzoom.models.policies.policies import score_multiply_adds, score_patches
@@ -31,133 +23,123 @@ from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.planning.coverage import frame_patches
 
 RANDOM_DRAWS = 5
-ENDS = ("none", "all")  # no patch, every patch
-Record = dict[str, Any]
-
-
-def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> Record:
-    """Return the confusion counts and multiply-adds of every policy and fraction."""
-    grid = frame.seen.grid
-    every = grid.every_patch()
-    overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (every[:0], every))
-    rows: list[Record] = []
-    for policy, draw, fraction, patch_index in _rows(request, frame):
-        scored = 0 if policy in ENDS else score_multiply_adds(policy, weights.config, grid)
-        drawn = mixed(overview, full, np.isin(every, patch_index), grid)
-        row = {
-            "policy": policy,
-            "draw": draw,
-            "fraction": fraction,
-            "patches": len(patch_index),
-            "counts": confusion(frame.labels, drawn, weights.config.classes).tolist(),
-            "multiply_adds": multiply_adds(weights.config, grid, len(patch_index), frame.bands, score=scored).total,
-        }
-        rows.append(row)
-    return {"frame": frame.name, "rows": rows}
-
-
-def _rows(request: EvaluateRequest, frame: ObservedFrame) -> Iterator[tuple[str, int, float, NDArray[np.intp]]]:
-    """Yield policy, draw, fraction and patches of each row; the random policy has several draws."""
-    yield "none", 0, 0.0, np.empty(0, np.intp)
-    yield "all", 0, 1.0, frame.seen.grid.every_patch()
-    for policy in request.policies:
-        for draw in range(RANDOM_DRAWS if policy == "random" else 1):
-            scores = score_patches(policy, frame.seen, seed=request.seed + 1000 * (draw + 1))
-            for fraction in request.fractions:
-                yield policy, draw, fraction, frame_patches(scores, fraction)
-
-
-Runs = Sequence[Sequence[Record]]  # records of the frames, of each of the weights or seeds
+NONE, ALL = ("none", 0.0), ("all", 1.0)  # no patch, every patch
+ENDS = (NONE[0], ALL[0])
+Choice = tuple[str, float]  # policy, and fraction of the patches
+Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Row:
-    """Counts of one policy and fraction; a run is a seed and a draw. Frames that a run did not judge are zeros."""
+    """A frame with the patches of one policy and fraction."""
 
-    counts: NDArray[np.int64]  # (run, frame, class, class)
-    of_seed: NDArray[np.intp]  # (run,)
-    parts: list[Record]  # rows of the records
-
-    def over_runs(self, figure: Callable[[Any], Any]) -> NDArray[np.float64]:
-        """Return a figure of the summed counts of each run, (run,) or (run, class)."""
-        return np.array([figure(run.sum(axis=0)) for run in self.counts])
+    counts: Counts  # (draw, class, class); the random policy has several draws
+    patches: int
+    multiply_adds: int
 
 
-def seeds_of(runs: Runs) -> list[list[int]]:
-    """Group weights without a common frame into seeds; return their indices. Weights without a frame are left out."""
+Run = Mapping[str, Mapping[Choice, Row]]  # rows of each frame, by some weights or by a seed
+
+
+def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> dict[Choice, Row]:
+    """Return the confusion counts and multiply-adds of every policy and fraction."""
+    grid, config = frame.seen.grid, weights.config
+    every = grid.every_patch()
+    overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (every[:0], every))
+    chosen = {NONE: [every[:0]], ALL: [every]}  # patches of each draw
+    for policy in request.policies:
+        seeds = range(1000, 1000 * (RANDOM_DRAWS if policy == "random" else 1) + 1, 1000)
+        scores = [score_patches(policy, frame.seen, seed=request.seed + seed) for seed in seeds]
+        chosen |= {(policy, part): [frame_patches(one, part) for one in scores] for part in request.fractions}
+    rows = {}
+    for (policy, fraction), draws in chosen.items():
+        maps = [mixed(overview, full, np.isin(every, some), grid) for some in draws]
+        counts = np.array([metrics.confusion(frame.labels, drawn, config.classes) for drawn in maps])
+        scored = 0 if policy in ENDS else score_multiply_adds(policy, config, grid)
+        spent = multiply_adds(config, grid, len(draws[0]), frame.bands, score=scored).total
+        rows[policy, fraction] = Row(counts, len(draws[0]), spent)
+    return rows
+
+
+def seeds_of(runs: Sequence[Iterable[str]]) -> list[list[int]]:
+    """Group weights without a common frame into seeds; return their indices. Weights without a frame are left out.
+
+    ``runs`` are the names of the frames of each of the weights.
+    """
     seeds: list[tuple[set[str], list[int]]] = []
-    for number, records in enumerate(runs):
-        names = {record["frame"] for record in records}
+    for number, names in enumerate(map(set, runs)):
         if not names:
             continue
-        for covered, members in seeds:
-            if not covered & names:
-                covered |= names
-                members.append(number)
-                break
-        else:
-            seeds.append((set(names), [number]))
+        covered, members = next((one for one in seeds if not one[0] & names), (set(), []))
+        if not members:
+            seeds.append((covered, members))
+        covered.update(names)
+        members.append(number)
     return [members for _, members in seeds]
 
 
-def collect_row(seeds: Runs, policy: str, fraction: float) -> Row:
-    """Collect the counts of one row from the records of all seeds; frames without a labelled pixel are left out."""
-    found = [
-        (number, record["frame"], row)
-        for number, records in enumerate(seeds)
-        for record in records
-        for row in record["rows"]
-        if (row["policy"], row["fraction"]) == (policy, fraction)
-    ]
-    order = sorted({frame for _, frame, row in found if np.any(row["counts"])})
-    draws = 1 + max(row["draw"] for _, _, row in found)
-    classes = len(found[0][2]["counts"])
-    counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
-    for number, frame, row in found:
-        if frame in order:
-            counts[number * draws + row["draw"], order.index(frame)] = row["counts"]
-    return Row(counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
+def counts_of(seeds: Sequence[Run], choice: Choice) -> Counts:
+    """Return the counts of one policy and fraction, (seed, draw, frame, class, class).
+
+    Frames without a labelled pixel are left out, those that a seed did not judge are zeros.
+    """
+    names = sorted({name for run in seeds for name, rows in run.items() if rows[choice].counts.any()})
+    shape = next(iter(seeds[0].values()))[choice].counts.shape
+    counts = np.zeros((len(seeds), shape[0], len(names), *shape[1:]), np.int64)
+    for number, run in enumerate(seeds):
+        for at, name in enumerate(names):
+            if name in run:
+                counts[number, :, at] = run[name][choice].counts
+    return counts
 
 
-def summarise(runs: Runs, class_names: Sequence[str], request: EvaluateRequest) -> Record:
-    """Return the figures of every row. ``runs`` are the records of `judge_frame` of each of the weights."""
-    seeds = [[record for number in members for record in runs[number]] for members in seeds_of(runs)]
+def summarise(runs: Sequence[Run], class_names: Sequence[str], request: EvaluateRequest) -> dict[str, Any]:
+    """Return the figures of every row. ``runs`` are the rows of `judge_frame` by each of the weights."""
+    seeds = [{name: rows for number in members for name, rows in runs[number].items()} for members in seeds_of(runs)]
     shared = [(policy, fraction) for policy in request.policies for fraction in request.fractions]
-    rows = {key: collect_row(seeds, *key) for key in (("none", 0.0), *shared, ("all", 1.0))}
-    whole = rows["all", 1.0]
-    support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
+    whole = counts_of(seeds, ALL)
+    support = whole.sum(axis=4).max(axis=(0, 1)).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
-    for (policy, fraction), row in rows.items():
-        cost = {}  # means of a frame, and their ratio to those of all patches
-        for name in ("patches", "multiply_adds"):
-            done, full = (float(np.mean([one[name] for one in some.parts])) for some in (row, whole))
-            cost[name] = {"done": done, "ratio": done / full if full else None}
-        table.append({"policy": policy, "fraction": fraction, **_accuracy(row, class_names), "cost": cost})
+    for choice in (NONE, *shared, ALL):
+        done, full = (_cost(seeds, one) for one in (choice, ALL))  # their ratio is that to all patches
+        cost = {name: {"done": done[name], "ratio": done[name] / full[name] if full[name] else None} for name in done}
+        figures = _accuracy(counts_of(seeds, choice), class_names)
+        table.append({"policy": choice[0], "fraction": choice[1], **figures, "cost": cost})
     return {"rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
 
 
-def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
-    """Return means over the runs; the spread of the mIoU is that over seeds, for a single seed that over draws."""
-    each = row.over_runs(mean_iou)
-    seeds = np.array([_mean(each[row.of_seed == number]) for number in np.unique(row.of_seed)])
-    repeats = seeds if len(seeds) > 1 else each
-    classes = row.over_runs(iou_per_class)
-    false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
+def _cost(seeds: Sequence[Run], choice: Choice) -> dict[str, float]:
+    """Return the mean patches and multiply-adds of a frame."""
+    rows = [of_frame[choice] for run in seeds for of_frame in run.values()]
+    return {name: float(np.mean([getattr(row, name) for row in rows])) for name in ("patches", "multiply_adds")}
+
+
+def _accuracy(counts: Counts, class_names: Sequence[str]) -> dict[str, Any]:
+    """Return means over seeds and draws; the spread of the mIoU is that over seeds, for a single seed over draws."""
+
+    def each(figure: Callable[[Counts], Any]) -> NDArray[np.float64]:
+        """Return a figure of the summed counts, (seed, draw) or (seed, draw, class)."""
+        return np.array([[figure(run.sum(axis=0)) for run in seed] for seed in counts])
+
+    miou = each(metrics.mean_iou)
+    seeds = [_mean(draws) for draws in miou]
+    repeats = seeds if len(seeds) > 1 else miou[0]
+    classes = np.moveaxis(each(metrics.iou_per_class), 2, 0)
+    false = each(metrics.false_pixels).mean(axis=(0, 1)).tolist()
     return {
-        "frames": row.counts.shape[1],
-        "miou": _mean(each),
-        "spread": float(repeats.std(ddof=1)) if len(repeats) > 1 else None,
-        "by_seed": seeds.tolist(),
-        "pixel_accuracy": _mean(row.over_runs(overall_accuracy)),
-        "average_accuracy": _mean(row.over_runs(average_accuracy)),
-        "kappa": _mean(row.over_runs(kappa)),
-        "per_class_iou": dict(zip(class_names, [_mean(column) for column in classes.T], strict=True)),
+        "frames": counts.shape[2],
+        "miou": _mean(miou),
+        "spread": float(np.std(repeats, ddof=1)) if len(repeats) > 1 else None,
+        "by_seed": seeds,
+        "pixel_accuracy": _mean(each(metrics.overall_accuracy)),
+        "average_accuracy": _mean(each(metrics.average_accuracy)),
+        "kappa": _mean(each(metrics.kappa)),
+        "per_class_iou": dict(zip(class_names, map(_mean, classes), strict=True)),
         "false_classes": {name: pixels for name, pixels in zip(class_names, false, strict=True) if pixels},
     }
 
 
-def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:
+def _mean(values: NDArray[np.float64]) -> float:
     """Return the mean without NaN; NaN for no value."""
-    known = np.asarray(values, np.float64)
-    known = known[~np.isnan(known)]
+    known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else float("nan")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,11 +78,9 @@ class DataSet:
     def notes(self) -> tuple[str, ...]:
         """Return notes on scenes without labels, and on labels without a scene."""
         bare = [Path(self.files[name]) for name in self.unlabelled]
-        notes = (
-            [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"] if bare else []
-        )
-        lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"] if self.alone else []
-        return (*notes, *lone)
+        left_out = f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"
+        lone = f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"
+        return tuple(note for files, note in ((bare, left_out), (self.alone, lone)) if files)
 
     @cached_property
     def classes(self) -> dict[str, ClassValue]:
@@ -92,23 +90,18 @@ class DataSet:
             return {}
         return classes_of_files(tuple(self.label_files.values()), settings)
 
-    def load(self, name: str, part: Literal["train", "test"] | None = None) -> SceneFile:
-        """Read one scene by its name with all labels, or with those inside or outside of the training mask.
+    def load(self, name: str, *, training: bool = False) -> SceneFile:
+        """Read one scene by its name with all labels, or for ``training`` with those inside of the mask.
 
         Raises SceneError, WavelengthError: as `load_scene_file`.
         """
-        if name not in self.files:
-            raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
         labels = {"labels": self.label_files.get(name), **self.choices}
         scene = load_scene_file(self.files[name], classes=self.classes, **labels)
-        if part is None or self.train_mask is None:
+        if not training or self.train_mask is None:
             return scene
-        train, rest = split_labels(scene, self.train_mask, self.mask_classes)
-        if part == "train":
-            return replace(
-                scene, labels=train, provenance=(*scene.provenance, f"labels inside {self.train_mask}: training")
-            )
-        return replace(scene, labels=rest, provenance=(*scene.provenance, f"labels outside {self.train_mask}: test"))
+        inside = labels_of_training(scene, self.train_mask, self.mask_classes)
+        provenance = (*scene.provenance, f"labels inside {self.train_mask}: training")
+        return replace(scene, labels=inside, provenance=provenance)
 
 
 def load_data_set(
@@ -125,8 +118,7 @@ def load_data_set(
     """
     choices = {name: value for name, value in choices.items() if value is not None}
     files, label_files, alone = _scenes(path, train_mask)
-    unknown = [name for name in hold_out if name not in files]
-    if unknown:
+    if unknown := [name for name in hold_out if name not in files]:
         raise SceneError(f"{path} has no scene {', '.join(unknown)} to hold out; it has {', '.join(files)}")
     if len(set(hold_out)) == len(files):
         raise SceneError(f"{path}: all {len(files)} scenes are held out, which leaves none to train on; hold out fewer")
@@ -146,10 +138,10 @@ def load_data_set(
     )
 
 
-def split_labels(
+def labels_of_training(
     scene: SceneFile, train_mask: str | Path, mask_classes: Sequence[int] | None
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the labels with the mask's class, or under a mask of one number, and all others, (y, x), 255 elsewhere."""
+) -> NDArray[np.uint8]:
+    """Return the labels with the mask's class, or under a mask of one number, (y, x), 255 elsewhere."""
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
     mask = load_codes(train_mask, scene.geobox).values
@@ -158,7 +150,7 @@ def split_labels(
         raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x); give one of its size")
     highest = int(mask.max(initial=0))
     if mask_classes is None and ((mask < 1) | (mask == highest)).all():
-        return _split(scene.labels, mask > 0)
+        return np.where(mask > 0, scene.labels, np.uint8(UNLABELLED))
     numbers = {value: index for index, value in enumerate(scene.class_values) if isinstance(value, int)}
     if not numbers:
         raise SceneError(f"{scene.path} has classes by colour; a mask of classes needs numbers; give a mask of 0 and 1")
@@ -176,11 +168,7 @@ def split_labels(
     if named.any() and (agree := trains[named].mean()) < 0.5:
         known = f"mask {train_mask} has the class of the labels in {agree:.0%} of its pixels"
         raise SceneError(f"{known}; give mask classes: the labels' number of each number of the mask, from 1 on")
-    return _split(scene.labels, trains)
-
-
-def _split(labels: NDArray[np.uint8], trains: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    return np.where(trains, labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), labels)
+    return np.where(trains, scene.labels, np.uint8(UNLABELLED))
 
 
 def _scenes(
@@ -249,7 +237,7 @@ class TrainingData:
             seed, day, hour = read_farm_name(name)
             law = SCOUTING_LAW if name.startswith(_SCOUTED) else FARM_LAW
             return built_in_scene(law, seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
-        return scene_of_file(self.files.load(name, "train"), self.camera)
+        return scene_of_file(self.files.load(name, training=True), self.camera)
 
 
 def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:
@@ -308,9 +296,8 @@ def open_training_data(
                 raise SettingsError(f"{flag} is for scene files; built-in scenes are drawn by seed and bring their own")
         train = _built_in_days(laws, FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
         left = FARM_VALIDATION * len(laws) if validation is None else validation
-        return TrainingData(
-            ",".join(laws), train, _built_in_days(laws, FARM_VALIDATION_SEED, left, odd=True), (), camera
-        )
+        judged = _built_in_days(laws, FARM_VALIDATION_SEED, left, odd=True)
+        return TrainingData(",".join(laws), train, judged, (), camera)
     if scenes is not None:
         raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
@@ -324,15 +311,7 @@ def open_training_data(
         raise SceneError(f"--validation {validation} leaves none of {of} to train on; take fewer")
     kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
     train = tuple(name for name in names if name not in kept)
-    return TrainingData(
-        files.path.stem,
-        train=train,
-        validation=kept,
-        held_out=files.held_out,
-        camera=camera,
-        files=files,
-        notes=files.notes,
-    )
+    return TrainingData(files.path.stem, train, kept, files.held_out, camera, files, files.notes)
 
 
 def only_class(scene: RasterScene) -> str | None:
@@ -343,27 +322,30 @@ def only_class(scene: RasterScene) -> str | None:
     return scene.class_names[there[0]] if len(there) == 1 else None
 
 
-def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
-    """Return notes on scenes with a single class, which may stand for unlabelled."""
-    by_class: dict[str, list[str]] = {}
-    for name, kind in alone.items():
-        by_class.setdefault(kind, []).append(name)
-    return tuple(
+def alike_note(kind: str, names: Sequence[str]) -> str:
+    """Return the note on scenes with a single class, which may stand for unlabelled."""
+    return (
         f"all labels are {kind} in {list_some(names)}; if its value in the label files stands for no class, write"
         " unlabelled = VALUE into the scene.toml"
-        for kind, names in by_class.items()
     )
 
 
-def scene_notes(empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return notes on scenes without any value, with labels on another grid, and with mostly negative values."""
+def scene_notes(
+    empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = (), unfit: Sequence[str] = ()
+) -> list[str]:
+    """Return notes on scenes without any value, with labels on another grid, with mostly negative values, and unfit."""
     left_out = f"{counted(len(empty), 'scene')} without any value left out: {list_some(empty)}"
     moved = (
         f"labels of {list_some(regridded)} have another place, CRS or pixels than their images: they are brought to"
         " the images' pixels by nearest neighbour"
     )
     dark = f"most values of {list_some(negative)} are negative, thus without light; add an offset to the scene.toml"
-    return tuple(note for names, note in ((empty, left_out), (regridded, moved), (negative, dark)) if names)
+    copied = (
+        f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
+        f" training scene: {list_some(unfit)}"
+    )
+    notes = (empty, left_out), (regridded, moved), (negative, dark), (unfit, copied)
+    return [note for names, note in notes if names]
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:

@@ -15,19 +15,8 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
 
 from spectralzoom.flows.training.data import Report
+from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
-from spectralzoom.models.evaluation.metrics import (
-    Counts,
-    Floats,
-    JudgedMap,
-    agreement,
-    calibration_error,
-    confidence_counts,
-    confusion,
-    iou_per_class,
-    judge_confidence,
-    mean_iou,
-)
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.reading.inference import coarse_prediction_of_columns, map_of_columns
@@ -55,13 +44,13 @@ def validate(scenes: Sequence[ReadTwice], classes: int) -> dict[str, Any] | None
     """Return `agreement` over all scenes with no patch, some by gain, and all; None without a scene."""
     if not scenes:
         return None
-    rows: dict[str, list[Counts]] = {"none": [], "gain": [], "all": []}
+    rows: dict[str, list[metrics.Counts]] = {"none": [], "gain": [], "all": []}
     for scene in scenes:
         part = np.zeros(scene.gain.shape, np.bool_)
         part[frame_patches(scene.gain, VALIDATED_FRACTION)] = True
         for name, chosen in zip(rows, (np.zeros_like(part), part, np.ones_like(part)), strict=True):
             rows[name].append(scene.counts(chosen, classes))
-    figures = {name: agreement(np.sum(counts, axis=0)) for name, counts in rows.items()}
+    figures = {name: metrics.agreement(np.sum(counts, axis=0)) for name, counts in rows.items()}
     return {"scenes": len(scenes), "fraction": VALIDATED_FRACTION, **figures}
 
 
@@ -72,8 +61,8 @@ def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) 
         grid, labels = _parts(weights, example)
         _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
         valid = (labels != UNLABELLED) & np.isfinite(every_class[..., 0])
-        maps.append(JudgedMap(every_class[valid], labels[valid]))
-    return judge_confidence(maps, seed) if maps else None
+        maps.append(metrics.JudgedMap(every_class[valid], labels[valid]))
+    return metrics.judge_confidence(maps, seed) if maps else None
 
 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the darkest of the training is judged, too
@@ -107,12 +96,12 @@ def judge_scans(
             rng = np.random.default_rng([seed, 0x5CA, i, j])
             judged = [_scanned(weights, one, augmentation, step, exposure_ms / REFERENCE_MS, rng) for one in known]
             counts = [one.counts for one, _ in judged]
-            calibration[i, j] = calibration_error(np.sum([sure for _, sure in judged], axis=0))
-            own = [mean_iou(one) for one in counts]
+            calibration[i, j] = metrics.calibration_error(np.sum([sure for _, sure in judged], axis=0))
+            own = [metrics.mean_iou(one) for one in counts]
             miou[i, j] = np.nanmean(own)
             spread[i, j] = np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
-                of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
+                of_classes[:, i, j] = np.nanmean([metrics.iou_per_class(one) for one in counts], axis=0)
             maps[step, exposure_ms] = [one for one, _ in judged]
             figure = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
             report("judging scans", len(maps) / miou.size, figure)
@@ -139,7 +128,7 @@ def _scanned(
     step: int,
     light: float,
     rng: np.random.Generator,
-) -> tuple[ScoredMap, Floats]:
+) -> tuple[ScoredMap, metrics.Floats]:
     """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, labels = _parts(weights, example)
@@ -148,9 +137,9 @@ def _scanned(
     )
     drawn, every_class = map_of_columns(weights, scan, grid, LineSpec(light, step))
     valid = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
-    sure = confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
-    classes = weights.config.classes
-    return ScoredMap(confusion(labels, drawn.classes, classes), expected_counts([every_class[valid]], classes)), sure
+    sure = metrics.confidence_counts(drawn.confidence[valid], drawn.classes[valid] == labels[valid])
+    counts = metrics.confusion(labels, drawn.classes, weights.config.classes)
+    return ScoredMap(counts, expected_counts([every_class[valid]], weights.config.classes)), sure
 
 
 def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.uint8]]:
@@ -190,8 +179,8 @@ def _miou(weights: Weights, examples: Sequence[Example]) -> float:
     for example in examples:
         grid, labels = _parts(weights, example)
         drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
-        counts += confusion(labels, drawn.classes, weights.config.classes)
-    return mean_iou(counts)
+        counts += metrics.confusion(labels, drawn.classes, weights.config.classes)
+    return metrics.mean_iou(counts)
 
 
 def judge_baselines(
@@ -220,5 +209,6 @@ def judge_baselines(
         report("fitting baseline classifiers", len(found) / 3, name)
         with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a single pixel
             classifier.fit(learnt.features, learnt.labels)
-        found[name] = mean_iou(confusion(judged.labels, classifier.predict(judged.features).astype(np.uint8), classes))
+        drawn = classifier.predict(judged.features).astype(np.uint8)
+        found[name] = metrics.mean_iou(metrics.confusion(judged.labels, drawn, classes))
     return found

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import shlex
-import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +13,14 @@ import numpy as np
 from rich.console import Console
 
 from spectralzoom.flows.tasks.scene import masks_contain
-from spectralzoom.flows.terminal.progress import one_after_the_other, table
+from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
+from spectralzoom.flows.training import figures
 from spectralzoom.flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
-from spectralzoom.flows.training.figures import (
-    FEW_PIXELS,
-    better_reading,
-    judge_baselines,
-    judge_calibration,
-    judge_scans,
-    read_twice,
-    validate,
-)
 from spectralzoom.flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.policies.placement import CascadeTable
-from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
 from spectralzoom.models.training.train import PIXELS, LabelledPixels, linear_classifier, train
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
@@ -68,8 +59,8 @@ def train_weights(
     begun = None if request.start is None else load_weights(request.start)
     device = choose_device(request.device)
     settings = request.settings
-    hold_out = {"hold_out": request.hold_out, **request.choices}
-    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **hold_out)
+    choices = {"hold_out": request.hold_out, **request.choices}
+    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **choices)
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
@@ -79,12 +70,12 @@ def train_weights(
         check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    weights, training = _learned(request, scenes, normalisation, begun, checkpoint, device, report)
-    trained = _trained_on(data, scenes, settings.darkest_ms)
+    augmentation = training_capture(normalisation, settings.darkest_ms)
+    weights, training = _learned(request, scenes, normalisation, augmentation, begun, checkpoint, device, report)
     record = {
         "command": request.command,
         "data": data.law,
-        TRAINED_ON: trained.as_dict(),
+        TRAINED_ON: asdict(_trained_on(data, scenes, settings.darkest_ms)),
         "split": scenes.split | {"held_out": list(data.held_out)},
         "settings": asdict(settings),
         "camera": asdict(request.camera),
@@ -92,13 +83,8 @@ def train_weights(
         **({} if begun is None else {"started_from": begun.record.get("command", "")}),
         **training,
     }
-    scans = judge_scans(
-        with_record(weights, **record),
-        scenes.validation.examples,
-        training_capture(normalisation, settings.darkest_ms),
-        settings.seed,
-        report,
-    )
+    frames = scenes.validation.examples
+    scans = figures.judge_scans(with_record(weights, **record), frames, augmentation, settings.seed, report)
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
@@ -110,22 +96,22 @@ def train_weights(
 
 def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> TrainedOn:
     """Return the ranges of the training data; season, sun and scale are known for built-in farms alone."""
+    farm: dict[str, Any] = {}
+    if data.files is None:
+        moments = [read_farm_name(name)[1:] for name in data.train]
+        days = [day for day, _ in moments]
+        heights = [sun_over_farm(*moment).elevation_deg for moment in moments]
+        farm = {"day": (min(days), max(days)), "sun_elevation_deg": (min(heights), max(heights))}
+        farm["ground_pixel_m"] = FARM_PIXEL_M
     nm = scenes.common.wavelength_nm
-    trained = TrainedOn(
+    return TrainedOn(
         bands=len(nm),
         wavelength_nm=(float(nm.min()), float(nm.max())),
         exposure_ms=(min_exposure_ms, max(min_exposure_ms, data.camera.exposure_ms)),
         scenes=len(data.train),
         classes=scenes.common.names,
         bands_nm=tuple(nm.tolist()),
-    )
-    if data.files is not None:
-        return trained
-    moments = [read_farm_name(name)[1:] for name in data.train]
-    days = [day for day, _ in moments]
-    heights = [sun_over_farm(*moment).elevation_deg for moment in moments]
-    return replace(
-        trained, day=(min(days), max(days)), sun_elevation_deg=(min(heights), max(heights)), ground_pixel_m=FARM_PIXEL_M
+        **farm,
     )
 
 
@@ -156,6 +142,7 @@ def _learned(
     request: TrainRequest,
     scenes: Scenes,
     normalisation: Normalisation,
+    augmentation: CaptureAugmentation | None,
     begun: Weights | None,
     checkpoint: Path,
     device: str,
@@ -167,7 +154,6 @@ def _learned(
     examples = scenes.train.examples
     config = network_config(request, common)
     rng = np.random.default_rng([0x1DA])
-    augmentation = training_capture(normalisation, settings.darkest_ms)
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
     start = linear_classifier(pixels, config.classes) | (load_encoder() if config.deep else {})
     model, summary = train(
@@ -185,28 +171,25 @@ def _learned(
     frames = scenes.validation.examples
     found: dict[str, Any] = {}
     labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    weights, found["readings"] = better_reading(
-        weights, start, frames, few=begun is None and labelled < FEW_PIXELS, begun=begun
+    weights, found["readings"] = figures.better_reading(
+        weights, start, frames, few=begun is None and labelled < figures.FEW_PIXELS, begun=begun
     )
-    found["baselines"] = judge_baselines(examples, frames, config.classes, settings.seed, report)
+    found["baselines"] = figures.judge_baselines(examples, frames, config.classes, settings.seed, report)
     if frames:
         report("validating", 0.0, f"{len(frames)} scenes")
-        found[CALIBRATION] = judge_calibration(weights, frames, settings.seed)
-    twice = read_twice(weights, frames)
+        found[CALIBRATION] = figures.judge_calibration(weights, frames, settings.seed)
+    twice = figures.read_twice(weights, frames)
     if twice:
         found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
-    found["validation"] = validate(twice, config.classes)
+    found["validation"] = figures.validate(twice, config.classes)
     return weights, {"training": summary, **found}
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; print and return the record."""
     check_counts(request)
-    request = replace(request, command=request.command or asked_command())
     with one_after_the_other(console) as report:
-        record = train_weights(
-            request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
-        )
+        record = train_weights(request, report, lambda note: show_text(f"note: {note}", console))
     _print_figures(record, request, console)
     return record
 
@@ -223,53 +206,39 @@ def check_counts(request: TrainRequest) -> None:
         if number is not None and number < 0:
             raise SettingsError(f"{name} must be 0 or more, got {number}")
     if not 0 < settings.darkest_ms <= REFERENCE_MS:
-        raise SettingsError(
-            f"--min-exposure-ms must be above 0 and at most {REFERENCE_MS:g}, the reference exposure, got"
-            f" {settings.darkest_ms}"
-        )
-
-
-def asked_command() -> str:
-    """Return the command without folders, for the record."""
-    return shlex.join(["spectralzoom", *[Path(word).name if "/" in word else word for word in sys.argv[1:]]])
+        limits = f"above 0 and at most {REFERENCE_MS:g}, the reference exposure"
+        raise SettingsError(f"--min-exposure-ms must be {limits}, got {settings.darkest_ms}")
 
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
-    out = request.out
-    steps = record["training"]["steps"]
-    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {steps} steps", markup=False, soft_wrap=True)
+    size_mb = request.out.stat().st_size / 1e6
+    show_text(f"weights: {request.out} ({size_mb:.1f} MB), {record['training']['steps']} steps", console)
     readings = record["readings"]
     of_readings, of_baselines = (
         ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
         for scores in (readings["miou"], record["baselines"] or {})
     )
     text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
-    console.print(f"{text}kept: {readings['kept']}", soft_wrap=True)
+    show_text(f"{text}kept: {readings['kept']}", console)
+    what = "mIoU of classifiers of a random half of the training pixels, on the other half"
+    if of_readings:
+        what = f"on at most {PIXELS} of their pixels at full exposure"
     if of_baselines:
-        console.print(
-            f"on at most {PIXELS} of their pixels at full exposure: {of_baselines}"
-            if of_readings
-            else f"mIoU of classifiers of a random half of the training pixels, on the other half: {of_baselines}",
-            soft_wrap=True,
-        )
-    figures = record["validation"]
-    if figures is None:
+        show_text(f"{what}: {of_baselines}", console)
+    judged = record["validation"]
+    if judged is None:
         left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
         on = request.dataset if left else "OTHER_SCENES"
-        console.print(
-            "no scene was kept for validation; to judge the weights on other scenes: "
-            f"{shlex.join(['spectralzoom', 'evaluate', str(on), '--weights', str(out)])}"
-            + ("" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"),
-            markup=False,
-            soft_wrap=True,
-        )
+        command = shlex.join(["spectralzoom", "evaluate", on, "--weights", str(request.out)])
+        more = "" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"
+        show_text(f"no scene was kept for validation; to judge the weights on other scenes: {command}{more}", console)
         if request.settings.darkest_ms < REFERENCE_MS:
-            console.print("the file has no scan performance, by which survey --seconds chooses", soft_wrap=True)
+            show_text("the file has no scan performance, by which survey --seconds chooses", console)
         return
-    title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
+    title = f"{judged['scenes']} scene{'s' if judged['scenes'] > 1 else ''} kept for validation"
     rows = [
-        [name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy"))]
+        [name, *(f"{judged[name][figure]:.1%}" for figure in ("miou", "overall_accuracy"))]
         for name in ("none", "gain", "all")
     ]
     console.print(table(("patches", "mIoU", "overall"), rows, title=title))
-    console.print(f"none: overview alone; all: every patch in full; gain: {figures['fraction']:.0%} of the patches")
+    console.print(f"none: overview alone; all: every patch in full; gain: {judged['fraction']:.0%} of the patches")

@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.tasks.scene import pack_mask
-from spectralzoom.flows.terminal.figures import counted
-from spectralzoom.flows.training.data import Report, TrainingData, alike_notes, only_class, scene_notes, trained_pixels
-from spectralzoom.flows.training.observed_scenes import observe_scene
+from spectralzoom.flows.training.data import Report, TrainingData, alike_note, only_class, scene_notes, trained_pixels
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import Example, normalised
+from spectralzoom.models.training.examples import Example, normalised, observe_scene
 from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -60,6 +58,15 @@ class Common:
     colours: NDArray[np.uint8]
     patch: int
     wavelength_nm: NDArray[np.float64]
+
+    def check(self, scene: RasterScene) -> None:
+        """Raise SceneError where a scene has other classes or bands."""
+        if scene.class_names != self.names:
+            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {self.names}")
+        if not np.array_equal(scene.wavelength_nm, self.wavelength_nm):
+            raise SceneError(
+                f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
+            )
 
 
 @dataclass(frozen=True)
@@ -122,11 +129,9 @@ def _imaged(
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
     found = Imaged()
-    alike: dict[str, str] = {}
-    empty: list[str] = []
-    unfit: list[str] = []
-    regridded: list[str] = []
-    negative: list[str] = []
+    alike: dict[str, list[str]] = {}  # by their class
+    lists: list[list[str]] = [[], [], [], []]
+    empty, regridded, negative, unfit = lists
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name in enumerate(names):
         report(what, number / len(names), name)
@@ -137,12 +142,7 @@ def _imaged(
             continue
         mask = trained_pixels(scene)  # raises for a scene without labels
         common = common or _common(request, scene)
-        if scene.class_names != common.names:
-            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {common.names}")
-        if not np.array_equal(scene.wavelength_nm, common.wavelength_nm):
-            raise SceneError(
-                f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
-            )
+        common.check(scene)
         if trained is not None and (scene.key in trained.keys.values() or not mask.any()):
             unfit.append(name)
             continue
@@ -151,7 +151,7 @@ def _imaged(
         if request.choices.get("train_mask") is not None:
             found.pixels[scene.key] = pack_mask(mask)
         if (alone := only_class(scene)) is not None:
-            alike[name] = alone
+            alike.setdefault(alone, []).append(name)
         if scene.regridded:
             regridded.append(name)
         if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
@@ -159,16 +159,11 @@ def _imaged(
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
-    notes = alike_notes(alike)
-    if trained is None and len(alike) == len(found.keys) and len(notes) == 1:
+    notes = [alike_note(*one) for one in alike.items()]
+    if trained is None and [*alike.values()] == [[*found.keys]]:
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *scene_notes(empty, regridded, negative)):
+    for note in (*notes, *scene_notes(*lists)):
         tell(note)
-    if unfit:
-        tell(
-            f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
-            f" training scene: {list_some(unfit)}"
-        )
     return common, found
 
 
@@ -176,8 +171,8 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if not scene.class_names:
         raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
     if len(scene.class_names) < 2:
-        notes = alike_notes({scene.name: scene.class_names[0]})
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
+        note = alike_note(scene.class_names[0], [scene.name])
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     built_in = bool(built_in_laws(request.dataset))
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns or COLUMNS[built_in])
     patch = request.patch or suggested_patch(scene.shape, built_in=built_in)

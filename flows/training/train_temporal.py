@@ -6,29 +6,28 @@ line spacing, which the weights segment. Other lands then measure what the prior
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from spectralzoom.flows.terminal.progress import one_after_the_other
+from spectralzoom.flows.terminal.progress import one_after_the_other, show_text
 from spectralzoom.flows.training.data import Report, check_out
-from spectralzoom.flows.training.observed_scenes import observe_finely
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.reading.inference import map_of_columns
 from spectralzoom.models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse, pooled
-from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation, ColumnNoise
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
+from spectralzoom.models.training.examples import Example, observe_scene
 from spectralzoom.models.training.temporal import PastPass, TemporalTraining, Visit, train_reader
 from spectralzoom.models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.grid import SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
@@ -123,44 +122,33 @@ def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
 
 def _visit(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> Visit:
     """Return a land on a day, as scans drawn at random show it."""
-    seen = _Land.observed(weights, seed, day, hour, rng)
+    land = _observed(weights, seed, day, hour, rng)
     drawn = []
     for _ in range(PASSES):
         step = int(rng.choice(list(SPACINGS), p=list(SPACINGS.values())))
         exposure_ms = float(np.exp(rng.uniform(np.log(MIN_EXPOSURE_MS), np.log(MAX_EXPOSURE_MS))))
-        observation = seen.observe(weights, step, exposure_ms, rng)
+        observation = _scan(weights, land, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
         drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))
-    return Visit(day + hour / 24, seen.labels, drawn)
+    return Visit(day + hour / 24, land.labels, drawn)
 
 
-@dataclass(frozen=True)
-class _Land:
-    """A land as a scan of every line at the reference exposure shows it."""
+def _observed(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> Example:
+    """Image the farm of a seed on a day by every line at the reference exposure, in normalised columns."""
+    camera = LineCamera()
+    scene = farm_scene(seed, SHAPE, camera=camera, day=day, hour=hour)
+    seen = observe_scene(scene, camera, SceneGrid(*SHAPE, weights.config.patch), weights.basis, rng)
+    return replace(seen, columns=weights.normalisation.apply(seen.columns, np.ones(weights.basis.columns, np.bool_)))
 
-    columns: NDArray[np.float32]  # normalised, of the padded grid
-    noise: ColumnNoise
-    labels: NDArray[np.uint8]
-    grid: SceneGrid
 
-    @staticmethod
-    def observed(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> _Land:
-        """Image the farm of a seed on a day, with noise of its own."""
-        camera = LineCamera()
-        scene = farm_scene(seed, SHAPE, camera=camera, day=day, hour=hour)
-        grid = SceneGrid(*SHAPE, weights.config.patch)
-        seen, noise = observe_finely(scene, camera, grid, weights.basis, int(rng.integers(2**31)))
-        padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
-        columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))
-        return _Land(columns, noise, np.asarray(scene.labels, np.uint8), grid)
-
-    def observe(self, weights: Weights, step: int, exposure_ms: float, rng: np.random.Generator) -> CurrentVisit:
-        """Return a visit by a uniform scan, segmented by the weights."""
-        light = exposure_ms / REFERENCE_MS
-        augmentation = CaptureAugmentation(weights.normalisation)
-        scan = augmentation.scanned(self.columns, self.noise, light=light, step=step, rng=rng)
-        _, every_class = map_of_columns(weights, scan, self.grid, LineSpec(light, step))
-        return CurrentVisit(every_class, np.ones(self.labels.shape, np.bool_), pooled(scan), light, step)
+def _scan(weights: Weights, land: Example, step: int, exposure_ms: float, rng: np.random.Generator) -> CurrentVisit:
+    """Return a visit by a uniform scan, segmented by the weights."""
+    assert land.noise is not None
+    light = exposure_ms / REFERENCE_MS
+    augmentation = CaptureAugmentation(weights.normalisation)
+    scan = augmentation.scanned(land.columns, land.noise, light=light, step=step, rng=rng)
+    _, every_class = map_of_columns(weights, scan, SceneGrid(*SHAPE, weights.config.patch), LineSpec(light, step))
+    return CurrentVisit(every_class, np.ones(SHAPE, np.bool_), pooled(scan), light, step)
 
 
 def judge_temporal(weights: Weights, reader: TemporalReader, seed: int, report: Report) -> list[dict[str, float]]:
@@ -173,12 +161,11 @@ def judge_temporal(weights: Weights, reader: TemporalReader, seed: int, report: 
     for number in range(JUDGED_LANDS):
         own = JUDGED_SEED + number
         rng = np.random.default_rng([seed, own])
-        land = _Land.observed(weights, own, JUDGED_DAY, 11.0, rng)
-        before = land.observe(weights, *BEFORE, rng)
+        before = _scan(weights, _observed(weights, own, JUDGED_DAY, 11.0, rng), *BEFORE, rng)
         for row, days in enumerate(JUDGED_AFTER):
             report("judging", (number + row / len(JUDGED_AFTER)) / JUDGED_LANDS, f"{days} d")
-            later = _Land.observed(weights, own, JUDGED_DAY + days, 11.0, rng)
-            now, anew = (later.observe(weights, *how, rng) for how in (NOW, BEFORE))
+            later = _observed(weights, own, JUDGED_DAY + days, 11.0, rng)
+            now, anew = (_scan(weights, later, *how, rng) for how in (NOW, BEFORE))
             prior_map = PriorMap(first_probabilities(before), before.coarse, float(days), JUDGED_DAY + days)
             fused = fuse(prior_map, now, None), fuse(prior_map, now, reader)
             maps = [*map(first_probabilities, (before, now, anew)), *fused]
@@ -194,9 +181,7 @@ def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``, and return the record of the file."""
     with one_after_the_other(console) as report:
         record = train_temporal(request, report)
-    console.print(
-        f"weights with a temporal reader: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
-    )
+    show_text(f"weights with a temporal reader: {request.out}, {record['steps']} steps", console)
     title = f"mIoU on {JUDGED_LANDS} lands that training did not see"
     table = Table("days later", *MAPS.values(), title=title)
     for row in record["validation"]:

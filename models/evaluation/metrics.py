@@ -60,12 +60,7 @@ def iou_per_class(counts: NDArray[np.number]) -> Floats:
     """Return the IoU of each class, (..., class, class) -> (..., class); NaN for one that the labels lack."""
     hit = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
     union = counts.sum(axis=-2) + counts.sum(axis=-1) - hit
-    return _divided(hit, union, where=labelled_classes(counts))
-
-
-def _divided(total: NDArray[np.number], number: NDArray[np.number], where: NDArray[np.bool_]) -> Floats:
-    """Return a quotient, NaN elsewhere."""
-    return np.asarray(np.divide(total, number, out=np.full(np.shape(total), np.nan), where=where))
+    return np.asarray(np.divide(hit, union, out=np.full(hit.shape, np.nan), where=labelled_classes(counts)))
 
 
 def mean_iou(counts: Numbers) -> float:
@@ -137,12 +132,8 @@ def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
     if not error > BAD_ERROR:
         return {"scenes": len(maps), "expected_error": error}
     temperature = fitted_temperature(maps, seed)
-    return {
-        "scenes": len(maps),
-        "expected_error": _error(maps, temperature),
-        "expected_error_before": error,
-        "temperature": temperature,
-    }
+    after = {"expected_error": _error(maps, temperature), "expected_error_before": error, "temperature": temperature}
+    return {"scenes": len(maps), **after}
 
 
 def fitted_temperature(maps: list[JudgedMap], seed: int) -> float:

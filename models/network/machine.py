@@ -25,12 +25,11 @@ def choose_device(asked: str) -> Present:
         return PROCESSOR
     import torch
 
-    kinds: tuple[tuple[Present, bool], ...] = (
-        ("cuda", torch.cuda.is_available()),
-        ("mps", torch.backends.mps.is_available()),
-        (PROCESSOR, True),
-    )
-    there = [name for name, available in kinds if available]
+    there = [PROCESSOR]
+    if torch.backends.mps.is_available():
+        there.insert(0, "mps")
+    if torch.cuda.is_available():
+        there.insert(0, "cuda")
     found = next((name for name in there if asked in ("auto", name)), None)
     if found is None:
         known = ", ".join(get_args(Device))

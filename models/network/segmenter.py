@@ -11,6 +11,7 @@ channels; the last ones describe the capture (`models.network.spectral.LineSpec`
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import cast
@@ -31,11 +32,8 @@ def code_2d(yx: Tensor, dim: int) -> Tensor:
     """Return sines and cosines of both coordinates, (..., 2) cells -> (..., dim) float32.
 
     Periods run geometrically from 2 to 128 cells. Angles are float64 and cast once: the error stays below 1e-6 at
-    1e7 px, where float32 angles would be wrong by half a turn.
-    Raises ShapeError for a width that does not divide by 4, or places in half precision.
+    1e7 px, where float32 angles would be wrong by half a turn. Raises ShapeError for places in half precision.
     """
-    if dim % 4:
-        raise ShapeError(f"a 2-D code needs a width that divides by 4, got {dim}")
     if yx.dtype in (torch.float16, torch.bfloat16):  # exact up to 2048 and 256 only
         raise ShapeError(f"places of tokens must be float32, float64 or whole numbers, got {yx.dtype}")
     periods = torch.linspace(math.log(2.0), math.log(LONGEST_PERIOD), dim // 4, dtype=torch.float64).exp()
@@ -49,8 +47,6 @@ class TokenAttention(nn.Module):
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
-        if dim % heads:
-            raise ShapeError(f"tokens of width {dim} do not divide by {heads} heads; choose another number of heads")
         self.heads = heads
         self.qkv = nn.Linear(dim, 3 * dim)
         self.out = nn.Linear(dim, dim)
@@ -80,17 +76,12 @@ class EncoderBlock(nn.Module):
         return cast(Tensor, x + self.mlp(self.norm2(x)))
 
 
-class Encoder(nn.Module):
-    """Stack of transformer blocks."""
+class Encoder(nn.Sequential):
+    """Stack of transformer blocks, (B, N, d) -> (B, N, d)."""
 
     def __init__(self, dim: int, layers: int, heads: int, mlp_ratio: int) -> None:
-        super().__init__()
-        self.blocks = nn.Sequential(*(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers)))
-        self.norm = nn.LayerNorm(dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Encode tokens, (B, N, d) -> (B, N, d)."""
-        return cast(Tensor, self.norm(self.blocks(x)))
+        blocks = nn.Sequential(*(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers)))
+        super().__init__(OrderedDict(blocks=blocks, norm=nn.LayerNorm(dim)))
 
 
 def cut(image: Tensor, patch: int) -> Tensor:

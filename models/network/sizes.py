@@ -107,13 +107,9 @@ class MultiplyAdds:
 
 
 def multiply_adds(
-    config: SegmenterConfig, grid: SceneGrid, patches: int, bands: int, *, score: int = 0, apart: bool = False
+    config: SegmenterConfig, grid: SceneGrid, patches: int, bands: int, *, score: int = 0
 ) -> MultiplyAdds:
-    """Count a field of ``bands`` bands or components, ``patches`` patches read in full; their policy took ``score``.
-
-    Spectral features are counted once, or again for each patch where patches were captured ``apart``.
-    """
-    basis = bands * config.columns
+    """Count a field of ``bands`` bands or components, ``patches`` patches read in full; their policy took ``score``."""
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
     tokens = rows * columns
     inputs = config.columns + PLANES
@@ -121,8 +117,8 @@ def multiply_adds(
     overview = TOKEN_PX**2 * config.columns * config.classes  # spectral classifier
     overview += (_photo_pyramid if config.deep else _pyramid)(inputs, config.overview_width, TOKEN_PX)
     overview += 2 * lowest * config.dim  # to a token and back
-    drawn = math.prod(grid.padded_shape) * (basis + config.overview_width * config.classes)
-    patch = config.patch**2 * (apart * basis + config.width * config.classes)
+    drawn = math.prod(grid.padded_shape) * (bands * config.columns + config.overview_width * config.classes)
+    patch = config.patch**2 * config.width * config.classes
     patch += _pyramid(inputs + config.overview_width, config.width, config.patch)
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)

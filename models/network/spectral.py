@@ -36,7 +36,7 @@ class SpectralBasis:
     @staticmethod
     def spanning(wavelength_nm: NDArray[np.floating], most_columns: int = 24) -> SpectralBasis:
         """Return a basis for these bands, with at most one column a band."""
-        wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
+        wavelength = checked_wavelengths(wavelength_nm)
         distinct = len(np.unique(wavelength))
         return SpectralBasis(float(wavelength.min()), float(wavelength.max()), min(most_columns, distinct))
 
@@ -48,7 +48,7 @@ class SpectralBasis:
 
         Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
-        wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
+        wavelength = checked_wavelengths(wavelength_nm)
         span_nm = self.high_nm - self.low_nm
         apart_nm = span_nm / (self.columns - 1) if self.columns > 1 else max(span_nm, LONGEST_NM)  # one covers all
         distance = (wavelength[:, None] - np.linspace(self.low_nm, self.high_nm, self.columns)) / apart_nm
@@ -80,11 +80,11 @@ def project(values: NDArray[np.floating], matrix: NDArray[np.float32]) -> NDArra
     return seen
 
 
-def checked_wavelengths(wavelength_nm: NDArray[np.floating], bands: int) -> NDArray[np.float64]:
-    """Return the wavelengths as float64 after checking number, finiteness and unit; raises WavelengthError."""
+def checked_wavelengths(wavelength_nm: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the wavelengths as float64. Raises WavelengthError: none, or one that is not finite or in another unit."""
     wavelength = np.asarray(wavelength_nm, np.float64)
-    if wavelength.shape != (bands,) or bands == 0:
-        raise WavelengthError(f"expected one wavelength for each of {bands} bands, got {wavelength.size}")
+    if not wavelength.size:
+        raise WavelengthError("expected at least one band with a wavelength, got none")
     outside = ~((wavelength >= SHORTEST_NM) & (wavelength <= LONGEST_NM))
     if outside.any():
         raise WavelengthError(

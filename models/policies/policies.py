@@ -13,7 +13,7 @@ from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import patches_of
 from spectralzoom.models.reading.inference import CoarsePrediction
 from spectralzoom.pipeline.errors import SettingsError
-from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
 
 Scores = NDArray[np.float64]
 Policy = Literal["gain", "entropy", "sobel", "random", "mask"]
@@ -37,21 +37,19 @@ def score_patches(
     Raises SettingsError for an unknown policy.
     """
     grid = seen.grid
-    if policy == "random":
-        scores = np.random.default_rng([seed, 0x5EA7]).random(grid.patch_shape)
-    elif policy == "gain":
+    if policy == "gain":
         found = class_errors(seen)
         return gain_of(found[:, 0], found[:, 1].sum(axis=0))
+    if policy == "random":
+        scores = np.random.default_rng([seed, 0x5EA7]).random(len(grid.every_patch()))
     elif policy == "mask":
-        image = np.zeros(grid.padded_shape)
         values = np.asarray(mask, np.float64).reshape(grid.height, grid.width, -1).mean(axis=-1)
-        image[: grid.height, : grid.width] = np.nan_to_num(values)
-        scores = _patch_means(image, seen)
+        scores = _patch_means(np.nan_to_num(values), grid)
     elif policy in PIXEL_SCORES and (of := PIXEL_SCORES[policy].of) is not None:
-        scores = _patch_means(of(seen), seen)
+        scores = _patch_means(of(seen)[: grid.height, : grid.width], grid)
     else:
         raise SettingsError(f"unknown policy {policy!r}; choose one of {', '.join(POLICIES)}")
-    return (scores * grid.valid_fraction()).ravel()
+    return scores * grid.valid_fraction().ravel()
 
 
 def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid) -> int:
@@ -121,13 +119,7 @@ SEEING_POLICIES = tuple(PIXEL_SCORES)  # depend on the surroundings alone: a lar
 GLANCING_POLICIES = ("gain", "entropy")  # depend on the network's prediction
 
 
-def _patch_means(pixels: NDArray[np.float64], seen: CoarsePrediction) -> Scores:
-    """Return the mean over the pixels of each patch that lie on the scene."""
-    grid = seen.grid
-    on_scene = np.zeros(grid.padded_shape)
-    on_scene[: grid.height, : grid.width] = 1.0
-    total, count = (
-        patches_of(image, grid.patch).sum(axis=(1, 2)).reshape(grid.patch_shape)
-        for image in (pixels * on_scene, on_scene)
-    )
-    return np.asarray(np.divide(total, count, out=np.zeros(grid.patch_shape), where=count > 0))
+def _patch_means(pixels: NDArray[np.float64], grid: SceneGrid) -> Scores:
+    """Return the mean over the pixels (y, x) of the scene in each patch; 0 without a pixel."""
+    total, count = (patch_pixels(grid, image).sum(axis=(1, 2)) for image in (pixels, np.ones(pixels.shape)))
+    return np.asarray(np.divide(total, count, out=np.zeros(total.shape), where=count > 0))

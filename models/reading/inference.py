@@ -306,21 +306,16 @@ def overview_of(weights: Weights, coarse_pass: CoarsePass) -> Overview:
 
 
 def draw(logits: Tensor, *, every_class: bool = False) -> DrawnMap:
-    """Choose the class of each pixel by logits (class, y, x), some rows at a time."""
+    """Choose the class of each pixel by logits (class, y, x), some rows at a time; none where one is not finite."""
+    import torch
+
     _, y, x = logits.shape
     every = np.empty((y, x, len(logits)), np.float32) if every_class else None
     drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32), every)
     for rows in cuts(y, ROWS_DRAWN):
-        confidence, classes = decide(logits[:, rows], dim=0)
-        drawn.classes[rows], drawn.confidence[rows] = classes.numpy(), confidence.numpy()
-        if drawn.log_probability is not None:
-            drawn.log_probability[rows] = logits[:, rows].log_softmax(dim=0).permute(1, 2, 0).numpy()
+        confidence, classes = logits[:, rows].softmax(dim=0).max(dim=0)
+        drawn.confidence[rows] = confidence.numpy()
+        drawn.classes[rows] = torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8).numpy()
+        if every is not None:
+            every[rows] = logits[:, rows].log_softmax(dim=0).permute(1, 2, 0).numpy()
     return drawn
-
-
-def decide(logits: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Return the largest probability and its class, uint8; NaN and 255 where a logit is not finite."""
-    import torch
-
-    confidence, classes = logits.softmax(dim=dim).max(dim=dim)
-    return confidence, torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
@@ -79,7 +79,7 @@ class Condensing(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SceneSpectra:
-    """Moments of a scene's spectra without noise: crops are condensed by them as surveys condense their lines."""
+    """Moments of a scene's spectra: crops are condensed by them as surveys condense their lines."""
 
     centre: Matrix  # (band,) mean spectrum
     covariance: Matrix  # (band, band)
@@ -91,6 +91,12 @@ class SceneSpectra:
         """Return the variances (band,) of shot and read noise of the mean spectrum, at a fraction of the reference."""
         shot = np.maximum(self.centre, 0) * self.value_of_electron / light
         return shot, (self.value_of_electron * self.read_noise_e / light) ** 2
+
+    def without_noise(self) -> SceneSpectra:
+        """Subtract the noise of the reference exposure; a tenth of the directions have no signal beyond it."""
+        noise = np.sum(self.noise(1.0), axis=0)
+        power = np.linalg.eigvalsh(self.covariance / np.sqrt(np.outer(noise, noise)))
+        return replace(self, covariance=self.covariance - np.quantile(power, 0.1) * np.diag(noise))
 
     @lru_cache(maxsize=2048)  # noqa: B019 - a training has some dozens of scenes, which stay
     def condensing(self, light: float) -> Condensing:

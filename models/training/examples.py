@@ -1,9 +1,16 @@
-"""Training data: labelled scenes imaged by the camera model, and random crops of them."""
+"""Training data: labelled scenes as spectral features, and random crops of them.
+
+Built-in farms are captured by the simulated rig as in a survey. Effects are chosen by the defaults, and the full scan
+is rendered, calibrated and rectified. Scene files are images of a camera already: they pass only the footprint and
+noise of `observe`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,11 +20,12 @@ from torch import Tensor
 
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import TOKEN_PX
-from spectralzoom.models.network.spectral import LineSpec, Normalisation, SpectralBasis
+from spectralzoom.models.network.spectral import LineSpec, Normalisation, SpectralBasis, project
 from spectralzoom.models.training.capture_augmentation import (
     REFERENCE_MS,
     CaptureAugmentation,
     ColumnNoise,
+    SceneSpectra,
     beside,
     normal,
     with_capture,
@@ -25,14 +33,27 @@ from spectralzoom.models.training.capture_augmentation import (
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.planning.coverage import cheapest_full
+from spectralzoom.pipeline.rectify.region import mosaic_rows
+from spectralzoom.pipeline.signal.subspace import FEW_BANDS
+from spectralzoom.pipeline.simulator.effects.effect import Chosen
+from spectralzoom.pipeline.simulator.render import EFFECTS
+from spectralzoom.pipeline.simulator.rig_model import Rig
+from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
+from spectralzoom.pipeline.simulator.selection.choice import decide
+from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
+from spectralzoom.pipeline.source import References
 
 NOISY = 0.25  # fraction of crops with added noise
 BRIGHTNESS = 0.04  # standard deviation of the factor of a crop's light
 ZOOMED = 0.7  # fraction of crops that are zoomed, if any
 ZOOMS = (-0.6, 0.5)  # octaves of their pixels
 HALO = 8  # rows around a strip that its footprint reaches
-STRIP_ROWS = 64  # most rows of a strip
+STRIP_ROWS = 64  # most rows of a strip, and rows that are rectified at a time
+TOLERANCE_SIGMA = 0.1  # default of a survey
 
 
 @dataclass(frozen=True)
@@ -46,6 +67,14 @@ class Example:
     noise: ColumnNoise | None = None
 
 
+def observe_scene(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
+) -> Example:
+    """Image a labelled scene on the basis, with noise by ``rng``. Raises SceneError: a gap."""
+    built_in = scene.key.partition("/")[0] in LAWS
+    return (observe_farm if built_in else observe)(scene, camera, grid, basis, rng)
+
+
 def observe(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Example:
@@ -55,8 +84,6 @@ def observe(
     """
     matrix, _ = basis.matrix(scene.wavelength_nm)
     planes = np.asarray(pad_by_reflection(scene.planes, grid.padded_shape), np.float32)
-    labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
-    labels[: grid.height, : grid.width] = np.asarray(scene.labels, np.uint8)
     rows, width = grid.padded_shape
     strip = math.gcd(rows, STRIP_ROWS)
     columns = np.empty((rows, width, basis.columns), np.float32)
@@ -68,7 +95,64 @@ def observe(
         electrons = electrons_of(scene, blurred, camera)
         columns[top : top + strip] = (expose(electrons, camera, rng=stream) * scale) @ matrix
     noise = ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
-    return Example(scene.name, columns, labels, (grid.height, grid.width), noise)
+    return _example(scene, grid, columns, noise)
+
+
+def _example(scene: RasterScene, grid: SceneGrid, columns: NDArray[np.float32], noise: ColumnNoise) -> Example:
+    """Return an example with columns of the padded grid; labels are padded by unlabelled pixels."""
+    gap = [(0, whole - size) for whole, size in zip(grid.padded_shape, scene.shape, strict=True)]
+    labels = np.pad(np.asarray(scene.labels, np.uint8), gap, constant_values=UNLABELLED)
+    return Example(scene.name, columns, labels, scene.shape, noise)
+
+
+class _KeptSweep(SimulatedSweep):
+    """A sweep that keeps its rendered lines."""
+
+    @cached_property
+    def raw(self) -> NDArray[np.uint16]:
+        return self.source.render(self.sweep, range(self.sweep.lines))
+
+    @cached_property
+    def references(self) -> References:
+        return self.source.references(self.sweep)
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        return self.raw[start:stop]
+
+
+def observe_farm(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
+) -> Example:
+    """Scan a farm by every line of the simulated rig. Raises SceneError: a gap."""
+    rig, cost = Rig(camera), CostModel()
+    _, full, _ = cheapest_full(grid, camera, cost)
+    effects, clock = chosen_effects(scene, rig, full), sweep_starts(full, camera, cost)
+    source = SimulatedSource(scene, rig, int(rng.integers(2**31)), effects, clock=clock)
+    matrix, _ = basis.matrix(scene.wavelength_nm)
+    bands = len(matrix)
+    rows: list[NDArray[np.float32]] = []
+    count, total, products = 0, np.zeros(bands), np.zeros((bands, bands))  # sums of the powers 0, 1 and 2
+    for part in mosaic_rows([_KeptSweep(source, sweep) for sweep in full], camera, grid, rows=STRIP_ROWS):
+        rows.append(project(part, matrix))
+        some = part[::2, ::2].reshape(-1, bands).astype(np.float64)
+        count += len(some)
+        total += some.sum(axis=0)
+        products += some.T @ some
+    columns = np.concatenate(rows)
+    if not np.isfinite(columns).all():
+        raise SceneError(f"scene {scene.name} has pixels that no line reached; training needs all of it")
+    mean = total / count
+    value = value_of_electron(scene)
+    noise = ColumnNoise.of_bands(matrix, value, camera.read_noise_e)
+    if bands > FEW_BANDS:
+        spectra = SceneSpectra(mean, products / count - np.outer(mean, mean), matrix, value, camera.read_noise_e)
+        noise = replace(noise, spectra=spectra.without_noise())
+    return _example(scene, grid, np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32), noise)
+
+
+def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Chosen:
+    """Choose effects as a survey of these sweeps does."""
+    return decide(probe_survey(scene, rig, sweeps, "sigma"), rig, EFFECTS, TOLERANCE_SIGMA).chosen
 
 
 def value_of_electron(scene: RasterScene) -> NDArray[np.float64]:

@@ -10,8 +10,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -154,18 +153,17 @@ def _sequences(lands: Sequence[Sequence[Visit]], settings: TemporalTraining, rng
     """Draw crops of lands through several visits, rotated and mirrored alike."""
     drawn = [_sequence(lands[int(rng.integers(len(lands)))], settings, rng) for _ in range(settings.batch)]
     batches = []
-    for number in range(settings.visits):
-        parts = list(zip(*(one[number] for one in drawn), strict=True))
-        observation, coarse, labels, seen = (torch.from_numpy(np.stack(part)) for part in parts[:4])
-        observation = observation - observation.logsumexp(dim=1, keepdim=True)
-        days, light, step, comparable, season = (torch.tensor(part, dtype=torch.float32) for part in parts[4:])
-        column = days[:, None, None, None], comparable[:, None, None, None]
-        batches.append(_Batch(observation, coarse, labels.long(), seen, column[0], light, step, season, column[1]))
+    for visits in zip(*drawn, strict=True):
+        batch = _Batch(*(torch.from_numpy(np.stack(part)) for part in zip(*visits, strict=True)))
+        observation = batch.observation - batch.observation.logsumexp(dim=1, keepdim=True)
+        batches.append(replace(batch, observation=observation, labels=batch.labels.long()))
     return batches
 
 
-def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator) -> list[tuple[Any, ...]]:
-    """Return one crop through visits of a land; the last visit is repeated if there are too few."""
+def _sequence(
+    land: Sequence[Visit], settings: TemporalTraining, rng: np.random.Generator
+) -> list[list[NDArray[np.generic]]]:
+    """Return one crop through visits of a land, as in `_Batch`; the last visit is repeated if there are too few."""
     side = settings.crop
     first = int(rng.integers(0, max(len(land) - settings.visits, 0) + 1))
     visits = [land[min(first + number, len(land) - 1)] for number in range(settings.visits)]
@@ -173,7 +171,7 @@ def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.
     fine = np.s_[y : y + side, x : x + side]
     small = np.s_[y // CELL_PX : (y + side) // CELL_PX, x // CELL_PX : (x + side) // CELL_PX]
     turns, mirrored = int(rng.integers(4)), bool(rng.integers(2))
-    sequence: list[tuple[Any, ...]] = []
+    sequence: list[list[NDArray[np.generic]]] = []
     before = visits[0].moment
     dated = rng.random() >= UNDATED
     for number, visit in enumerate(visits):
@@ -188,9 +186,10 @@ def _sequence(land: Sequence[Visit], settings: TemporalTraining, rng: np.random.
         )
         turned = [np.rot90(image[::-1] if mirrored else image, turns) for image in images]
         channels_first = [image.transpose(2, 0, 1) if image.ndim == 3 else image for image in turned]
-        comparable = float(rng.random() >= INCOMPARABLE)
-        taken = coarse_pass.light, float(coarse_pass.step), comparable, season_of(visit.moment if dated else None)
-        sequence.append((*map(np.ascontiguousarray, channels_first), abs(visit.moment - before), *taken))
+        days, comparable = ([[[one]]] for one in (abs(visit.moment - before), rng.random() >= INCOMPARABLE))
+        season = season_of(visit.moment if dated else None)
+        taken = (np.array(one, np.float32) for one in (days, coarse_pass.light, coarse_pass.step, season, comparable))
+        sequence.append([*map(np.ascontiguousarray, channels_first), *taken])
         before = visit.moment
     return sequence
 

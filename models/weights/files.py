@@ -56,13 +56,9 @@ class TrainedOn:
     ground_pixel_m: float | None = None
     bands_nm: tuple[float, ...] | None = None  # centre of each band
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for a record."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-
     @staticmethod
     def read(content: Mapping[str, Any]) -> TrainedOn:
-        """Read values of `as_dict`. Raises TypeError for other entries."""
+        """Read its values in a record. Raises TypeError for other entries."""
         plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in content.items()}
         return TrainedOn(**plain)
 
@@ -268,7 +264,7 @@ def describe_weights(path: Path) -> Description:
         basis = SpectralBasis(**about["basis"])
         names = tuple(map(str, about["class_names"]))
         record = dict(about["record"])
-        checked_wavelengths(np.array([basis.low_nm, basis.high_nm]), 2)
+        checked_wavelengths(np.array([basis.low_nm, basis.high_nm]))
         if basis.columns != config.columns or basis.low_nm > basis.high_nm:
             raise WavelengthError(
                 f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected "

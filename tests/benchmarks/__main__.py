@@ -1,4 +1,4 @@
-"""Run the benchmarks in this folder and print one table: python tests/benchmarks [name ...] [--markdown FILE].
+"""Run the benchmarks in this folder and print one table: python tests/benchmarks [name ...].
 
 A name is the part of the file name after bench_. Missed goals are printed too. A benchmark that crashes is named, the
 others still run, and the exit code is 1.
@@ -22,7 +22,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parents[1])]
 
-from measure import Row, aligned, markdown_lines  # noqa: E402
+from measure import Row, aligned  # noqa: E402
 
 HEADINGS = ("what", "figure", "goal", "met", "peers")
 WIDTHS = (58, 26, 24, 3, 60)
@@ -30,16 +30,12 @@ MET = {True: "yes", False: "NO", None: "-"}
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the requested benchmarks, or all; print the table, and write it as Markdown if a file is given."""
+    """Run the requested benchmarks, or all, and print the table."""
     parser = argparse.ArgumentParser(prog="python tests/benchmarks", description="Benchmarks with goals and peers.")
     parser.add_argument("names", nargs="*", help="benchmarks to run, as in bench_NAME.py; all where none is given")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table as Markdown as well")
     asked = parser.parse_args(arguments)
-    found = list(HERE.glob("**/bench_*.py"))
-    sys.path[:0] = sorted({str(path.parent) for path in found})
-    there = sorted(path.stem.removeprefix("bench_") for path in found)
-    unknown = sorted(set(asked.names) - set(there))
-    if unknown:
+    there = sorted(path.stem.removeprefix("bench_") for path in HERE.glob("bench_*.py"))
+    if unknown := sorted(set(asked.names) - set(there)):
         parser.error(f"no benchmark {', '.join(unknown)}; there are: {', '.join(there)}")
     tables: dict[str, Sequence[Row]] = {}
     failed = []
@@ -61,10 +57,6 @@ def main(arguments: Sequence[str]) -> int:
     print(f"; missed: {'; '.join(missed)}" if missed else "")
     if failed:
         print(f"crashed: {', '.join(failed)}")
-    if asked.markdown:
-        lines = markdown_lines(_cells_of([row for rows in tables.values() for row in rows]))
-        asked.markdown.write_text("\n".join([*lines, "", _machine(), ""]), encoding="utf-8")
-        print(f"{asked.markdown}")
     return 1 if failed else 0
 
 
@@ -76,7 +68,7 @@ def _machine() -> str:
     """Return processor, cores, load and versions in one line."""
     from spectralzoom.flows.tradeoff import describe_machine, mean_load
 
-    it: dict[str, Any] = describe_machine(threads=1)
+    it: dict[str, Any] = describe_machine()
     versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())
     return f"{it['processor']}, {it['cores']} cores, load {mean_load()}, one thread; python {it['python']}, {versions}"
 

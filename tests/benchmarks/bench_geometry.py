@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from measure import Row, time_in_turn
+from measure import Row
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.geometry import mirror
@@ -17,7 +17,7 @@ IFOV = LineCamera().ifov_rad
 
 
 def rows() -> list[Row]:
-    return [_round_trip(np.float64, 1e-12), _round_trip(np.float32, 1e-6), _fifty_digits(), *_rotation(), _time()]
+    return [_round_trip(np.float64, 1e-12), _round_trip(np.float32, 1e-6), _fifty_digits(), *_rotation()]
 
 
 def _disk(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -106,16 +106,3 @@ def _noise() -> tuple[float, float]:
     turn = line_rotation(noisy) - line_rotation(direction)
     slope, exact = (slope_rotation(mirror.direction_to_position(one)) for one in (noisy, direction))
     return 320 * float(np.sqrt(np.mean(turn**2))), float(np.rad2deg(np.sqrt(np.mean((slope - exact) ** 2))))
-
-
-def _time() -> Row:
-    position = _disk(COUNT)
-    given = {name: position.astype(name) for name in ("float64", "float32")}
-    calls = {
-        name: lambda one=one: mirror.direction_to_position(mirror.position_to_direction(one))
-        for name, one in given.items()
-    }
-    spent = {name: 1e9 * clock.cpu_min_s / COUNT for name, clock in time_in_turn(calls, rounds=3).items()}
-    return Row(
-        "time of position -> ray -> position", f"{spent['float64']:.3g} ns", peers=f"float32: {spent['float32']:.3g} ns"
-    )

@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from measure import Row, aligned, data_folder, not_run
+from measure import Row, aligned, data_folder, not_run, print_rows
 from numpy.typing import NDArray
 from paper_sets import CAMERA, INPUTS, DataSet, Image, Say, coarse_image, farm_all, farm_four, folder
 
@@ -26,6 +26,7 @@ from spectralzoom.models.evaluation.metrics import confusion, mean_iou, overall_
 from spectralzoom.models.network.machine import keep_freed_memory, one_thread
 from spectralzoom.models.network.sizes import multiply_adds
 from spectralzoom.models.network.spectral import LineSpec, patches_of
+from spectralzoom.models.policies.placement import mixed
 from spectralzoom.models.policies.policies import PIXEL_SCORES, score_multiply_adds, score_patches
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from spectralzoom.models.training.examples import normalised, observe
@@ -72,10 +73,8 @@ class Readings:
     def counts(self, chosen: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the confusion of the map with the chosen patches read in full."""
         grid = self.seen.grid
-        mask = np.zeros(grid.patch_shape, np.bool_)
-        mask.ravel()[chosen] = True
-        pixels = mask.repeat(grid.patch, 0).repeat(grid.patch, 1)[: grid.height, : grid.width]
-        return confusion(self.labels, np.where(pixels, self.full, self.overview), self.classes)
+        drawn = mixed(self.overview, self.full, np.isin(grid.every_patch(), chosen), grid)
+        return confusion(self.labels, drawn, self.classes)
 
     def scores(self, policy: str, pooling: str, seed: int) -> Scores:
         """Score every patch, (patch,), by a row of `POLICIES`."""
@@ -144,7 +143,7 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
         observed = observe(scene, CAMERA, grid, data.weights.basis, np.random.default_rng([number, 0x9A9E]))
         _, reached = data.weights.basis.matrix(scene.wavelength_nm)
         columns = normalised(observed, data.weights.normalisation, reached).columns.astype(np.float32)
-        every = len(grid.every_patch())
+        every, bands = len(grid.every_patch()), len(scene.wavelength_nm)
         for factor in (*INPUTS, 1):
             read = read_scene(data.weights, columns, scene.labels, grid, factor)
             coarse = 0 if factor == 1 else int(np.prod([-(-n // (grid.patch * factor)) for n in scene.shape]))
@@ -156,11 +155,13 @@ def judge(data: DataSet, counts: Sequence[int], say: Say) -> Tallies:
                 cost = 0 if policy in ("random", "ideal") else score_multiply_adds(policy, config, grid)
                 for text, k in rows.items():
                     own = cost if 0 < k < every else 0
-                    spent = multiply_adds(config, grid, k, len(scene.wavelength_nm), score=own, apart=factor > 1)
+                    spent = multiply_adds(config, grid, k, bands, score=own).total
+                    if factor > 1:  # patches are captured apart
+                        spent += k * grid.patch**2 * bands * config.columns
                     row = found.setdefault((factor, label, text), Tally())
                     row.counts.append([read.counts(select_patches(one, k)) for one in scores])
                     row.patches.append(coarse + k)
-                    row.multiply_adds.append(spent.total)
+                    row.multiply_adds.append(spent)
     return found
 
 
@@ -229,12 +230,5 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def main(arguments: Sequence[str]) -> int:
-    for row in rows(arguments):
-        met = {True: "holds", False: "does NOT hold", None: ""}[row.met]
-        print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    print_rows(rows(sys.argv[1:]))

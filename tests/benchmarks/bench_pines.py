@@ -1,8 +1,8 @@
 """Indian Pines, trained and tested on halves of the same fields: the segmenter against LDA, SVM and random forest.
 
-All methods read the spectra of the file, and those of the simulated camera with blur and noise, as in surveys and
-`spectralzoom train`. The peers read every band, as single pixels and as means of 5 x 5 px. Their settings are chosen
-on the training pixels alone, one half of each field against the other, like the test halves.
+All methods read the spectra of the simulated camera with blur and noise, as in surveys and `spectralzoom train`. The
+peers read every band, as single pixels and as means of 5 x 5 px. Their settings are chosen on the training pixels
+alone, one half of each field against the other, like the test halves.
 `bench_pines.py --weights FILE` evaluates given weights instead of training some. Set OMP_NUM_THREADS=1.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import Row, data_folder, not_run
+from measure import Row, data_folder, not_run, print_rows
 from numpy.typing import NDArray
 from scipy.ndimage import label, uniform_filter
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
@@ -30,20 +30,17 @@ from sklearn.svm import SVC
 from spectralzoom.flows.evaluate.frames import observe_frame
 from spectralzoom.flows.tasks.scene import scene_of_file
 from spectralzoom.flows.training.data import load_data_set
-from spectralzoom.flows.training.figures import READINGS
 from spectralzoom.flows.training.train import train_weights
-from spectralzoom.flows.training.train_scenes import COLUMNS, TrainRequest
+from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.evaluation.metrics import average_accuracy, confusion, kappa, overall_accuracy
 from spectralzoom.models.network.machine import one_thread
-from spectralzoom.models.network.sizes import SegmenterConfig
-from spectralzoom.models.network.spectral import SpectralBasis, patches_of
 from spectralzoom.models.policies.policies import score_patches
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
-from spectralzoom.models.training.examples import Example, electrons_of, measured_normalisation, normalised
-from spectralzoom.models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train, with_linear
+from spectralzoom.models.training.examples import electrons_of
+from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.models.weights.files import Weights, load_weights
 from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
-from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.planning.coverage import frame_patches
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
@@ -88,20 +85,15 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
     folder = data_folder("indian_pines")
     if not (folder / SCENE).is_file():
         return [not_run("Indian Pines, disjoint halves", folder)]
-    split = _open(folder)
+    split = replace(_open(folder), values=exposed(_scene(folder), 0))
     with tempfile.TemporaryDirectory() as name:
         found = [one for path in weights or (_trained(folder, Path(name)),) for one in _through_camera(folder, path)]
-    seen = replace(split, values=exposed(_scene(folder), 0))
-    table = _compared(found, _peers(seen, "camera"))
-    return table + _compared([] if weights else _of_the_file(folder, split), _peers(split, "file"))
-
-
-def _compared(ours: Sequence[Result], peers: Sequence[Result]) -> list[Row]:
+    peers = _peers(split)
     bars = [max(peer.figures[number] for peer in peers) for number in range(3)]
     goal = f"> {bars[0]:.1%} {bars[1]:.1%} {bars[2]:.3f}"
     shown = [
         _row(one, goal, all(a > b for a, b in zip(one.figures, bars, strict=True))) if one.every else _row(one)
-        for one in ours
+        for one in found
     ]
     return [*shown, *map(_row, peers)]
 
@@ -118,10 +110,11 @@ def _choices(folder: Path) -> dict[str, Any]:
 
 def _open(folder: Path) -> Split:
     files = load_data_set(folder / SCENE, **_choices(folder))
-    train, test = files.load(Path(SCENE).stem, "train"), files.load(Path(SCENE).stem, "test")
+    train, every = (files.load(Path(SCENE).stem, training=part) for part in (True, False))
     assert train.labels is not None
-    assert test.labels is not None
-    return Split(np.asarray(train.values, np.float32), train.labels, test.labels, len(train.class_names))
+    assert every.labels is not None
+    test = np.where(train.labels == UNLABELLED, every.labels, np.uint8(UNLABELLED))
+    return Split(np.asarray(train.values, np.float32), train.labels, test, len(train.class_names))
 
 
 def halves(labels: Labels) -> NDArray[np.int64]:
@@ -136,11 +129,11 @@ def halves(labels: Labels) -> NDArray[np.int64]:
     return half
 
 
-def _peers(split: Split, source: str) -> list[Result]:
+def _peers(split: Split) -> list[Result]:
     smooth = np.asarray(uniform_filter(split.values, (WINDOW, WINDOW, 1), mode="reflect"), np.float32)
     scan_passes = {"single spectra": split.values, f"{WINDOW} x {WINDOW} px": smooth}
     return [
-        _peer(f"{source}: {name}, {scan_pass}", values, split, *made)
+        _peer(f"{name}, {scan_pass}", values, split, *made)
         for scan_pass, values in scan_passes.items()
         for name, made in _classifiers().items()
     ]
@@ -192,33 +185,10 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
     if scene.key not in weights.record.get("split", {}).get("pixels", {}):
         raise ValueError(f"{path} was not trained with --train-mask on {SCENE}: its test pixels may have taught it")
     scan_pass = observe_frame(scene, scene.name, weights, LineCamera(), 0)
-    return _judged("camera", weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
+    return _judged(weights, scan_pass.seen, scan_pass.fine, scan_pass.labels)
 
 
-def _of_the_file(folder: Path, split: Split) -> list[Result]:
-    """Train the segmenter on the spectra of the file, and return its results."""
-    scene = _scene(folder)
-    height, width = split.train.shape
-    basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[False])
-    grid = SceneGrid(height, width, patch=8)
-    columns = (split.values / np.float32(split.values.max())) @ basis.matrix(scene.wavelength_nm)[0]
-    columns = np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32)
-    labels = np.full(grid.padded_shape, UNLABELLED, np.uint8)
-    labels[:height, :width] = split.train
-    observed = Example("pines", columns, labels, (height, width))
-    normalisation = measured_normalisation([observed])
-    example = normalised(observed, normalisation, np.ones(basis.columns, bool))
-    config = SegmenterConfig(split.classes, basis.columns, grid.patch)
-    pixels = LabelledPixels.drawn([example], np.random.default_rng(0))
-    start = linear_classifier(pixels.brightened(normalisation.gain_shift, np.random.default_rng(1)), split.classes)
-    network, record = train(config, [example], normalisation.gain_shift, SETTINGS, start=start)
-    network = with_linear(network, start, READINGS["mean of both"])
-    weights = Weights(network, basis, normalisation, scene.class_names, scene.class_colours, {"training": record})
-    patches = np.asarray(patches_of(example.columns, grid.patch), np.float32)
-    return _judged("file", weights, coarse_prediction_of_columns(weights, example.columns, grid), patches, split.test)
-
-
-def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:
+def _judged(weights: Weights, seen: CoarsePrediction, fine: Values, labels: Labels) -> list[Result]:
     """Return the results with several fractions of the patches, chosen by entropy."""
     training = weights.record["training"]
     found = []
@@ -231,20 +201,12 @@ def _judged(source: str, weights: Weights, seen: CoarsePrediction, fine: Values,
             drawn = segment(weights, observation, fine[patch_index], patch_index).classes
             spent = time.process_time() - began
             counts = confusion(labels, drawn, weights.config.classes)
-            name = f"{source}: segmenter, {100 * fraction:.0f} % of patches"
+            name = f"segmenter, {100 * fraction:.0f} % of patches"
             found.append(Result(name, counts, spent, words, fraction == 1))
     return found
 
 
-def main() -> int:
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
     parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
-    flags = parser.parse_args()
-    for row in rows(flags.weights):
-        met = {True: "met", False: "NOT met", None: ""}[row.met]
-        print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    print_rows(rows(parser.parse_args().weights))

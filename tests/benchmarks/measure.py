@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import gc
 import math
-import multiprocessing
 import os
 import statistics
 import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TypeVar
 
 ROOT = Path(__file__).resolve().parents[2]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -81,12 +77,6 @@ def ns_of(clock: Timing, values: float) -> float:
     return clock.cpu_min_s / values * 1e9
 
 
-def alone(call: Callable[..., T], *given: object) -> T:
-    """Call a function in a separate process, with its own memory and settings."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(call, *given).result()
-
-
 def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
     """Return rows of texts, the first of them headings, in aligned columns; longer texts are wrapped."""
     widths = [min(width, max(len(line[column]) for line in cells)) for column, width in enumerate(most)]
@@ -99,6 +89,13 @@ def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
         ]
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join(line.rstrip() for line in lines)
+
+
+def print_rows(rows: Sequence[Row]) -> None:
+    """Print one row a line."""
+    for row in rows:
+        met = {True: "met", False: "NOT met", None: ""}[row.met]
+        print("  ".join(text for text in (row.what, row.figure, row.goal, met, row.peers) if text))
 
 
 def markdown_lines(cells: Sequence[Sequence[str]]) -> list[str]:

@@ -14,7 +14,7 @@ from rich.console import Console
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
 from spectralzoom.flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
-from spectralzoom.flows.evaluate.judge import collect_row, judge_frame, seeds_of, summarise
+from spectralzoom.flows.evaluate.judge import ALL, NONE, Choice, Row, counts_of, judge_frame, seeds_of, summarise
 from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import farm_test_data
 from spectralzoom.flows.training.train import train_weights
@@ -165,7 +165,7 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     assert kept == [True]
     loaded = load_weights(weights[0])
     scan_pass = observe_frame(scene_at(data), "001", loaded, LineCamera(), 0)
-    counts = np.array(judge_frame(TRIAL, scan_pass, loaded)["rows"][0]["counts"])
+    (counts,) = judge_frame(TRIAL, scan_pass, loaded)[NONE].counts
     assert row["pixel_accuracy"] == overall_accuracy(counts)
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
@@ -175,22 +175,17 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
 
 def test_miou_of_frames_comes_from_their_summed_counts():
     """The order of the frames has no effect."""
-    rng = np.random.default_rng(0)
-    records = [_record(f"{number:03d}", rng) for number in range(4)]
-    there, back = (summarise([order], ("a", "b"), TRIAL) for order in (records, records[::-1]))
+    run = _judged("abcd", np.random.default_rng(0))
+    there, back = (summarise([dict(order)], ("a", "b"), TRIAL) for order in (run.items(), [*run.items()][::-1]))
     assert json.dumps(there["rows"][0], sort_keys=True) == json.dumps(back["rows"][0], sort_keys=True)
-    whole = collect_row([records], "none", 0.0)
-    assert there["rows"][0]["miou"] == mean_iou(whole.counts.sum(axis=(0, 1)))
+    assert there["rows"][0]["miou"] == mean_iou(counts_of([run], NONE).sum(axis=(0, 1, 2)))
 
 
 def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, capsys: pytest.CaptureFixture[str]):
     """The mean is taken over the classes of all frames' labels."""
     counts = [[[8, 0, 2], [1, 9, 0], [0, 0, 0]], [[7, 3, 0], [0, 10, 0], [0, 0, 0]]]
-    records = [_record("001", np.random.default_rng(0)), _record("002", np.random.default_rng(0))]
-    for record, one in zip(records, counts, strict=True):
-        for row in record["rows"]:
-            row |= {"counts": one}
-    found = summarise([records], ("soil", "crop", "weed"), TRIAL)
+    run = {str(number): dict.fromkeys(CHOICES, Row(np.array([one]), 2, 3)) for number, one in enumerate(counts)}
+    found = summarise([run], ("soil", "crop", "weed"), TRIAL)
     row = found["rows"][0]
     assert row["miou"] == pytest.approx(np.mean([15 / 21, 19 / 23]))
     assert row["false_classes"] == {"weed": 2}
@@ -199,32 +194,29 @@ def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, caps
     assert "2 px false" in capsys.readouterr().out
 
 
-def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
-    given = {"draw": 0, "patches": 2, "multiply_adds": 3}
-    rows = [
-        {"policy": policy, "fraction": fraction, "counts": rng.integers(1, 9, (2, 2)).tolist(), **given}
-        for policy, fraction in (("none", 0.0), ("entropy", 0.5), ("all", 1.0))
-    ]
-    return {"frame": name, "rows": rows}
+CHOICES: tuple[Choice, ...] = (NONE, ("entropy", 0.5), ALL)
+
+
+def _judged(names: str, rng: np.random.Generator) -> dict[str, dict[Choice, Row]]:
+    return {name: {choice: Row(rng.integers(1, 9, (1, 2, 2)), 2, 3) for choice in CHOICES} for name in names}
 
 
 def test_weights_without_a_common_frame_are_one_seed() -> None:
     """Folds of one training are joined and weights that share a frame are seeds; frames not judged have zero counts."""
     rng = np.random.default_rng(0)
-    runs = [[_record(name, rng) for name in names] for names in ("ab", "c", "abc", "")]
-    assert seeds_of(runs) == [[0, 1], [2]]
-    joined, part = [*runs[0], *runs[1]], runs[2][:2]
-    row, less = collect_row([joined], "none", 0.0), collect_row([joined, part], "none", 0.0)
-    assert less.counts.shape == (2, 3, 2, 2)
-    assert not less.counts[1, 2].any()
-    assert (row.counts.sum(axis=0) == less.counts[0]).all()
+    assert seeds_of(["ab", "c", "abc", ""]) == [[0, 1], [2]]
+    joined, part = _judged("abc", rng), _judged("ab", rng)
+    row, less = counts_of([joined], NONE), counts_of([joined, part], NONE)
+    assert less.shape == (2, 1, 3, 2, 2)
+    assert not less[1, 0, 2].any()
+    assert (row[0] == less[0]).all()
 
 
 def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The built-in fields of the test data have seeds of their own, apart from training."""
     monkeypatch.setattr("spectralzoom.flows.training.data.FARM_SHAPE", (32, 48))
     # choosing takes seconds
-    monkeypatch.setattr("spectralzoom.flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)
+    monkeypatch.setattr("spectralzoom.models.training.examples.chosen_effects", lambda *_: USUAL)
     weights = tmp_path / "w.safetensors"
     save_weights(replace(make_weights(classes=len(CLASSES), columns=6), class_names=CLASSES), weights)
     quick = {**QUICK, "policies": ("entropy",), "fractions": (0.25,)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def test_findings_have_hectares_and_changes() -> None:
 def _judged(weights: Path, folder: Path, content: dict[str, Any], *, unlike: bool = False) -> Path:
     """Write a copy of the tiny weights with the calibration of their expected scores, and return its path."""
     path = folder / "judged.safetensors"
-    known = with_record(load_weights(weights), **{TRAINED_ON: SEEN.as_dict()})
+    known = with_record(load_weights(weights), **{TRAINED_ON: asdict(SEEN)})
     save_weights(of_other_scenes(known) if unlike else known, path)
     _add_part(path, path, MAP_SCORES, content, {})
     return path

@@ -36,7 +36,7 @@ def test_all_scenes_cannot_be_held_out(tmp_path: Path) -> None:
 
 
 def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
-    """Training and test labels share no pixel, and pixels where mask and labels disagree are not trained on."""
+    """Pixels outside of the mask, and those where mask and labels disagree, are not trained on."""
     np.save(tmp_path / "a.npy", np.ones((2, 3, 1)))
     np.save(tmp_path / "gt.npy", np.array([[0, 4, 9], [9, 4, 4]]))
     (tmp_path / "scene.toml").write_text(
@@ -44,14 +44,12 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
     )
     scipy.io.savemat(tmp_path / "mask.mat", {"m": np.array([[1, 1, 1], [2, 0, 2]], np.uint8)})
     data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.mat", mask_classes=[9, 4])
-    train, test = data.load("a", "train"), data.load("a", "test")
-    assert train.labels.tolist() == [[255, 255, 1], [255, 255, 0]]
-    assert test.labels.tolist() == [[255, 0, 255], [1, 0, 255]]
+    assert data.load("a", training=True).labels.tolist() == [[255, 255, 1], [255, 255, 0]]
+    assert data.load("a").labels.tolist() == [[255, 0, 1], [1, 0, 0]]
     assert tuple(load_data_set(tmp_path, train_mask=tmp_path / "mask.mat").files) == ("a",)
     np.save(tmp_path / "binary.npy", np.array([[255, 0, 255], [0, 255, 255]], np.uint8))
     data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "binary.npy")
-    assert data.load("a", "train").labels.tolist() == [[255, 255, 1], [255, 0, 0]]
-    assert data.load("a", "test").labels.tolist() == [[255, 0, 255], [1, 255, 255]]
+    assert data.load("a", training=True).labels.tolist() == [[255, 255, 1], [255, 0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -72,15 +70,14 @@ def test_masks_that_do_not_fit_are_refused(tmp_path: Path, mask: int, classes: l
     chosen = {} if classes is None else {"mask_classes": classes}
     data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy", **chosen)  # type: ignore[arg-type]
     with pytest.raises(SceneError, match=words):
-        data.load("a", "train")
+        data.load("a", training=True)
 
 
 def test_indian_pines_splits_by_the_disjoint_mask(real_data: Path) -> None:
-    """5,528 pixels are for training and the rest of the 10,249 labelled pixels for the test."""
+    """5,528 of the 10,249 labelled pixels are for training."""
     folder = real_data / "indian_pines"
     mask = folder / "indianpines_disjoint_dset.mat"
     data = load_data_set(folder / "Indian_pines_corrected.npy", train_mask=mask, mask_classes=MASK_TO_CLASS)
     (name,) = data.files
-    train, test = data.load(name, "train"), data.load(name, "test")
-    assert np.count_nonzero(np.asarray(train.labels) != 255) == 5528
-    assert np.count_nonzero(np.asarray(test.labels) != 255) == 10249 - 5528
+    labelled = [np.asarray(data.load(name, training=part).labels) != 255 for part in (True, False)]
+    assert [np.count_nonzero(one) for one in labelled] == [5528, 10249]

@@ -13,10 +13,9 @@ from spectralzoom.flows.settings.load import parse_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
 from spectralzoom.flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
-from spectralzoom.flows.training.observed_scenes import observe_scene
 from spectralzoom.flows.training.train_scenes import TrainRequest, observe_all
 from spectralzoom.models.network.spectral import SpectralBasis
-from spectralzoom.models.training.examples import observe
+from spectralzoom.models.training.examples import observe, observe_scene
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid

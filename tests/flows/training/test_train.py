@@ -148,7 +148,7 @@ def test_few_labels_give_the_mean_of_network_and_linear_classifier(
     folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch, few: int, validation: int, kept: str | None
 ) -> None:
     """With more labels the reading with the best validation score is kept; without validation scenes, the network."""
-    monkeypatch.setattr(flow, "FEW_PIXELS", few)
+    monkeypatch.setattr(figures, "FEW_PIXELS", few)
     readings = train_weights(_request(folder, out, validation=validation))["readings"]
     scores = readings["miou"]
     assert readings["kept"] == (kept or max(scores, key=lambda name: scores[name]))

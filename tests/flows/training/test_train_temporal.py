@@ -78,7 +78,7 @@ def test_visit_days_are_in_order() -> None:
 def test_the_command_trains_and_writes_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reader belongs to the given weights; its record has seeds, settings and validation on another land."""
     # choosing takes seconds
-    monkeypatch.setattr("spectralzoom.flows.training.observed_scenes.chosen_effects", lambda *_: USUAL)
+    monkeypatch.setattr("spectralzoom.models.training.examples.chosen_effects", lambda *_: USUAL)
     monkeypatch.setattr(remember, "VISITS", 2)
     for name, value in {"JUDGED_AFTER": (3,), "JUDGED_LANDS": 1, "SHAPE": (64, 96)}.items():
         monkeypatch.setattr(remember, name, value)

@@ -153,13 +153,12 @@ def test_multiply_adds_of_the_temporal_reader_equal_the_counter() -> None:
 
 
 def test_multiply_adds_are_proportional_to_patches() -> None:
-    """Columns are computed from each band, again for patches captured separately; those of the policy are added."""
+    """Columns are computed from each band once; those of the policy are added."""
     config = SegmenterConfig(classes=5)
     grid = SceneGrid(250, 256, 16)
     one, many, bare = (multiply_adds(config, grid, *given, score=9) for given in ((1, 270), (20, 270), (20, 0)))
     assert one.overview == many.overview == bare.overview + 256**2 * 270 * config.columns
     assert 20 * one.detail == many.detail == bare.detail
-    assert multiply_adds(config, grid, 20, 270, apart=True).detail == bare.detail + 20 * 16**2 * 270 * config.columns
     assert many.total == many.overview + many.detail + 9
 
 

@@ -49,12 +49,8 @@ def _four_patches() -> placement.ReadTwice:
 
 
 def test_chosen_patches_are_read_in_full() -> None:
-    """Two patches are read and become right; the third stays wrong, and the last is right by the overview."""
+    """Two patches become right, the third stays wrong; the last is right by the overview and wrong in full."""
     np.testing.assert_array_equal(_four_patches().counts(FOUR >= 0.3, 2), [[8, 0], [4, 4]])
-
-
-def test_reading_every_patch_includes_what_gets_worse() -> None:
-    """The last patch is right by the overview, and wrong by the full network."""
     np.testing.assert_array_equal(_four_patches().counts(np.ones(4, np.bool_), 2), [[4, 4], [0, 8]])
 
 
