@@ -60,7 +60,7 @@ def states(stores: Stores) -> dict[str, str]:
 @given(facts, facts, st.integers(), st.integers())
 def test_keyword_arguments_are_the_key(one: Any, other: Any, pool: int, pixels: int) -> None:
     """An argument that is `Unkeyed` changes no key; an object with a key counts by it alone."""
-    dry = Stores(Archive(Path("nowhere"), writes=False), dry=True)
+    dry = Stores(Archive(Path("nowhere")), dry=True)
     usual = letter(dry, text=one, scene=Scene("a"))
     assert letter(dry, text=one, scene=Scene("a", pixels), pool=pool) == usual
     assert letter(dry, text=one, scene=Scene("b")) != usual
@@ -82,7 +82,7 @@ def test_inputs_and_version_are_the_key(archive: Archive) -> None:
 
 def test_a_decorated_function_has_the_key_of_its_arguments() -> None:
     """Another function around it changes no argument."""
-    dry = Stores(Archive(Path("nowhere"), writes=False), dry=True)
+    dry = Stores(Archive(Path("nowhere")), dry=True)
     around = replace(letter, build=wraps(letter.build)(lambda *given, **facts: letter.build(*given, **facts)))
     keys = [
         one(dry, text=text, pool=pool).key for one, text, pool in ((letter, "a", 1), (around, "a", 2), (around, "b", 1))
@@ -102,7 +102,7 @@ def test_a_store_is_made_once(archive: Archive) -> None:
 
 def test_a_dry_run_makes_nothing_and_answers_addresses(tmp_path: Path, archive: Archive) -> None:
     """A store whose input is missing has no key yet; after one argument changed, what follows from it would run."""
-    nowhere = Stores(Archive(tmp_path / "none", writes=False), dry=True)
+    nowhere = Stores(Archive(tmp_path / "none"), dry=True)
     assert spell(nowhere).key == ""
     assert states(nowhere) == {"letter": "to run", "join": "to run"}
     assert not (tmp_path / "none").exists()

@@ -37,7 +37,7 @@ class NotedStores(Stores):
     """Stores that make nothing, and note the stages of each request's inputs."""
 
     def __init__(self) -> None:
-        super().__init__(Archive(Path("nowhere"), writes=False), dry=True)
+        super().__init__(Archive(Path("nowhere")), dry=True)
         self.inputs: dict[str, list[str]] = {}
 
     def get(self, request: Request, *_: Ref) -> Ref:
