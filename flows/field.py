@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView
-from spectralzoom.flows.settings.survey_settings import RECORDED, RIG, Settings
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RECORDED, RIG, Settings
 from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
 from spectralzoom.flows.tasks.recorded_field import OpenedRecording, open_recorded
@@ -170,7 +170,10 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         model=model,
         grid=grid,
         zones=zones,
-        labels=FieldLabels(Once(lambda: judged_labels(scene, model.described))),
+        labels=FieldLabels(
+            Once(lambda: judged_labels(scene, model.described)),
+            scene.key if settings.scene in BUILT_IN_SCENES and recorded is None else None,
+        ),
         recorded=None if recorded is None else RecordedPasses(recorded.field.source),
         raster=raster,
         prior=prior,

@@ -56,9 +56,12 @@ class FieldLabels:
     """Labels of a field in the classes of the weights, without pixels of their training; drawn when first used."""
 
     read: Once[NDArray[np.uint8] | None]  # (y, x)
+    scene: str | None  # key of a built-in scene, which has no other labels; None for other scenes
 
     @property
-    def key(self) -> str | None:
-        """Return a hash of the labels."""
+    def key(self) -> str:
+        """Return what the labels depend on besides the weights; those of a built-in scene are not drawn for it."""
+        if self.scene is not None:
+            return self.scene
         found = self.read()
-        return None if found is None else array_digest(found)
+        return "none" if found is None else array_digest(found)

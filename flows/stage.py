@@ -63,12 +63,10 @@ class Stage(Generic[P]):
         """Return the store of these arguments, found or made; a task inside a Prefect flow. Raises as `build`."""
         call = inspect.signature(self.build).bind(None, *args, **facts)
         call.apply_defaults()
-        every = dict(list(call.arguments.items())[1:])
-        given = [ref for value in every.values() for ref in (value if isinstance(value, tuple) else (value,))]
-        inputs = [ref for ref in given if isinstance(ref, Ref)]
-        left_out = unkeyed_names(self.build)
-        named = (name for name, one in call.signature.parameters.items() if one.kind is one.KEYWORD_ONLY)
-        params = {name: every[name] for name in named if name not in left_out}
+        inputs = [ref for ref in call.args[1:] if ref is not None]
+        if not all(isinstance(ref, Ref) for ref in inputs):
+            raise TypeError(f"{self.name}: arguments that are no stores must be keywords, to be part of the key")
+        params = {name: value for name, value in call.kwargs.items() if name not in unkeyed_names(self.build)}
         request = Request(self, inputs, params, lambda out: self.build(out, *args, **facts))
         return task_in_flow(self.name, stores.name, partial(stores.get, request), *inputs, retries=self.retries)
 
@@ -141,11 +139,12 @@ class Row:
     """What became of one stage; figures of a store that was found are None."""
 
     name: str
-    ref: Ref  # in a dry run without a key where an input is missing
+    title: str
+    ref: Ref  # in a dry run without a key where that depends on the content of a store that is missing
     state: Literal["ran", "cached", "to run", "blocked"]
     why: str = ""  # a stage is blocked
     version: int = 0
-    params: Mapping[str, Any] = field(default_factory=dict)  # of a dry run
+    params: Mapping[str, Any] = field(default_factory=dict)
     wall_s: float | None = None
     cpu_s: float | None = None
     peak_rss_bytes: int | None = None
@@ -187,95 +186,87 @@ class Stores:
         return bool(ref.key) and self.archive.is_there(ref.uri)
 
     def get(self, request: Request, *_: Ref) -> Ref:
-        """Return the store of a request, found or made."""
-        return self._foreseen(request) if self.dry else self._recorded(request, self._found_or_made)
+        """Return the store of a request, found or made. In a dry run its address; without a key where that is open."""
+        made = request.stage
+        if not all(ref.key for ref in request.inputs):
+            return self._make(request, Ref(made.product, "", Path()))
+        ref = self.archive.ref(
+            made.product, self.archive.key(made.product, made.version, request.params, request.inputs)
+        )
+        try:
+            found = self.archive.find(ref.stage, ref.key) is not None
+        except (PipelineError, OSError) as error:
+            if not self.dry:
+                raise
+            return self._record(replace(self._row(request, replace(ref, key="")), state="blocked", why=str(error)))
+        if not found and self.archive.is_known(ref):
+            self._cleared[ref] = partial(self._make, request, ref)
+            found = True
+        return self._record(self._row(request, ref)) if found else self._make(request, ref)
 
     def restore(self, ref: Ref) -> None:
         """Make a store again if its files were cleared away."""
-        again = self._cleared.pop(ref, None)
-        if again is not None:
-            again()
+        if ref in self._cleared:
+            self._cleared[ref]()
+            self._cleared.pop(ref, None)
 
-    def _key(self, request: Request) -> str:
-        made = request.stage
-        return self.archive.key(made.product, made.version, request.params, request.inputs)
-
-    def _found_or_made(self, request: Request) -> tuple[Ref, bool]:
-        key = self._key(request)
-        ref = self.archive.ref(request.stage.product, key)
-        if self.archive.find(ref.stage, key) is not None:
-            return ref, False
-        if self.archive.is_known(ref):
-            self._cleared[ref] = partial(self._recorded, request, self._made)
-            return ref, False
-        return self._made(request)
-
-    def _made(self, request: Request) -> tuple[Ref, bool]:
-        made = request.stage
-        spool = self.archive.root / "spool" / self._key(request)
-        for ref in request.inputs:
-            self.restore(ref)
-
-        def build(folder: Path) -> None:
-            request.build(Output(folder, partial(self._watch, made.name, made.title, "running"), spool))
-            self._finish(folder)
-            self.bytes_written += bytes_in(spool)
-
-        ref, built = self.archive.produce(
-            made.product, build, version=made.version, params=request.params, inputs=request.inputs
-        )
-        self.bytes_written += self.archive.size_of(ref.uri) if built else 0
-        return ref, built
-
-    def _recorded(self, request: Request, get: Callable[[Request], tuple[Ref, bool]]) -> Ref:
-        """Return the store that ``get`` finds or makes, and record time and memory of its making."""
-        name, title = request.stage.name, request.stage.title
+    def _make(self, request: Request, ref: Ref) -> Ref:
+        """Make a store, after those of its inputs that were cleared away; in a dry run record that it would be made."""
+        for one in request.inputs:
+            self.restore(one)
+        if self.dry:
+            return self._record(replace(self._row(request, ref), state="to run"))
         with suppress(OSError):  # Linux: reset the peak
             Path("/proc/self/clear_refs").write_text("5")
         wall_s, cpu_s = time.perf_counter(), time.process_time()
-        self._watch(name, title, "running", 0.0)
         try:
-            ref, built = get(request)
+            built = self._build(request, ref)
         except BaseException:
-            self._watch(name, title, "failed", 0.0)
+            self._watch(request.stage.name, request.stage.title, "failed", 0.0)
             raise
-        spent_s = time.perf_counter() - wall_s
-        size = self.archive.stored_bytes(ref)
-        row = Row(name, ref, "cached")
-        row = replace(row, bytes_in=sum(map(self.archive.stored_bytes, request.inputs)), bytes_out=size)
-        if built:
-            cpu_s = time.process_time() - cpu_s
-            row = replace(row, state="ran", wall_s=spent_s, cpu_s=cpu_s, peak_rss_bytes=peak_bytes())
-        self.rows[row.name] = row
-        self._watch(name, title, row.state, 1.0)
-        self._log(f"{title}: {f'{spent_s:.1f} s' if built else 'found'}, {size / 1e6:.1f} MB, {ref.uri}")
-        return ref
+        row = self._row(request, ref)
+        if built:  # else another process has made it meanwhile
+            spent = {"wall_s": time.perf_counter() - wall_s, "cpu_s": time.process_time() - cpu_s}
+            row = replace(row, state="ran", peak_rss_bytes=peak_bytes(), **spent)
+        return self._record(row)
 
-    def _foreseen(self, request: Request) -> Ref:
-        """Return the address that a store would have, without a key where one of its inputs is missing."""
+    def _build(self, request: Request, ref: Ref) -> bool:
         made = request.stage
-        row = Row(made.name, Ref(made.product, "", Path()), "to run", version=made.version, params=request.params)
-        if all(ref.key and self.archive.is_known(ref) for ref in request.inputs):
-            try:
-                ref = self.archive.ref(made.product, self._key(request))
-                there = self.archive.find(ref.stage, ref.key) is not None
-                if not there and self.archive.is_known(ref):
-                    self._cleared[ref] = partial(self._would_run, replace(row, ref=ref), request)
-                    there = True
-                row = replace(row, ref=ref, state="cached" if there else "to run")
-            except (PipelineError, OSError) as error:  # the survey would stop here
-                row = replace(row, state="blocked", why=str(error))
-        if row.state == "to run":
-            self._would_run(row, request)
-        else:
-            self.rows[made.name] = row
-        return row.ref
+        spool = self.archive.root / "spool" / ref.key
+        report = partial(self._watch, made.name, made.title, "running")
+        report(0.0)
 
-    def _would_run(self, row: Row, request: Request) -> None:
-        """Record in a dry run that a store would be made, and so its inputs that were cleared away."""
-        for ref in request.inputs:
-            self.restore(ref)
-        self.rows[row.name] = row
+        def build(folder: Path) -> None:
+            request.build(Output(folder, report, spool))
+            self._finish(folder)
+            self.bytes_written += bytes_in(spool)
+
+        _, built = self.archive.produce(
+            made.product, build, version=made.version, params=request.params, inputs=request.inputs
+        )
+        self.bytes_written += self.archive.size_of(ref.uri) if built else 0
+        return built
+
+    def _row(self, request: Request, ref: Ref) -> Row:
+        """Return the row of a store that was found."""
+        made = request.stage
+        row = Row(made.name, made.title, ref, "cached", version=made.version, params=request.params)
+        if self.dry:
+            return row
+        sizes = [self.archive.stored_bytes(one) for one in (*request.inputs, ref)]
+        return replace(row, bytes_in=sum(sizes[:-1]), bytes_out=sizes[-1])
+
+    def _record(self, row: Row) -> Ref:
+        """Record and report what became of a stage; a second store of one stage has a row of its own."""
+        name, number = row.name, 1
+        while name in self.rows and self.rows[name].ref != row.ref:
+            number += 1
+            name = f"{row.name}-{number}"
+        self.rows[name] = replace(row, name=name)
+        self._watch(row.name, row.title, row.state, 1.0)
+        took = "found" if row.wall_s is None else f"{row.wall_s:.1f} s"
+        self._log(f"{row.title}: {took}, {(row.bytes_out or 0) / 1e6:.1f} MB, {row.ref.uri}")
+        return row.ref
 
 
 def peak_bytes() -> int:

@@ -126,6 +126,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
             second = _second_pass(stores, plan, effects, first, attention, request)
             mosaic = second.mosaic
         _stop_after(stores, plan, mosaic, "capture", "mosaic")
+    stores.restore(mosaic)  # the report shows it, also where the map is stored
     class_map = segment(
         stores,
         mosaic,
@@ -204,7 +205,7 @@ def _second_pass(
     sweeps = [] if request is None else request.sweeps
     raw = capture_fine(
         stores,
-        attention,
+        attention if request is not None else replace(attention, key=""),  # which leaves the lines open
         effects,
         request=SweepRequest.of(sweeps, field.camera, settings.cost, after_s=plan.passes.coarse_s),
         view=field.view,

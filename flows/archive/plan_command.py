@@ -26,7 +26,7 @@ from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.terminal.figures import format_count
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import put_out, table
-from spectralzoom.pipeline.errors import PipelineError
+from spectralzoom.pipeline.errors import PipelineError, SurveyStopped
 from spectralzoom.pipeline.geometry.scan import exposing
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.pipeline.planning.uniform_scans import frontier
@@ -63,7 +63,8 @@ def dry_run(settings: Settings) -> tuple[SurveyPlan, Stores]:
     if is_archive(settings.out):
         archive = Archive.open(settings.out, create=False, write=False)
     stores = Stores(archive, dry=True)
-    run_stages(stores, found)
+    with suppress(SurveyStopped):
+        run_stages(stores, found)
     return found, stores
 
 
@@ -72,8 +73,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
     plan, stores = dry_run(settings)
     passes, field = plan.passes, plan.field
     fine: FinePlan | None = None
-    attention = stores.rows[score.name].ref
-    if stores.has(attention):
+    if score.name in stores.rows and stores.has(attention := stores.rows[score.name].ref):
         with suppress(PipelineError, OSError):  # the row of the stage that reads it has the error
             fine = load_plan(attention)
     zoomed = None if passes.plain else plan

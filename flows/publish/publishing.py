@@ -57,11 +57,11 @@ def publish(stores: Stores, plan: SurveyPlan, products: Products, *, started: da
 
 def clear_raw(stores: Stores, plan: SurveyPlan, products: Products, run: RunRef, *, note: Note) -> RunRef:
     """Compare and clear the raw lines that the settings do not keep; in a flow as a task."""
-    raws = [one.raw for one in products.passes]
+    raws = [one.raw for one in products.passes if stores.has(one.raw)]
 
     def work(*_: Ref) -> RunRef:
         archive = stores.archive
-        if all(map(stores.has, raws)):
+        if raws:
             catalogue = Catalogue.read(archive)
             named = (one for raw in raws for one in catalogue.named_by(raw.uri))
             others = [one for one in named if one.settings.get("keep") != KEEP_SIGNAL]
