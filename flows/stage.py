@@ -190,9 +190,8 @@ class Stores:
         made = request.stage
         if not all(ref.key for ref in request.inputs):
             return self._make(request, Ref(made.product, "", Path()))
-        ref = self.archive.ref(
-            made.product, self.archive.key(made.product, made.version, request.params, request.inputs)
-        )
+        key = self.archive.key(made.product, made.version, request.params, request.inputs)
+        ref = self.archive.ref(made.product, key)
         try:
             found = self.archive.find(ref.stage, ref.key) is not None
         except (PipelineError, OSError) as error:
@@ -212,7 +211,7 @@ class Stores:
 
     def _make(self, request: Request, ref: Ref) -> Ref:
         """Make a store, after those of its inputs that were cleared away; in a dry run record that it would be made."""
-        for one in request.inputs:
+        for one in request.inputs if ref.key else ():
             self.restore(one)
         if self.dry:
             return self._record(replace(self._row(request, ref), state="to run"))
@@ -226,8 +225,8 @@ class Stores:
             raise
         row = self._row(request, ref)
         if built:  # else another process has made it meanwhile
-            spent = {"wall_s": time.perf_counter() - wall_s, "cpu_s": time.process_time() - cpu_s}
-            row = replace(row, state="ran", peak_rss_bytes=peak_bytes(), **spent)
+            wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+            row = replace(row, state="ran", wall_s=wall_s, cpu_s=cpu_s, peak_rss_bytes=peak_bytes())
         return self._record(row)
 
     def _build(self, request: Request, ref: Ref) -> bool:
