@@ -74,12 +74,12 @@ def _write_scan_path(sweep: zarr.Group, name: str, scan_path: ScanPath, table: T
 
 def _read_scan_path(group: zarr.Group) -> tuple[ScanPath, TieTable]:
     about: dict[str, Any] = dict(group.attrs)
-    width = float(about["width"])
-    bound = float(about["bound_px"])
-    spacing = int(about["spacing"])
-    samples = int(about["samples"])
+    spacing, samples = int(about["spacing"]), int(about["samples"])
     shape, corner, kept = ((int(about[name][0]), int(about[name][1])) for name in ("shape", "corner", "kept"))
     seen = read_array(group, "seen")
     lines, starts = (read_array(group, name).astype(np.intp) for name in ("lines", "starts"))
-    scan_path = ScanPath(read_array(group, "scan"), read_array(group, "across"), lines, starts, seen, width)
-    return scan_path, TieTable(read_array(group, "tie_points"), spacing, shape, bound, seen, samples, corner, kept)
+    scan_path = ScanPath(
+        read_array(group, "scan"), read_array(group, "across"), lines, starts, seen, float(about["width"])
+    )
+    tie_points, bound = read_array(group, "tie_points"), float(about["bound_px"])
+    return scan_path, TieTable(tie_points, spacing, shape, bound, seen, samples, corner, kept)
