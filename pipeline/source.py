@@ -105,5 +105,5 @@ class SweepLines(Protocol):
     def valid_line(self) -> NDArray[np.bool_]:
         """Return (line,) whether a line can be used."""
 
-    def read(self, start: int, stop: int) -> NDArray[np.integer[Any]]:
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> NDArray[np.integer[Any]]:
         """Return the lines ``start`` to ``stop``: raw DN (line, sample, band), or scores in steps of components."""

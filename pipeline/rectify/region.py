@@ -118,7 +118,7 @@ def _reader(
         return lambda wanted, samples: cache.window(one.lines, wanted, samples, likely=likely)
     knot = coordinates[..., 0]
     if not np.isfinite(knot).any():
-        return lambda wanted, samples: one.lines.read(wanted.start, wanted.stop)[:, samples]
+        return lambda wanted, samples: one.lines.read(wanted.start, wanted.stop, samples)
     first, last = int(np.floor(np.nanmin(knot))), int(np.ceil(np.nanmax(knot)))
     members = member_lines(scan_path, slice(max(first - TAPS, 0), min(last + TAPS + 1, len(scan_path))))
     origin = int(members.min())

@@ -17,13 +17,13 @@ from spectralzoom.pipeline.rectify.registration.alignment import SweepShift
 from spectralzoom.pipeline.rectify.scan_paths import JudgedStamps, judge_stamps
 from spectralzoom.pipeline.signal.components import Components
 from spectralzoom.pipeline.signal.lines import CondensedLines, Raw
-from spectralzoom.pipeline.source import References, SweepLines
+from spectralzoom.pipeline.source import References
 
 LEAST_LINES = 2  # of a run, so that it has a direction
 CELL_PX = 4  # of the map of captures
 
 
-class StoredLines(SweepLines, CondensedLines, Protocol):
+class StoredLines(CondensedLines, Protocol):
     """The condensed lines of one sweep, and their source."""
 
     @property
@@ -125,14 +125,14 @@ class InterlacedLines:
             step=first.step,
         )
 
-    def read(self, start: int, stop: int) -> Raw:
-        """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> Raw:
+        """Return scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
         part, number = self.part[start:stop], self.number[start:stop]
         found: Raw | None = None
         for taker in np.unique(part).tolist():
             here = part == taker
             first = int(number[here].min())
-            raw = self.parts[taker].read(first, int(number[here].max()) + 1)
+            raw = self.parts[taker].read(first, int(number[here].max()) + 1, samples)
             found = np.empty((len(part), *raw.shape[1:]), raw.dtype) if found is None else found
             found[here] = raw[number[here] - first]
         assert found is not None

@@ -184,12 +184,12 @@ class RawCube(StoredSweep):
         """(line, sample, band)."""
         return len(self.time_s), self.references.dark.shape[0], len(self.wavelength_nm)
 
-    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
+    def read(self, start: int = 0, stop: int | None = None, samples: slice = slice(None)) -> NDArray[np.uint16]:
         """Return the raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16.
 
         Fastest on multiples of 64.
         """
-        return read_array(self.group, "dn", slice(start, stop))
+        return read_array(self.group, "dn", (slice(start, stop), samples))
 
     def read_lines(self, numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
         """Return the raw numbers of single lines in ascending order, (line, sample, band) uint16.
@@ -198,13 +198,6 @@ class RawCube(StoredSweep):
         """
         parts = np.split(numbers, np.flatnonzero(np.diff(numbers // SHARD_ROWS)) + 1)
         return np.concatenate([self.read(int(part[0]), int(part[-1]) + 1)[part - part[0]] for part in parts])
-
-    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
-        """Return the raw numbers of some lines and samples, (line, sample, band) uint16.
-
-        Only the chunks that hold them are decoded.
-        """
-        return read_array(self.group, "dn", (lines, samples))
 
 
 def read_line_facts(group: zarr.Group, path: object) -> dict[str, Any]:

@@ -152,13 +152,11 @@ class SignalCube(StoredSweep):
         lines, samples = self.usable.shape
         return lines, samples, len(self.components)
 
-    def read_window(self, lines: slice, samples: slice) -> NDArray[np.signedinteger[Any]]:
-        """Return the scores of some lines and samples in steps, (line, sample, component)."""
-        return read_array(self.group, "scores", (slice(None), lines, samples)).transpose(1, 2, 0)
-
-    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.signedinteger[Any]]:
+    def read(
+        self, start: int = 0, stop: int | None = None, samples: slice = slice(None)
+    ) -> NDArray[np.signedinteger[Any]]:
         """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
-        return self.read_window(slice(start, stop), slice(None))
+        return read_array(self.group, "scores", (slice(None), slice(start, stop), samples)).transpose(1, 2, 0)
 
     @cached_property
     def rare(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -175,7 +173,7 @@ class SignalCube(StoredSweep):
         chosen = slice(None) if bands is None else list(bands)
         law = self.components if bands is None else self.components.of_bands(bands)
         first, last, _ = samples.indices(self.usable.shape[1])
-        scores = self.read_window(slice(start, stop), slice(first, last)).astype(np.float32) * np.float32(self.step)
+        scores = self.read(start, stop, slice(first, last)).astype(np.float32) * np.float32(self.step)
         values = law.restore(scores)
         line, sample = self.rare
         here = slice(*np.searchsorted(line, (start, start + len(values))))
@@ -225,7 +223,7 @@ class RestoredCube(RawCube):
 
     signal: SignalCube
 
-    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
+    def read(self, start: int = 0, stop: int | None = None, samples: slice = slice(None)) -> NDArray[np.uint16]:
         """Return the numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16."""
         first, last, _ = slice(start, stop).indices(len(self.time_s))
         values = self.signal.spectra(first, last)
@@ -233,15 +231,11 @@ class RestoredCube(RawCube):
             values *= mirror_throughput(np.nan_to_num(self.position[first:last])).astype(np.float32)[:, None, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             numbers = np.rint(values / self._gain + self.references.dark)
-        return np.where(np.isfinite(numbers), np.clip(numbers, 0, MOST_DN), MOST_DN).astype(np.uint16)
+        return np.where(np.isfinite(numbers), np.clip(numbers, 0, MOST_DN), MOST_DN).astype(np.uint16)[:, samples]
 
     @cached_property
     def _gain(self) -> NDArray[np.float32]:
         return judge_elements(self.references).gain
-
-    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
-        """Return the numbers of some lines and samples, (line, sample, band) uint16."""
-        return self.read(lines.start, lines.stop)[:, samples]
 
 
 def open_lines(path: Path) -> RawCube:

@@ -54,9 +54,9 @@ class PlaceLines:
     def usable(self) -> NDArray[np.bool_]:
         return np.ones((self.sweep.lines, CAMERA.samples), np.bool_)
 
-    def read(self, start: int, stop: int) -> NDArray[np.int32]:
+    def read(self, start: int, stop: int, samples: slice) -> NDArray[np.int32]:
         places = np.rint(self.sweep.line_px()[start:stop] * SCALE).astype(np.int32)
-        return np.repeat(places[:, None, None], CAMERA.samples, axis=1)
+        return np.repeat(places[:, None, None], CAMERA.samples, axis=1)[:, samples]
 
 
 @pytest.mark.parametrize("step", [1, 2])

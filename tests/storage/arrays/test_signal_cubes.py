@@ -118,12 +118,12 @@ def test_rare_spectra_are_restored(tmp_path: Path) -> None:
             assert np.abs(off / cube.components.noise).max() <= RESIDUAL_STEP / 2 + 1e-3
 
 
-def test_read_window_equals_that_part_of_the_whole(tmp_path: Path) -> None:
+def test_a_window_equals_that_part_of_the_whole(tmp_path: Path) -> None:
     """Scores of some lines and samples equal that part of all scores."""
     cube, _ = store(tmp_path / "fine-0.zarr", lines_of())
     whole = cube.read()
     assert whole.dtype == np.int16
-    np.testing.assert_array_equal(cube.read_window(slice(60, 70), slice(5, 66)), whole[60:70, 5:66])
+    np.testing.assert_array_equal(cube.read(60, 70, slice(5, 66)), whole[60:70, 5:66])
     np.testing.assert_array_equal(cube.read(127), whole[127:])
 
 
@@ -183,7 +183,7 @@ def test_restored_lines_are_close_to_raw_lines(tmp_path: Path, by_mirror: bool) 
     clean = (made.clean / GAIN) * light + DARK
     truth = (numbers - clean)[common(cube)]
     assert np.sqrt(np.mean(truth**2)) < 0.5 * np.sqrt(np.mean((raw - clean)[common(cube)] ** 2))
-    np.testing.assert_array_equal(restored.read_window(slice(60, 70), slice(4, 9)), numbers[60:70, 4:9])
+    np.testing.assert_array_equal(restored.read(60, 70, slice(4, 9)), numbers[60:70, 4:9])
     np.testing.assert_array_equal(restored.read_lines(np.array([1, 65, 128])), numbers[[1, 65, 128]])
 
 
