@@ -42,11 +42,6 @@ class UniformScan:
         """Return a summary, such as "every 2nd line, 25 ms"."""
         return format_scan(self.step, self.exposure_ms)
 
-    @property
-    def price(self) -> tuple[float, int, float]:
-        """Return a key that sorts scans by seconds, then bytes, then falling mIoU."""
-        return self.seconds, self.bytes_raw, -self.expected[MIOU]
-
 
 def format_scan(step: int, *exposures_ms: float) -> str:
     """Return a summary of a scan in one exposure or several, such as "every 2nd line, 25 ms"."""
@@ -196,7 +191,8 @@ def choose_scan(scans: Sequence[UniformScan], seconds: float) -> UniformScan:
             f"{fastest.seconds + 0.005:.2f} s ({fastest.summary})"
         )
     best = max(scan.expected[MIOU] for scan in paid)
-    return min((scan for scan in paid if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
+    equal = [scan for scan in paid if scan.expected[MIOU] >= best - LOSS]
+    return min(equal, key=lambda scan: (scan.seconds, scan.bytes_raw, -scan.expected[MIOU]))
 
 
 def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:
