@@ -172,7 +172,7 @@ def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int
 
 @dataclass(frozen=True)
 class MosaicWork:
-    """PlacedSweep sweeps, camera and grid of a mosaic."""
+    """Placed sweeps, camera and grid of a mosaic."""
 
     placed: Sequence[PlacedSweep]
     camera: LineCamera
