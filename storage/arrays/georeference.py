@@ -7,7 +7,7 @@ odc-geo; its grid mapping has the GeoTransform.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,15 +60,9 @@ class AngularGrid:
         """
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
-        return {
-            "spatial:dimensions": ["y", "x"],
-            "spatial:shape": list(shape),
-            "spatial:transform_type": "affine",
-            "spatial:transform": [step, 0.0, left, 0.0, step, top],
-            "spatial:bbox": [left, top, left + step * shape[1], top + step * shape[0]],
-            "spatial:registration": "pixel",
-            "zarr_conventions": [_SPATIAL | {"description": _OF_ANGLES}],
-        }
+        bounds = (left, top, left + step * shape[1], top + step * shape[0])
+        conventions = [_SPATIAL | {"description": _OF_ANGLES}]
+        return _spatial(shape, (step, 0.0, left, 0.0, step, top), bounds) | {"zarr_conventions": conventions}
 
     def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
         """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
@@ -120,13 +114,19 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
     return {
         **({} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
         "proj:wkt2": crs.to_wkt(),
-        "spatial:dimensions": ["y", "x"],
-        "spatial:shape": list(geobox.shape),
-        "spatial:transform_type": "affine",
-        "spatial:transform": [float(number) for number in geobox.affine[:6]],
-        "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
-        "spatial:registration": "pixel",
+        **_spatial(geobox.shape, geobox.affine[:6], geobox.boundingbox.bbox),
         "zarr_conventions": [_PROJ, _SPATIAL],
+    }
+
+
+def _spatial(shape: Sequence[int], transform: Iterable[float], bounds: Iterable[float]) -> dict[str, Any]:
+    return {
+        "spatial:dimensions": ["y", "x"],
+        "spatial:shape": list(shape),
+        "spatial:transform_type": "affine",
+        "spatial:transform": [float(number) for number in transform],
+        "spatial:bbox": [float(number) for number in bounds],
+        "spatial:registration": "pixel",
     }
 
 
