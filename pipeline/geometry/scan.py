@@ -187,23 +187,17 @@ def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class MemoryPart:
-    """Lines ``lines[0]`` to ``lines[1]`` of a sweep in the pairs ``pairs[0]`` to ``pairs[1]`` of a load, half open."""
+    """Lines ``lines[0]`` to ``lines[1]`` of a sweep in a load, half open."""
 
     sweep: int  # place in the list of sweeps
     lines: tuple[int, int]
-    pairs: tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Load:
-    """One content of the memory. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
+    """One content of the memory. A position is a pair of X and Y; both channels lie in one vector, Y behind X."""
 
     parts: tuple[MemoryPart, ...]
-
-    @property
-    def pairs(self) -> int:
-        """Return the number of pairs in the memory."""
-        return self.parts[-1].pairs[1]
 
 
 def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
@@ -213,8 +207,7 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
 
     Raises SettingsError: the positions of one line do not fit the memory.
     """
-    loads: list[Load] = []
-    parts: list[MemoryPart] = []
+    loads: list[list[MemoryPart]] = [[]]
     used = 0
     for number, sweep in enumerate(sweeps):
         if sweep.positions > vector_pairs:
@@ -226,15 +219,14 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
         while line < sweep.lines:
             room = (vector_pairs - used) // sweep.positions
             if room == 0:
-                loads.append(Load(tuple(parts)))
-                parts = []
+                loads.append([])
                 used = 0
                 continue
             taken = min(room, sweep.lines - line)
-            parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.positions)))
+            loads[-1].append(MemoryPart(number, (line, line + taken)))
             line += taken
             used += taken * sweep.positions
-    return [*loads, Load(tuple(parts))] if parts else loads
+    return [Load(tuple(parts)) for parts in loads if parts]
 
 
 def device_range(cells: tuple[int, int], ends: Ends) -> tuple[int, int]:

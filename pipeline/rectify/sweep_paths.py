@@ -109,21 +109,9 @@ class InterlacedLines:
                 found[part == taker] = column[number[part == taker]]
             return found
 
-        first = parts[0]
-        return cls(
-            sweep,
-            tuple(parts),
-            part,
-            number,
-            position=gathered("position"),
-            time_s=gathered("time_s"),
-            valid_line=gathered("valid_line"),
-            usable=gathered("usable"),
-            source=first.source,
-            references=first.references,
-            components=first.components,
-            step=first.step,
-        )
+        columns: dict[str, Any] = {name: gathered(name) for name in ("position", "time_s", "valid_line", "usable")}
+        shared = {name: getattr(parts[0], name) for name in ("source", "references", "components", "step")}
+        return cls(sweep, tuple(parts), part, number, **columns, **shared)
 
     def read(self, start: int, stop: int, samples: slice = slice(None)) -> Raw:
         """Return scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""

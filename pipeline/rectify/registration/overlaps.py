@@ -97,11 +97,8 @@ class PlacedImage:
         scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
         points = np.stack([scan, line] if sweep.along == "x" else [line, scan], axis=-1)
         for scan_path, image in self.scan_paths:
-            yield (
-                scan_path,
-                image,
-                path_geolocation(scan_path, self.camera, points, along=sweep.along, binning=sweep.binning),
-            )
+            at = path_geolocation(scan_path, self.camera, points, along=sweep.along, binning=sweep.binning)
+            yield scan_path, image, at
 
     def line_and_turn(self, along_px: float, scan_px: float) -> tuple[float, Floats] | None:
         """Return the line that sees a place, and the place's derivative (2, 2) by its centre; None off the sweep."""
