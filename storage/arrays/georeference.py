@@ -132,6 +132,8 @@ def _spatial(shape: Sequence[int], transform: Iterable[float], bounds: Iterable[
 
 def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
     """Return ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
+    import odc.geo.xr as odc_xr
+
     found: dict[str, SmallArray] = {}
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
@@ -142,15 +144,8 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
             about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
             centres = np.arange(size) + 0.5
         found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
-    return {**found, GRID_MAPPING: grid_mapping(geobox)}
-
-
-def grid_mapping(geobox: GeoBox) -> SmallArray:
-    """Return CRS and transform of a map as CF's grid mapping."""
-    import odc.geo.xr as odc_xr
-
     mapping = odc_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
-    return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
+    return {**found, GRID_MAPPING: SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))}
 
 
 def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:

@@ -119,12 +119,6 @@ class SignalCube(cubes.StoredSweep):
             return cubes.read_references(layout.open_group(self.path.with_name(f"{shared}.zarr")))
         return cubes.read_references(self.group)
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(line, sample, component)."""
-        lines, samples = self.usable.shape
-        return lines, samples, len(self.components)
-
     def read(
         self, start: int = 0, stop: int | None = None, samples: slice = slice(None)
     ) -> NDArray[np.signedinteger[Any]]:

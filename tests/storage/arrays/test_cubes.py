@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-import zarr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import IncompleteStoreError
@@ -18,7 +17,7 @@ from spectralzoom.pipeline.source import Line, References
 from spectralzoom.storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from spectralzoom.storage.arrays.georeference import AngularGrid
 from spectralzoom.storage.arrays.mosaics import Attention, open_mosaic, write_attention
-from tests.storage.plain_mosaic import plain_writer, write_values
+from tests.storage.plain_mosaic import write_values
 
 GRID = AngularGrid(1.057e-4, (100, 70))
 
@@ -128,13 +127,6 @@ def test_raw_lines_are_stored_in_chunks_of_64(tmp_path: Path) -> None:
     assert sharding["configuration"]["chunk_shape"] == [64, 128, 6]
     assert [codec["name"] for codec in sharding["configuration"]["codecs"]] == ["bytes", "blosc", "crc32c"]
     assert len([path for path in (tmp_path / "raw.zarr" / "dn" / "c").rglob("*") if path.is_file()]) == 3
-
-
-def test_images_without_bands_have_one_chunk_per_file(tmp_path: Path) -> None:
-    """Separate reads of chunks of a few kilobytes would take longer than their decompression."""
-    coverage = plain_writer(tmp_path / "m.zarr", (130, 700), np.array([500.0, 700.0])).group["coverage"]
-    assert isinstance(coverage, zarr.Array)
-    assert coverage.chunks == coverage.shards == (64, 640)
 
 
 NM = np.linspace(400, 900, 270)

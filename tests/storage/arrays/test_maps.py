@@ -22,11 +22,10 @@ from spectralzoom.storage.arrays.georeference import (
     map_attributes,
     map_coordinates,
 )
-from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
+from spectralzoom.storage.arrays.ground_maps import GroundMapWriter, load_ground_map
 from spectralzoom.storage.arrays.layout import (
     NO_CLASS,
     SHARD_COLUMNS,
-    SHARD_ROWS,
     blank_pixels,
     create_group,
     open_group,
@@ -119,11 +118,6 @@ def test_a_block_must_have_the_images_of_its_map(tmp_path: Path, goes_on: bool) 
     writer = begin(tmp_path / "a.zarr", goes_on=goes_on)
     with pytest.raises(ShapeError, match="give classes, confidence, picture" + (", changed" if goes_on else "")):
         writer.write_block(slice(0, 64), slice(0, 90), block((64, 90), goes_on=not goes_on))
-
-
-def test_the_default_block_is_a_whole_number_of_shards() -> None:
-    """The stage that writes maps in these blocks therefore splits no shard."""
-    assert BLOCK[0] % SHARD_ROWS == BLOCK[1] % SHARD_COLUMNS == 0
 
 
 def test_load_ground_map_refuses_an_angular_map(tmp_path: Path) -> None:
