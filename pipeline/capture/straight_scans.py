@@ -61,11 +61,10 @@ FLAT_PX = 0.01  # largest stretch or shift at the ends of a line without a mirro
 
 @dataclass(frozen=True)
 class StraightScan:
-    """A sweep derived from positions, with the line spacing and direction of the scan."""
+    """A sweep derived from positions, with the line spacing of the scan."""
 
     sweep: Sweep
     distance_px: float  # of consecutive lines; ``sweep.step`` is the nearest whole number from 1
-    backward: bool  # lines were taken against the scan axis
     note: str = ""  # on a gap
 
 
@@ -114,7 +113,7 @@ def fit_sweep(
         step=step,
         binning=binning,
     )
-    return StraightScan(sweep, abs(distance), distance < 0, note)
+    return StraightScan(sweep, abs(distance), note)
 
 
 def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats, apart_px: float, most: float) -> None:

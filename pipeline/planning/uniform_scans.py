@@ -56,7 +56,6 @@ class ScanPerformance:
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
     scores: Mapping[str, NDArray[np.float64]]  # mIoU and IoU by class, (step, exposure) 0..1
-    scenes: int
     spread: NDArray[np.float64] | None = None  # of mIoU, (step, exposure), from scene to scene
     light_fraction: float = 1.0  # of today's light over a clear sky's, in which the scenes were scanned
 
@@ -72,7 +71,6 @@ class ScanPerformance:
             tuple(content["steps"]),
             tuple(float(content["exposures_ms"][i]) / light_fraction for i in order),
             {name: np.asarray(table, np.float64)[:, order] for name, table in tables.items()},
-            int(content["scenes"]),
             None if content.get("spread") is None else np.asarray(content["spread"], np.float64)[:, order],
             light_fraction,
         )

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
 from spectralzoom.storage.arrays import layout
-from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
+from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
 CONFIDENCE_STEP = 1 / 256
@@ -42,7 +42,6 @@ class ClassMap:
     confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where there is no class
     names: tuple[str, ...]
     colours: NDArray[np.uint8]  # (class, 3)
-    grid: AngularGrid | None = None
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def load_class_map(path: Path) -> ClassMap:
     group = layout.open_group(path)
     classes, confidence = (layout.read_array(group, name) for name in ("classes", "confidence"))
     legend = legend_of(group)
-    return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))
+    return ClassMap(classes, confidence, legend.names, legend.colours)
 
 
 def class_counts(classes: NDArray[np.integer], count: int) -> NDArray[np.int64]:

@@ -15,7 +15,7 @@ from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.signal.components import Components, broad_weights
 from spectralzoom.storage.arrays import layout
-from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
+from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
 RGB_NM = (640.0, 550.0, 460.0)  # shown as red, green and blue
@@ -115,8 +115,6 @@ class Mosaic:
     components: Components
     step: float
     wavelength_nm: NDArray[np.float64]  # (band,)
-    fwhm_nm: NDArray[np.float64] | None
-    grid: AngularGrid | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -195,10 +193,7 @@ class Mosaic:
 def open_mosaic(path: Path) -> Mosaic:
     """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = layout.open_group(path)
-    wavelength, fwhm = layout.read_bands(group)
-    return Mosaic(
-        group, layout.read_components(group), layout.step_of(group), wavelength, fwhm, grid_of(dict(group.attrs))
-    )
+    return Mosaic(group, layout.read_components(group), layout.step_of(group), layout.read_bands(group)[0])
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ COST = CostModel()
 GRID = SceneGrid(256, 600, 16)
 FULL = full_sweeps(GRID, CAMERA, "x")
 FULL_S = COST.seconds(FULL, CAMERA)
-RECORD = ScanPerformance((1, 2, 4), (5.0, 100.0), {MIOU: np.array([[0.9, 0.95], [0.85, 0.92], [0.7, 0.8]])}, 3)
+RECORD = ScanPerformance((1, 2, 4), (5.0, 100.0), {MIOU: np.array([[0.9, 0.95], [0.85, 0.92], [0.7, 0.8]])})
 
 
 def second_pass(seconds: float, *, step: int = 4, margin_px: float = 0.0) -> SecondPass:
