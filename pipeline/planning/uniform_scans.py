@@ -7,6 +7,7 @@ Between two exposures interpolation is linear in the logarithm; beyond the table
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -168,11 +169,9 @@ def longest_exposure(
     if taken_s(shortest) > seconds:
         return None
     scale = 10.0**_DIGITS
-    low, high = math.ceil(shortest * scale), math.floor(longest * scale)
-    while low < high:  # bisection, since time is not linear at the camera's highest rate
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if taken_s(middle / scale) <= seconds else (low, middle - 1)
-    return low / scale if taken_s(low / scale) <= seconds else shortest
+    tenths = range(math.ceil(shortest * scale), math.floor(longest * scale) + 1)
+    in_time = bisect_right(tenths, seconds, key=lambda tenth: taken_s(tenth / scale))
+    return tenths[in_time - 1] / scale if in_time else shortest
 
 
 def choose_scan(scans: Sequence[UniformScan], seconds: float) -> UniformScan:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,11 @@ LEAST_LINES = 2  # of a run, so that it has a direction
 CELL_PX = 4  # of the map of captures
 
 
-class StoredLines(CondensedLines, Protocol):
-    """The condensed lines of one sweep, and their source."""
-
-    @property
-    def source(self) -> str:
-        """Return the name of their source."""
-
-
 @dataclass(frozen=True)
 class SweepPath:
     """A captured sweep, its trusted lines, and its corrections."""
 
-    lines: StoredLines
+    lines: CondensedLines
     stamps: JudgedStamps
     shift: SweepShift
     gain: NDArray[np.float32] | None
@@ -62,7 +54,7 @@ class SweepPath:
 
 
 def sweep_paths(
-    sweeps: Sequence[StoredLines], camera: LineCamera, found: Mapping[str, Any] | None = None
+    sweeps: Sequence[CondensedLines], camera: LineCamera, found: Mapping[str, Any] | None = None
 ) -> list[SweepPath]:
     """Judge the lines of sweeps; ``found`` are a registration's corrections, by the sweeps' names."""
     paths = []
@@ -84,7 +76,7 @@ class InterlacedLines:
     """Lines of several condensed sweeps with the same components, read as the lines of one sweep."""
 
     sweep: Sweep  # of all lines together
-    parts: tuple[StoredLines, ...]
+    parts: tuple[CondensedLines, ...]
     part: NDArray[np.intp]  # (line,) number of the sweep of a line
     number: NDArray[np.intp]  # (line,) its line number there
     position: NDArray[np.float64]  # (line, 2) mirror at mid exposure
@@ -98,7 +90,7 @@ class InterlacedLines:
 
     @classmethod
     def of(
-        cls, sweep: Sweep, parts: Sequence[StoredLines], part: NDArray[np.intp], number: NDArray[np.intp]
+        cls, sweep: Sweep, parts: Sequence[CondensedLines], part: NDArray[np.intp], number: NDArray[np.intp]
     ) -> InterlacedLines:
         """Gather the columns of the sweeps' lines."""
 

@@ -89,6 +89,10 @@ class CondensedLines(SweepLines, Protocol):
     def usable(self) -> NDArray[np.bool_]:
         """Return (line, sample) spectra that can be used."""
 
+    @property
+    def source(self) -> str:
+        """Return the name of the source of its lines."""
+
 
 @dataclass(frozen=True)
 class CondensedSignal:

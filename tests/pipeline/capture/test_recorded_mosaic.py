@@ -30,7 +30,9 @@ def _ramp() -> SimulatedSource:
 
 def _mosaic(recorded: RecordedSweep) -> NDArray[np.float32]:
     facts = {one.name: getattr(recorded, one.name) for one in fields(recorded)}
-    lines: Any = SimpleNamespace(**facts, read=lambda start, stop: recorded.read_lines(np.arange(start, stop)))
+    lines: Any = SimpleNamespace(
+        **facts, read=lambda start, stop, at: recorded.read_lines(np.arange(start, stop))[:, at]
+    )
     return np.concatenate(list(mosaic_rows([lines], CAMERA, GRID, rows=80)))
 
 
