@@ -5,8 +5,8 @@ The geolocation of a grid is stored as tie points at every few of its pixels, bi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ SAFETY = 1.05  # on the bound of tie points, which holds to the second order
 PIECE_SAMPLES = 64
 MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
 TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
-LEAST_TIE_PX = 4  # closer tie points take a byte a pixel and more
+TOLERANCE_PX = 2e-3  # of interpolated coordinates [px of the sweep]
+MOST_TIE_PX = 16  # from tie point to tie point
+LEAST_TIE_PX = 4  # closer tie points take a byte a pixel and more: such points are located directly
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class TieTable:
     """
 
     tie_points: Floats  # (row, column, 2) knot and sample of the pixels ``corner`` + (row, column) * spacing
-    spacing: int  # 1: every pixel is a tie point, and NaN where it is off the scan path
+    spacing: int
     shape: tuple[int, int]  # (y, x) of the grid
     bound_px: float  # largest error of a coordinate [px of the sweep]
     seen: NDArray[np.bool_]  # (knot,) of the scan path
@@ -72,8 +74,6 @@ class TieTable:
         ]
         if any(part.stop <= part.start for part in here):
             found: Floats = np.empty((0, 0, 2))
-        elif self.spacing == 1:
-            found = self.tie_points[here[0], here[1]].copy()
         else:
             found = self._between(*here)
             tie_points = self.tie_points[
@@ -110,19 +110,12 @@ class TieTable:
 
 
 def tie_table(
-    scan_path: ScanPath,
-    camera: LineCamera,
-    grid: PixelGrid,
-    *,
-    along: Axis,
-    binning: int = 1,
-    tie: int = 16,
-    tolerance_px: float = 2e-3,
-) -> TieTable:
-    """Tabulate the geolocation of a scan path over a grid.
+    scan_path: ScanPath, camera: LineCamera, grid: PixelGrid, *, along: Axis, binning: int = 1
+) -> TieTable | None:
+    """Tabulate the geolocation of a scan path over a grid; None if lines lie too unevenly for tie points.
 
-    The distance of tie points starts at ``tie`` pixels. It is halved until the error of the pixels between, in lines
-    and in samples, is at most ``tolerance_px`` [px of the sweep]. The bound is an eighth of the tie points' second
+    The distance of tie points starts at 16 pixels. It is halved until the error of the pixels between, in lines
+    and in samples, is at most ``TOLERANCE_PX`` [px of the sweep]. The bound is an eighth of the tie points' second
     differences (of both axes together). The deviation of the knots from straight lines of that length is added, which
     finds a single line out of place between tie points. The error half-way between tie points is used instead if it is
     larger.
@@ -137,25 +130,24 @@ def tie_table(
         return knots_of_points(curve, camera, points.reshape(-1, 2), along, binning).reshape(*counts, 2)
 
     step_px = grid.spacing_px * camera.ifov_rad / scan_path.width
-    while tie > 1:
+    tie = MOST_TIE_PX
+    while tie >= LEAST_TIE_PX:
         tie_points = np.empty((0, 0, 2))
         bound = _knot_bound(scan_path, tie * step_px)
-        if bound <= tolerance_px and min(kept) > 0:
+        if bound <= TOLERANCE_PX and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             tie_points = exact(0, tie, (rows, columns))
             corners = _corners(tie_points)
             ends = np.array([len(scan_path), samples]) - 0.5
             cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(axis=-1)  # with points of it
             bound = SAFETY * (bound + _tie_bound(tie_points, cells))
-            if bound <= tolerance_px:
+            if bound <= TOLERANCE_PX:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
                 bound = max(bound, float(np.abs(middle - corners.mean(axis=0))[cells].max(initial=0)))
-        if bound <= tolerance_px:
+        if bound <= TOLERANCE_PX:
             return TieTable(tie_points, tie, grid.shape, bound, scan_path.seen, samples, corner, kept)
         tie //= 2
-    pixels = exact(0, 1, kept)
-    drop_unseen(pixels, scan_path.seen, samples)
-    return TieTable(pixels, 1, grid.shape, 0.0, scan_path.seen, samples, corner, kept)
+    return None
 
 
 def _within_reach(
@@ -256,11 +248,8 @@ def place(
     )
 
     def table(scan_path: ScanPath) -> TieTable | None:
-        """Return a table of the whole grid; None if lines lie too unevenly for tie points to save memory."""
-        if grid is None:
-            return None
-        of_grid = partial(tie_table, scan_path, camera, along=sweep.along, binning=sweep.binning)
-        return None if of_grid(replace(grid, shape=(1, 1))).spacing < LEAST_TIE_PX else of_grid(grid)
+        """Return the tie table of the whole grid."""
+        return None if grid is None else tie_table(scan_path, camera, grid, along=sweep.along, binning=sweep.binning)
 
     return PlacedSweep(lines, tuple((scan_path, table(scan_path)) for scan_path in scan_paths), gain)
 
