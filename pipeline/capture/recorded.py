@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.errors import NotRecordedError, SceneError, ShapeError
+from spectralzoom.pipeline.errors import NotRecordedError, SceneError
 from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep
@@ -50,12 +50,6 @@ class RecordedSweep:
     exposure_ms: Floats  # (line,)
     valid_line: NDArray[np.bool_]  # (line,)
     read_lines: Callable[[Numbers], NDArray[np.uint16]]  # numbers of lines, ascending -> (line, sample, band) uint16
-
-    def __post_init__(self) -> None:
-        lines = self.sweep.lines
-        for name in ("position", "time_s", "exposure_ms", "valid_line"):
-            if len(getattr(self, name)) != lines:
-                raise ShapeError(f"sweep {self.sweep.name}: {name} is of {len(getattr(self, name))} lines, not {lines}")
 
     @cached_property
     def tangents(self) -> Floats:

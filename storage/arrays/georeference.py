@@ -19,7 +19,6 @@ import zarr
 from affine import Affine
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.errors import PoseError
 from spectralzoom.pipeline.ground.georeference import zoomed_out
 from spectralzoom.storage.arrays.layout import SmallArray, create_group, damage_named, open_group
 
@@ -106,10 +105,7 @@ def create_placed_group(
 
 
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
-    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
-
-    Raises PoseError: the grid has no CRS.
-    """
+    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners."""
     crs = _crs_of(geobox)
     return {
         **({} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
@@ -162,8 +158,7 @@ def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
 
 
 def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
-    if geobox.crs is None:
-        raise PoseError(f"a map needs a CRS, got {geobox!r}")
+    assert geobox.crs is not None
     return geobox.crs
 
 

@@ -12,7 +12,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
@@ -158,8 +157,6 @@ def overlap_windows(images: Sequence[PlacedImage], *, window_px: float) -> list[
 
     A window is as wide as both sweeps reach along all of it; narrow ones are included.
     """
-    if not window_px >= LEAST_OVERLAP_PX:
-        raise SettingsError(f"windows must be at least {LEAST_OVERLAP_PX:.0f} px long, got {window_px} px")
     seen = [number for number, image in enumerate(images) if image.broad.usable.any()]
     return [
         window

@@ -12,7 +12,7 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from spectralzoom.pipeline.errors import IncompleteStoreError, PoseError, ShapeError
+from spectralzoom.pipeline.errors import IncompleteStoreError, ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays import class_maps
 from spectralzoom.storage.arrays.georeference import (
@@ -212,12 +212,6 @@ def test_load_geobox_refuses_a_damaged_store(tmp_path: Path) -> None:
     group.attrs.put({})
     with pytest.raises(IncompleteStoreError, match=r"the grid of .*a\.zarr cannot be read"):
         load_geobox(path)
-
-
-def test_map_attributes_require_a_crs() -> None:
-    """A grid without a CRS raises PoseError."""
-    with pytest.raises(PoseError, match="a map needs a CRS"):
-        map_attributes(GeoBox(box().shape, box().affine, None))
 
 
 # --- class maps on the grid of a mosaic ---------------------------------------------------------------------------
