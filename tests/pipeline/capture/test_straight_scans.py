@@ -13,7 +13,7 @@ from spectralzoom.pipeline.capture.straight_scans import angles_to_positions, co
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
-from spectralzoom.pipeline.geometry.mirror import REST_TANGENT, direction_to_scene, position_to_direction
+from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from spectralzoom.pipeline.geometry.scan import (
     CostModel,
     Sweep,
@@ -140,14 +140,6 @@ def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None
     np.testing.assert_allclose(along, np.broadcast_to(np.arange(640) - 319.5, along.shape), atol=0.011)
     np.testing.assert_allclose(across, np.broadcast_to(scan[:, None], across.shape), atol=1e-6)
     assert flat.slit_px == CAMERA.slit_px
-
-
-def test_angles_along_the_scan_follow_the_formula() -> None:
-    """On the axis X is -tan(angle) / tan 50 deg: the beam along the rest normal is turned by the same angle."""
-    positions, reached = angles_to_positions(np.array([[0, 0], [0, 10], [0, -30], [0, 50]], float))
-    expected = -np.tan(np.deg2rad([0, 10, -30, 50])) / REST_TANGENT
-    np.testing.assert_allclose(positions, np.stack([expected, np.zeros(4)], axis=-1), atol=1e-12)
-    assert reached.all()
 
 
 def test_positions_of_angles_view_along_these_angles() -> None:

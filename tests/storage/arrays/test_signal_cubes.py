@@ -174,15 +174,6 @@ def test_restored_lines_count_unusable_spectra_as_saturated(tmp_path: Path) -> N
     assert np.argwhere(~valid).tolist() == [[7, 9]]
 
 
-@pytest.mark.parametrize("bands", [1, 2, 8])
-def test_few_bands_take_fewer_bytes_than_raw_numbers(tmp_path: Path, bands: int) -> None:
-    """All components of 1 to 8 bands are kept, and stored scores are smaller than the numbers as uint16."""
-    cube, _ = store(tmp_path / "fine-0.zarr", lines_of(bands))
-    assert len(cube.components) == bands
-    stored = sum(path.stat().st_size for path in (tmp_path / "fine-0.zarr" / "scores").rglob("*") if path.is_file())
-    assert stored < 2 * bands * SHAPE[0] * SHAPE[1]
-
-
 def test_lines_without_light_are_stored(tmp_path: Path) -> None:
     """There is no component and no usable spectrum: spectra are NaN, and restored lines are saturated."""
     lines = lines_of()
