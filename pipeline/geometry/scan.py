@@ -15,15 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry import mirror
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.mirror import (
-    camera_slope,
-    direction_to_position,
-    direction_to_scene,
-    line_centre,
-    position_to_direction,
-    scene_to_direction,
-)
 from spectralzoom.pipeline.setting_fields import stated
 
 Axis = Literal["x", "y"]
@@ -130,7 +123,7 @@ def scan_positions(swath_px: float, scan_px: Floats, camera: LineCamera) -> Floa
     Raises PoseError: a position is beyond the mirror's disk.
     """
     tangents = np.stack([np.full_like(scan_px, swath_px), scan_px], axis=-1) * camera.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
+    return mirror.direction_to_position(mirror.scene_to_direction(tangents))
 
 
 def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> Floats:
@@ -140,8 +133,8 @@ def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> 
 
     Raises PoseError: a position is beyond the rim, before or after the shift.
     """
-    tangents = direction_to_scene(position_to_direction(position)) + shift_px * camera.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
+    tangents = mirror.direction_to_scene(mirror.position_to_direction(position)) + shift_px * camera.ifov_rad
+    return mirror.direction_to_position(mirror.scene_to_direction(tangents))
 
 
 def scan_of_points(
@@ -154,8 +147,8 @@ def scan_of_points(
     """
     xi0 = swath_px * camera.ifov_rad
     xi, eta = np.asarray(along_px, np.float64) * camera.ifov_rad, np.asarray(scan_px, np.float64) * camera.ifov_rad
-    centre = line_centre(xi, eta, xi0)
-    return centre / camera.ifov_rad, camera_slope(xi, eta, xi0, centre)
+    centre = mirror.line_centre(xi, eta, xi0)
+    return centre / camera.ifov_rad, mirror.camera_slope(xi, eta, xi0, centre)
 
 
 def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slope: ArrayLike) -> tuple[Floats, Floats]:
