@@ -199,10 +199,7 @@ def write_probabilities_tile(
 
 
 class ProbabilityStore:
-    """Stored class probabilities, read in parts.
-
-    Raises IncompleteStoreError: they are missing or damaged.
-    """
+    """Stored class probabilities, read in parts (IncompleteStoreError: they are missing or damaged)."""
 
     def __init__(self, path: Path) -> None:
         self._group = layout.open_group(path)

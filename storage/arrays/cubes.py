@@ -213,10 +213,7 @@ def read_references(group: zarr.Group) -> References:
 
 
 def open_raw_cube(path: Path) -> RawCube:
-    """Open a sweep that `RawCubeWriter` stored.
-
-    Raises IncompleteStoreError: it is missing, was not closed, or is damaged.
-    """
+    """Open a sweep that `RawCubeWriter` stored (IncompleteStoreError: it is missing, was not closed, or is damaged)."""
     group = layout.open_group(path)
     return RawCube(**read_line_facts(group, path), references=read_references(group))
 

@@ -100,10 +100,7 @@ class GroundMapWriter:
             )
 
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
-        """Store one block of all images, by name.
-
-        Raises ShapeError: an image lacks, or a class has no name.
-        """
+        """Store one block of all images, by name (ShapeError: an image lacks, or a class has no name)."""
         if set(images) != set(self._images):
             raise ShapeError(f"a block got {', '.join(images)}; give {', '.join(self._images)}, one value a pixel")
         for name in NUMBERED & set(images):

@@ -84,10 +84,7 @@ class MosaicWriter:
 
     def write_rows(self, first: int, scores: NDArray[np.floating], seen: NDArray[np.bool_]) -> None:
         """Store rows of scores (y, x, component) and of the mask ``seen`` (y, x); ``first`` is a multiple of 64."""
-        deep, wide = self.tile_shape
-        for rows in cuts(len(scores), deep):
-            for columns in cuts(scores.shape[1], wide):
-                self.write_tile(first + rows.start, columns.start, scores[rows, columns], seen[rows, columns])
+        self.write_tile(first, 0, scores, seen)
 
     def blank(self, where: NDArray[np.bool_] | None) -> None:
         """Set the (y, x) pixels ``where``, which show no scene, to unseen; None: all show it."""
