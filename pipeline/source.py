@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -45,11 +45,8 @@ class References:
 
     def same_as(self, other: References) -> bool:
         """Return whether all frames of two references are equal bit for bit."""
-        frames = ("dark", "white", "white_reference", "bad")
-        pairs = [(getattr(self, name), getattr(other, name)) for name in frames]
-        return self.by_mirror == other.by_mirror and all(
-            (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs
-        )
+        names = (one.name for one in fields(self))
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
 
 class Source(Protocol):
@@ -105,5 +102,5 @@ class SweepLines(Protocol):
     def valid_line(self) -> NDArray[np.bool_]:
         """Return (line,) whether a line can be used."""
 
-    def read(self, start: int, stop: int) -> NDArray[np.integer[Any]]:
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> NDArray[np.integer[Any]]:
         """Return the lines ``start`` to ``stop``: raw DN (line, sample, band), or scores in steps of components."""

@@ -39,7 +39,7 @@ def register_coarse(
 ) -> None:
     """Estimate pointing and radiometric gain of the coarse sweeps from the overlaps of neighbours."""
     sweeps = open_sweeps(signal, None, camera)
-    broad = [BroadSweep.read(one.lines, camera, usable=one.usable) for one in sweeps]
+    broad = [BroadSweep.read(one.lines, usable=one.usable) for one in sweeps]
     out.report(0.4)
     found = register_sweeps(broad, camera, prior_px=prior_px)
     out.report(0.8)
@@ -77,7 +77,7 @@ def register_fine(
     seen = open_mosaic(mosaic.path / "mosaic.zarr")
     under = seen.brightness(bands=BROAD_BANDS) if sweeps else np.empty((0, 0), np.float32)
     for number, one in enumerate(sweeps):
-        broad = BroadSweep.read(one.lines, camera, usable=one.usable)
+        broad = BroadSweep.read(one.lines, usable=one.usable)
         anchors.append(anchor_sweep(broad, camera, grid, under, prior_px=2 * prior_px))
         out.report((number + 1) / len(sweeps))
     record = {

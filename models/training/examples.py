@@ -116,8 +116,8 @@ class _KeptSweep(SimulatedSweep):
     def references(self) -> References:
         return self.source.references(self.sweep)
 
-    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        return self.raw[start:stop]
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> NDArray[np.uint16]:
+        return self.raw[start:stop, samples]
 
 
 def observe_farm(

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.errors import NotRecordedError, SceneError, ShapeError
+from spectralzoom.pipeline.errors import NotRecordedError, SceneError
 from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep
@@ -29,10 +29,8 @@ Numbers = NDArray[np.intp]
 
 BLOCK_LINES = 64  # read at a time
 SWATH_PX = 1.0  # largest distance of a planned swath from the recorded one
-REACH_STEPS = 0.75  # largest distance of a planned line from a recorded one, in recorded line spacings,
-PLANNED_REACH = (
-    0.8  # or in planned line spacings, where that is more: the last recorded line serves a plan that ends there
-)
+REACH_STEPS = 0.75  # largest distance of a planned line from a recorded one, in recorded line spacings, or
+PLANNED_REACH = 0.8  # in planned ones, where that is more: the last recorded line serves a plan that ends there
 FINE_ENOUGH = 1.5  # largest ratio of recorded to planned line spacing
 SAME_PX = 1e-4  # distances that differ by less are equal, as positions are float32; the first line is chosen then
 
@@ -41,7 +39,7 @@ SAME_PX = 1e-4  # distances that differ by less are equal, as positions are floa
 class RecordedSweep:
     """One sweep of a recording: its lines in the order of capture, and a function that reads single lines.
 
-    It is a `pipeline.source.SweepLines`. ``sweep`` is the planned one where the recording holds it, else one that
+    ``sweep`` is the planned one where the recording holds it, else one that
     `pipeline.capture.straight_scans.fit_sweep` derived from the positions.
     """
 
@@ -52,16 +50,6 @@ class RecordedSweep:
     exposure_ms: Floats  # (line,)
     valid_line: NDArray[np.bool_]  # (line,)
     read_lines: Callable[[Numbers], NDArray[np.uint16]]  # numbers of lines, ascending -> (line, sample, band) uint16
-
-    def __post_init__(self) -> None:
-        lines = self.sweep.lines
-        for name in ("position", "time_s", "exposure_ms", "valid_line"):
-            if len(getattr(self, name)) != lines:
-                raise ShapeError(f"sweep {self.sweep.name}: {name} is of {len(getattr(self, name))} lines, not {lines}")
-
-    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Return raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
-        return self.read_lines(np.arange(start, min(stop, self.sweep.lines)))
 
     @cached_property
     def tangents(self) -> Floats:
@@ -92,51 +80,31 @@ class PickedLines:
     again: NDArray[np.bool_]  # (line,) the same recorded line serves the planned line before
 
 
+@dataclass(frozen=True, eq=False)
 class RecordedSource:
     """A :class:`pipeline.source.Source` over recorded sweeps.
 
-    Parameters
-    ----------
-    sweeps
-        The recorded sweeps, in the order of capture.
-    camera
-        The camera of the recording, with the samples of a line that is not binned.
-    wavelength_nm, field_shape
-        (band,) centres [nm] and (y, x) size of the field [px].
-    notes
-        Assumptions on the recording.
-
-    Raises
-    ------
-    SceneError
-        There is no sweep, or a sweep's lines have other samples or bands than the camera and the wavelengths.
+    Raises SceneError: there is no sweep, or a sweep's lines have other samples or bands than the camera and the
+    wavelengths.
     """
 
+    sweeps: Sequence[RecordedSweep]  # in the order of capture
+    camera: LineCamera  # of the recording, with the samples of a line that is not binned
+    wavelength_nm: NDArray[np.float64]  # (band,)
+    field_shape: tuple[int, int]  # (y, x) [px]
+    notes: Sequence[str] = ()  # assumptions on the recording
     name = "recorded"
 
-    def __init__(
-        self,
-        sweeps: Sequence[RecordedSweep],
-        camera: LineCamera,
-        wavelength_nm: NDArray[np.float64],
-        field_shape: tuple[int, int],
-        *,
-        notes: Sequence[str] = (),
-    ) -> None:
-        if not sweeps:
+    def __post_init__(self) -> None:
+        if not self.sweeps:
             raise SceneError("the recording holds no sweep; name a folder or file with raw cubes in it")
-        self.sweeps = tuple(sweeps)
-        self.camera = camera
-        self.wavelength_nm = wavelength_nm
-        self.field_shape = field_shape
-        self.notes = tuple(notes)
         for one in self.sweeps:
-            wanted = (camera.samples // one.sweep.binning, len(wavelength_nm))
+            wanted = (self.camera.samples // one.sweep.binning, len(self.wavelength_nm))
             if one.references.dark.shape != wanted:
                 raise SceneError(
                     f"sweep {one.sweep.name} has lines of {one.references.dark.shape} (sample, band), and a camera of "
-                    f"{camera.samples} samples and {len(wavelength_nm)} wavelengths gives {wanted} with binning "
-                    f"{one.sweep.binning}; set camera.samples and the wavelengths to what was recorded"
+                    f"{self.camera.samples} samples and {len(self.wavelength_nm)} wavelengths gives {wanted} with "
+                    f"binning {one.sweep.binning}; set camera.samples and the wavelengths to what was recorded"
                 )
 
     @property
@@ -157,7 +125,7 @@ class RecordedSource:
 
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames of the lines that serve a sweep; raises as `lines`."""
-        return (self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]).references
+        return self.sweeps[int(self.pick(sweep).place[0])].references
 
     def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
         """Return a sweep without the lines at either end that were never captured; None where none was.
@@ -165,11 +133,7 @@ class RecordedSource:
         Plans begin and end a few lines beyond the field, where a recording may have none. A missing line in between
         stays, and `lines` names it. A recorded line that serves the last two lines of an end counts as one of them.
         """
-        if self._own(sweep) is not None:
-            return sweep
-        place, line, _ = max(
-            (self._nearest(sweep, group) for group in self._groups), key=lambda one: np.count_nonzero(one[0] >= 0)
-        )
+        place, line = self._served(sweep)
         taken = np.flatnonzero(place >= 0)
         if not len(taken):
             return None
@@ -181,9 +145,7 @@ class RecordedSource:
 
     def serves(self, sweep: Sweep) -> bool:
         """Return whether every line of a sweep was captured, so that `pick` finds it."""
-        return self._own(sweep) is not None or any(
-            bool((self._nearest(sweep, group)[0] >= 0).all()) for group in self._groups
-        )
+        return bool((self._served(sweep)[0] >= 0).all())
 
     def pick(self, sweep: Sweep) -> PickedLines:
         """Choose the recorded lines that serve a sweep; nothing is read.
@@ -192,17 +154,21 @@ class RecordedSource:
 
         Raises NotRecordedError: a planned line was never captured.
         """
-        if (own := self._own(sweep)) is not None:
-            return PickedLines(np.full(sweep.lines, own), np.arange(sweep.lines), np.zeros(sweep.lines, np.bool_))
-        found = [self._nearest(sweep, group) for group in self._groups]
-        whole = [one for one in found if (one[0] >= 0).all()]
-        if not whole:
-            self._refuse(sweep, max((place for place, _, _ in found), key=lambda place: np.count_nonzero(place >= 0)))
-        place, line, _ = min(whole, key=lambda one: round(float(one[2].mean()) / SAME_PX) if sweep.lines else 0)
+        place, line = self._served(sweep)
+        if (place < 0).any():
+            self._refuse(sweep, place)
         order = np.lexsort((line, place))
         place, line = place[order], line[order]
         again = (np.diff(place, prepend=-1) == 0) & (np.diff(line, prepend=-1) == 0)
         return PickedLines(place, line, again)
+
+    def _served(self, sweep: Sweep) -> tuple[Numbers, Numbers]:
+        """Return recorded sweep and line for each planned line, of the group that serves the most; -1 where none."""
+        if (own := self._own(sweep)) is not None:
+            return np.full(sweep.lines, own), np.arange(sweep.lines)
+        found = [self._nearest(sweep, group) for group in self._groups]
+        place, line, _ = min(found, key=lambda one: (np.sum(one[0] < 0), np.round(one[2].mean() / SAME_PX)))
+        return place, line
 
     def _own(self, sweep: Sweep) -> int | None:
         """Return the number of the recorded sweep with the same lines; its exposure decides among several."""
@@ -238,13 +204,7 @@ class RecordedSource:
         """
         place, line = np.full((2, sweep.lines), -1)
         best = np.full(sweep.lines, np.inf)
-        able = [  # on the planned swath, with its binning and fine enough lines
-            number
-            for number, one in ((number, self.sweeps[number]) for number in group)
-            if (one.sweep.along, one.sweep.binning) == (sweep.along, sweep.binning)
-            and abs(one.sweep.swath_px - sweep.swath_px) <= SWATH_PX
-            and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
-        ]
+        able = [number for number in group if self._is_able(self.sweeps[number], sweep)]
         for usable in (True, False):
             open_lines = place < 0
             for number in able:
@@ -258,6 +218,14 @@ class RecordedSource:
                 better = open_lines & (distance <= reach) & (distance < best - SAME_PX)
                 place[better], line[better], best[better] = number, candidates[near[better]], distance[better]
         return place, line, best
+
+    def _is_able(self, one: RecordedSweep, sweep: Sweep) -> bool:
+        """Return whether a recorded sweep lies on the planned swath, with its binning and fine enough lines."""
+        return (
+            (one.sweep.along, one.sweep.binning) == (sweep.along, sweep.binning)
+            and abs(one.sweep.swath_px - sweep.swath_px) <= SWATH_PX
+            and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
+        )
 
     def _refuse(self, sweep: Sweep, place: Numbers) -> NoReturn:
         """Raise NotRecordedError for the first planned line without a recorded one; ``place`` is -1 there."""

@@ -91,7 +91,6 @@ class RecordedPasses:
         found = []
         for sweep in planned:
             if (cut := self.source.cut_to_recorded(sweep)) is not None:
-                self.source.pick(cut)
                 found.append(replace(cut, exposure_ms=self._exposure_ms(cut)))
         return found
 
@@ -115,19 +114,11 @@ class RecordedPasses:
         for one in (some for some in self.source.sweeps if some.valid_line.any()):
             scan_px = one.tangents[one.valid_line, 1] / self.source.camera.ifov_rad
             low, high = float(np.nanmin(scan_px)), float(np.nanmax(scan_px))
-            found.append(
-                replace(
-                    like,
-                    name=f"{like.name.rpartition('-')[0]}-{len(found)}",
-                    swath_px=one.sweep.swath_px,
-                    start_px=low - (like.positions - 1) / 2,
-                    lines=round((high - low) / like.step) + 1,
-                )
-            )
+            name, lines = f"{like.name.rpartition('-')[0]}-{len(found)}", round((high - low) / like.step) + 1
+            start_px = low - (like.positions - 1) / 2
+            found.append(replace(like, name=name, swath_px=one.sweep.swath_px, start_px=start_px, lines=lines))
         return found
 
     def _exposure_ms(self, sweep: Sweep) -> float | None:
         """Return the exposure of the recorded sweep that serves the first line."""
-        if not sweep.lines:
-            return sweep.exposure_ms
         return self.source.sweeps[int(self.source.pick(sweep).place[0])].sweep.exposure_ms

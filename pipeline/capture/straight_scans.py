@@ -14,16 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.geometry import mirror
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.mirror import (
-    REST_TANGENT,
-    direction_to_normal,
-    direction_to_position,
-    direction_to_scene,
-    normal_to_device,
-    position_to_direction,
-    scene_to_direction,
-)
 from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, points_of_scan
 
 MOST_DEG = 89.0  # a direction at a larger angle misses the scene plane
@@ -38,13 +30,13 @@ def angles_to_positions(angles_deg: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """
     positions = np.full(angles_deg.shape, np.nan)
     ahead = (np.abs(angles_deg) < MOST_DEG).all(axis=1)
-    direction = scene_to_direction(np.tan(np.deg2rad(angles_deg[ahead])))
-    device = normal_to_device(direction_to_normal(direction))
+    direction = mirror.scene_to_direction(np.tan(np.deg2rad(angles_deg[ahead])))
+    device = mirror.normal_to_device(mirror.direction_to_normal(direction))
     straight = 2 * device[:, 2] ** 2 - 1  # of the beam that falls along the rest normal, after the reflection
     lateral = 2 * device[:, 2] * np.hypot(device[:, 0], device[:, 1])
     reached = np.zeros(len(angles_deg), np.bool_)
-    reached[ahead] = (device[:, 2] > 0) & (straight > 0) & (lateral <= REST_TANGENT * straight)
-    positions[reached] = direction_to_position(direction[reached[ahead]])
+    reached[ahead] = (device[:, 2] > 0) & (straight > 0) & (lateral <= mirror.REST_TANGENT * straight)
+    positions[reached] = mirror.direction_to_position(direction[reached[ahead]])
     return positions, reached
 
 
@@ -61,11 +53,10 @@ FLAT_PX = 0.01  # largest stretch or shift at the ends of a line without a mirro
 
 @dataclass(frozen=True)
 class StraightScan:
-    """A sweep derived from positions, with the line spacing and direction of the scan."""
+    """A sweep derived from positions, with the line spacing of the scan."""
 
     sweep: Sweep
     distance_px: float  # of consecutive lines; ``sweep.step`` is the nearest whole number from 1
-    backward: bool  # lines were taken against the scan axis
     note: str = ""  # on a gap
 
 
@@ -99,7 +90,7 @@ def fit_sweep(
             f"sweep {name} has too few valid lines ({len(lines)}), a scan takes at least 2: leave it out, record more "
             "lines, or survey its file with --scene"
         )
-    across, scan = (direction_to_scene(position_to_direction(position[lines])) / camera.ifov_rad).T
+    across, scan = (mirror.direction_to_scene(mirror.position_to_direction(position[lines])) / camera.ifov_rad).T
     distance, note = line_spacing(scan, lines)
     _check_path(name, lines, across, scan, distance, MOST_BEND * camera.samples)
     step = max(round(abs(distance)), 1)
@@ -114,7 +105,7 @@ def fit_sweep(
         step=step,
         binning=binning,
     )
-    return StraightScan(sweep, abs(distance), distance < 0, note)
+    return StraightScan(sweep, abs(distance), note)
 
 
 def _check_path(name: str, lines: NDArray[np.intp], across: Floats, scan: Floats, apart_px: float, most: float) -> None:

@@ -15,15 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry import mirror
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.mirror import (
-    camera_slope,
-    direction_to_position,
-    direction_to_scene,
-    line_centre,
-    position_to_direction,
-    scene_to_direction,
-)
 from spectralzoom.pipeline.setting_fields import stated
 
 Axis = Literal["x", "y"]
@@ -130,7 +123,7 @@ def scan_positions(swath_px: float, scan_px: Floats, camera: LineCamera) -> Floa
     Raises PoseError: a position is beyond the mirror's disk.
     """
     tangents = np.stack([np.full_like(scan_px, swath_px), scan_px], axis=-1) * camera.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
+    return mirror.direction_to_position(mirror.scene_to_direction(tangents))
 
 
 def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> Floats:
@@ -140,8 +133,8 @@ def shifted_position(position: Floats, shift_px: Floats, camera: LineCamera) -> 
 
     Raises PoseError: a position is beyond the rim, before or after the shift.
     """
-    tangents = direction_to_scene(position_to_direction(position)) + shift_px * camera.ifov_rad
-    return direction_to_position(scene_to_direction(tangents))
+    tangents = mirror.direction_to_scene(mirror.position_to_direction(position)) + shift_px * camera.ifov_rad
+    return mirror.direction_to_position(mirror.scene_to_direction(tangents))
 
 
 def scan_of_points(
@@ -154,8 +147,8 @@ def scan_of_points(
     """
     xi0 = swath_px * camera.ifov_rad
     xi, eta = np.asarray(along_px, np.float64) * camera.ifov_rad, np.asarray(scan_px, np.float64) * camera.ifov_rad
-    centre = line_centre(xi, eta, xi0)
-    return centre / camera.ifov_rad, camera_slope(xi, eta, xi0, centre)
+    centre = mirror.line_centre(xi, eta, xi0)
+    return centre / camera.ifov_rad, mirror.camera_slope(xi, eta, xi0, centre)
 
 
 def points_of_scan(swath_px: float, camera: LineCamera, scan_px: ArrayLike, slope: ArrayLike) -> tuple[Floats, Floats]:
@@ -187,23 +180,17 @@ def sweep_to_scene(sweep: Sweep, camera: LineCamera) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class MemoryPart:
-    """Lines ``lines[0]`` to ``lines[1]`` of a sweep in the pairs ``pairs[0]`` to ``pairs[1]`` of a load, half open."""
+    """Lines ``lines[0]`` to ``lines[1]`` of a sweep in a load, half open."""
 
     sweep: int  # place in the list of sweeps
     lines: tuple[int, int]
-    pairs: tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Load:
-    """One content of the memory. A pair is an X and a Y; both channels lie in one vector, Y behind X."""
+    """One content of the memory. A position is a pair of X and Y; both channels lie in one vector, Y behind X."""
 
     parts: tuple[MemoryPart, ...]
-
-    @property
-    def pairs(self) -> int:
-        """Return the number of pairs in the memory."""
-        return self.parts[-1].pairs[1]
 
 
 def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
@@ -213,8 +200,7 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
 
     Raises SettingsError: the positions of one line do not fit the memory.
     """
-    loads: list[Load] = []
-    parts: list[MemoryPart] = []
+    loads: list[list[MemoryPart]] = [[]]
     used = 0
     for number, sweep in enumerate(sweeps):
         if sweep.positions > vector_pairs:
@@ -226,15 +212,14 @@ def memory_loads(sweeps: Sequence[Sweep], vector_pairs: int) -> list[Load]:
         while line < sweep.lines:
             room = (vector_pairs - used) // sweep.positions
             if room == 0:
-                loads.append(Load(tuple(parts)))
-                parts = []
+                loads.append([])
                 used = 0
                 continue
             taken = min(room, sweep.lines - line)
-            parts.append(MemoryPart(number, (line, line + taken), (used, used + taken * sweep.positions)))
+            loads[-1].append(MemoryPart(number, (line, line + taken)))
             line += taken
             used += taken * sweep.positions
-    return [*loads, Load(tuple(parts))] if parts else loads
+    return [Load(tuple(parts)) for parts in loads if parts]
 
 
 def device_range(cells: tuple[int, int], ends: Ends) -> tuple[int, int]:

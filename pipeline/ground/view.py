@@ -25,7 +25,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spectralzoom.pipeline.errors import PoseError, ShapeError
+from spectralzoom.pipeline.errors import PoseError
 from spectralzoom.pipeline.setting_fields import misfits, stated
 
 Floats = NDArray[np.float64]
@@ -130,7 +130,7 @@ class GroundView:
 
     def sink(self, points_px: ArrayLike) -> Floats:
         """Return w of scene points (..., 2): above 0 where the ray meets the ground, 0 at the horizon."""
-        tangents = _pairs(points_px) * self.ifov_rad
+        tangents = np.asarray(points_px, np.float64) * self.ifov_rad
         return np.asarray(self.sinks[0] + tangents[..., 1] * self.sinks[1] + tangents[..., 0] * self.sinks[2])
 
     def scene_to_ground(self, points_px: ArrayLike) -> Floats:
@@ -138,7 +138,7 @@ class GroundView:
 
         NaN where the ray is at or above the horizon.
         """
-        tangents = _pairs(points_px) * self.ifov_rad
+        tangents = np.asarray(points_px, np.float64) * self.ifov_rad
         view, right, down = self.axes
         rays = view + tangents[..., 1:] * right + tangents[..., :1] * down
         w = self.sink(points_px)
@@ -194,10 +194,3 @@ def pixel_places(scene_shape: tuple[int, int]) -> tuple[Floats, Floats]:
     """Return y of every row and x of every column of a scene, from its centre [px]."""
     rows, columns = (np.arange(size, dtype=np.float64) for size in scene_shape)
     return rows - (scene_shape[0] - 1) / 2, columns - (scene_shape[1] - 1) / 2
-
-
-def _pairs(points_px: ArrayLike) -> Floats:
-    points = np.asarray(points_px, np.float64)
-    if points.ndim == 0 or points.shape[-1] != 2:
-        raise ShapeError(f"scene points need y and x on the last axis, got shape {points.shape}")
-    return points

@@ -31,7 +31,9 @@ def on_field(shape: BaseGeometry, crs: pyproj.CRS, place: GroundPlace) -> BaseGe
     back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
     outline = shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
     there, given = (_unwrapped(one, middle) for one in (outline, shape))
-    around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
+    (west, south), (east, north) = np.reshape(there.bounds, (2, 2))
+    by = ROUND_THE_FIELD * max(east - west, north - south)
+    around = shapely.box(west - by, south - by, east + by, north + by)
     near = shapely.intersection(given, around)
     if near.is_empty:
         return near
@@ -63,11 +65,6 @@ def _unwrapped(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
             shape, lambda at: np.column_stack([(at[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg, at[:, 1:]])
         )
     )
-
-
-def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
-    west, south, east, north = shape.bounds
-    return shapely.box(west - by, south - by, east + by, north + by)
 
 
 def pixels_inside(shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0)) -> Mask:

@@ -29,15 +29,32 @@ BEYOND = "beyond the mirror's range; use a smaller scene or a smaller angle per 
 _PROBES = 65  # scan positions at which a swath's reach is computed; it changes by 1e-3 px between two
 
 
-def full_sweeps(grid: SceneGrid, camera: LineCamera, along: Axis, *, overlap_px: float = 0) -> list[Sweep]:
-    """Cover the whole scene at full resolution with the fewest swaths of lines along one axis.
+def full_sweeps(
+    grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int = 1, overlap_px: float = 0
+) -> list[Sweep]:
+    """Cover the whole scene with the fewest swaths of lines of ``step`` held positions along one axis.
 
-    ``overlap_px`` is the least width that neighbouring swaths share, and half of it beyond either end of the field.
+    ``overlap_px`` is the least width that neighbouring swaths share, and half of it beyond either end of the field, in
+    px of the full resolution.
 
     Raises PoseError: the field is beyond the mirror's range.
     Raises SettingsError: the overlap is negative or as wide as a line.
     """
-    return _cover(grid, camera, along, step=1, overlap_px=overlap_px)
+    if not 0 <= overlap_px < camera.samples // step * step:
+        raise SettingsError(
+            f"swaths of lines of {camera.samples} samples can overlap by 0 px or more and less than a line, "
+            f"got {overlap_px} px; choose a smaller overlap"
+        )
+    across, scan = field_px(grid, along)
+    cells = -(-across // step)
+    low, high = -across / 2, cells * step - across / 2
+    sweeps = []
+    for number, swath in enumerate(_swath_centres((low, high), scan, camera, step, overlap_px)):
+        seen = np.clip(swath + reach_px(swath, scan, camera, step), low + step / 2, high - step / 2)
+        start, lines = _scan_range(float(swath), seen, scan, camera, step)
+        sweeps.append(Sweep(f"full-{number}", "fine", along, float(swath), start, lines, step))
+    check_reach(sweeps, camera)
+    return sweeps
 
 
 def uniform_sweeps(
@@ -49,17 +66,10 @@ def uniform_sweeps(
     exposure_ms: float | None = None,
     overlap_px: float = 0,
 ) -> list[Sweep]:
-    """Cover the whole scene with lines of ``step`` held positions.
-
-    ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution; ``exposure_ms`` None takes the
-    camera's.
-
-    Raises SettingsError: the overlap is negative or as wide as a line. Raises PoseError: the field is beyond the
-    mirror's range.
-    """
+    """Return `full_sweeps` as a uniform scan, raising as they do; ``exposure_ms`` None takes the camera's."""
     return [
         replace(sweep, name=f"scan-{number}", kind="coarse", exposure_ms=exposure_ms)
-        for number, sweep in enumerate(_cover(grid, camera, along, step=step, overlap_px=overlap_px))
+        for number, sweep in enumerate(full_sweeps(grid, camera, along, step=step, overlap_px=overlap_px))
     ]
 
 
@@ -95,11 +105,8 @@ def with_margin(sweeps: Sequence[Sweep], camera: LineCamera, margin_px: float) -
 
     Raises PoseError: a sweep then leaves the mirror's range.
     """
-    more = [-(-margin_px // sweep.step) for sweep in sweeps]
-    grown = [
-        replace(sweep, start_px=sweep.start_px - count * sweep.step, lines=sweep.lines + 2 * int(count))
-        for sweep, count in zip(sweeps, more, strict=True)
-    ]
+    more = (int(-(-margin_px // sweep.step)) for sweep in sweeps)
+    grown = [some_lines(sweep, -count, sweep.lines + count) for sweep, count in zip(sweeps, more, strict=True)]
     check_reach(grown, camera)
     return grown
 
@@ -122,24 +129,6 @@ def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArra
 def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:
     """Return the scene's size along the line and along the scan [px]."""
     return (grid.width, grid.height) if along == "x" else (grid.height, grid.width)
-
-
-def _cover(grid: SceneGrid, camera: LineCamera, along: Axis, *, step: int, overlap_px: float) -> list[Sweep]:
-    if not 0 <= overlap_px < camera.samples // step * step:
-        raise SettingsError(
-            f"swaths of lines of {camera.samples} samples can overlap by 0 px or more and less than a line, "
-            f"got {overlap_px} px; choose a smaller overlap"
-        )
-    across, scan = field_px(grid, along)
-    cells = -(-across // step)
-    low, high = -across / 2, cells * step - across / 2
-    sweeps = []
-    for number, swath in enumerate(_swath_centres((low, high), scan, camera, step, overlap_px)):
-        seen = np.clip(swath + reach_px(swath, scan, camera, step), low + step / 2, high - step / 2)
-        start, lines = _scan_range(float(swath), seen, scan, camera, step)
-        sweeps.append(Sweep(f"full-{number}", "fine", along, float(swath), start, lines, step))
-    check_reach(sweeps, camera)
-    return sweeps
 
 
 def _swath_centres(
@@ -289,14 +278,10 @@ class SavingEntry:
     done: float
     full: float
 
-    @property
-    def ratio(self) -> float | None:
-        """Return done over full; None where full is 0."""
-        return self.done / self.full if self.full else None
-
     def as_dict(self) -> dict[str, float | str | None]:
-        """Return the entry in the receipt's form."""
-        return {"done": self.done, "full": self.full, "ratio": self.ratio, "full_is": "predicted"}
+        """Return the entry in the receipt's form; the ratio is None where full is 0."""
+        ratio = self.done / self.full if self.full else None
+        return {"done": self.done, "full": self.full, "ratio": ratio, "full_is": "predicted"}
 
 
 def count_samples(sweeps: Sequence[Sweep], camera: LineCamera, grid: SceneGrid) -> int:

@@ -49,6 +49,11 @@ class FinePlan:
         return sum(sweep.lines for sweep in self.sweeps)
 
 
+def no_pass(reason: str, expected_gain: float = 0.0) -> FinePlan:
+    """Return a second pass without lines."""
+    return FinePlan([], np.empty(0, np.intp), 0.0, expected_gain, reason=reason)
+
+
 @dataclass(frozen=True)
 class SecondPass:
     """Planner of the second pass in the time that the first one leaves.
@@ -123,7 +128,7 @@ class SecondPass:
         if self.recorded is not None:
             sweeps = self.recorded(sweeps)
         if chosen is None or not sweeps:
-            return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason="no run of lines with a gain fits the time")
+            return no_pass("no run of lines with a gain fits the time")
         patch_index = self.rows.patches(chosen.runs)
         whole = len(patch_index) == np.count_nonzero(self.rows.row >= 0)
         what = "the whole field" if whole else f"{len(patch_index)} patches"
@@ -158,12 +163,12 @@ class SecondPass:
         plans = [plan for plan in plans if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
         plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
         if plan is None:
-            reason = "no second pass in the time would score more than the first one"
-            return FinePlan([], np.empty(0, np.intp), 0.0, 0.0, reason=reason)
+            return no_pass("no second pass in the time would score more than the first one")
         if not plan.sweeps or plan.expected_gain >= LEAST_GAIN:
             return plan
-        reason = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
-        return FinePlan([], np.empty(0, np.intp), 0.0, plan.expected_gain, reason=reason)
+        return no_pass(
+            f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points", plan.expected_gain
+        )
 
     @property
     def _between(self) -> Sequence[Sweep]:

@@ -113,14 +113,14 @@ def sweeps_of_runs(sweeps: Sequence[Sweep], runs: Sequence[LineRun]) -> list[Swe
     for number, first, stop in runs:
         if not 0 <= number < len(sweeps):
             raise SettingsError(f"the extent names sweep {number}, the scan has sweeps 0 to {len(sweeps) - 1}")
-        sweep = sweeps[number]
-        if not 0 <= first < stop <= sweep.lines:
+        lines = sweeps[number].lines
+        if not 0 <= first < stop <= lines:
             raise SettingsError(
-                f"the extent names lines {first} to {stop} of sweep {number}, which has lines 0 to {sweep.lines}"
+                f"the extent names lines {first} to {stop} of sweep {number}, which has lines 0 to {lines}"
             )
         if number in taken:
             raise SettingsError(f"the extent names sweep {number} twice; give one run of its lines")
-        taken[number] = some_lines(sweep, first, stop)
+        taken[number] = some_lines(sweeps[number], first, stop)
     return [taken[number] for number in sorted(taken)]
 
 

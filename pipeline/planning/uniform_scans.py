@@ -7,6 +7,7 @@ Between two exposures interpolation is linear in the logarithm; beyond the table
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -42,11 +43,6 @@ class UniformScan:
         """Return a summary, such as "every 2nd line, 25 ms"."""
         return format_scan(self.step, self.exposure_ms)
 
-    @property
-    def price(self) -> tuple[float, int, float]:
-        """Return a key that sorts scans by seconds, then bytes, then falling mIoU."""
-        return self.seconds, self.bytes_raw, -self.expected[MIOU]
-
 
 def format_scan(step: int, *exposures_ms: float) -> str:
     """Return a summary of a scan in one exposure or several, such as "every 2nd line, 25 ms"."""
@@ -61,7 +57,6 @@ class ScanPerformance:
     steps: tuple[int, ...]
     exposures_ms: tuple[float, ...]  # ascending
     scores: Mapping[str, NDArray[np.float64]]  # mIoU and IoU by class, (step, exposure) 0..1
-    scenes: int
     spread: NDArray[np.float64] | None = None  # of mIoU, (step, exposure), from scene to scene
     light_fraction: float = 1.0  # of today's light over a clear sky's, in which the scenes were scanned
 
@@ -77,7 +72,6 @@ class ScanPerformance:
             tuple(content["steps"]),
             tuple(float(content["exposures_ms"][i]) / light_fraction for i in order),
             {name: np.asarray(table, np.float64)[:, order] for name, table in tables.items()},
-            int(content["scenes"]),
             None if content.get("spread") is None else np.asarray(content["spread"], np.float64)[:, order],
             light_fraction,
         )
@@ -175,11 +169,9 @@ def longest_exposure(
     if taken_s(shortest) > seconds:
         return None
     scale = 10.0**_DIGITS
-    low, high = math.ceil(shortest * scale), math.floor(longest * scale)
-    while low < high:  # bisection, since time is not linear at the camera's highest rate
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if taken_s(middle / scale) <= seconds else (low, middle - 1)
-    return low / scale if taken_s(low / scale) <= seconds else shortest
+    tenths = range(math.ceil(shortest * scale), math.floor(longest * scale) + 1)
+    in_time = bisect_right(tenths, seconds, key=lambda tenth: taken_s(tenth / scale))
+    return tenths[in_time - 1] / scale if in_time else shortest
 
 
 def choose_scan(scans: Sequence[UniformScan], seconds: float) -> UniformScan:
@@ -196,7 +188,8 @@ def choose_scan(scans: Sequence[UniformScan], seconds: float) -> UniformScan:
             f"{fastest.seconds + 0.005:.2f} s ({fastest.summary})"
         )
     best = max(scan.expected[MIOU] for scan in paid)
-    return min((scan for scan in paid if scan.expected[MIOU] >= best - LOSS), key=lambda scan: scan.price)
+    equal = [scan for scan in paid if scan.expected[MIOU] >= best - LOSS]
+    return min(equal, key=lambda scan: (scan.seconds, scan.bytes_raw, -scan.expected[MIOU]))
 
 
 def reference_scan(scans: Sequence[UniformScan]) -> UniformScan:

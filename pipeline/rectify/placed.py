@@ -6,7 +6,7 @@ The geolocation of a grid is stored as tie points at every few of its pixels, bi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,29 @@ SAFETY = 1.05  # on the bound of tie points, which holds to the second order
 PIECE_SAMPLES = 64
 MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
 TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
-LEAST_TIE_PX = 4  # closer tie points take a byte a pixel and more
+TOLERANCE_PX = 2e-3  # of interpolated coordinates [px of the sweep]
+MOST_TIE_PX = 16  # from tie point to tie point
+LEAST_TIE_PX = 4  # closer tie points take a byte a pixel and more: such points are located directly
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """Pixels of a grid: y and x of the first centre from the scene's centre, their distance, and their number."""
+
+    origin_px: tuple[float, float]
+    spacing_px: float
+    shape: tuple[int, int]
+
+    @classmethod
+    def of_scene(cls, grid: SceneGrid) -> PixelGrid:
+        """Return the scene's own pixels."""
+        return cls(((1 - grid.height) / 2, (1 - grid.width) / 2), 1, (grid.height, grid.width))
+
+    def points(self, rows: slice, columns: slice) -> NDArray[np.float64]:
+        """Return the centres of a part of the pixels, (y, x, 2) from the scene's centre [px]."""
+        y = self.origin_px[0] + self.spacing_px * np.arange(rows.start, rows.stop)
+        x = self.origin_px[1] + self.spacing_px * np.arange(columns.start, columns.stop)
+        return np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -35,7 +57,7 @@ class TieTable:
     """
 
     tie_points: Floats  # (row, column, 2) knot and sample of the pixels ``corner`` + (row, column) * spacing
-    spacing: int  # 1: every pixel is a tie point, and NaN where it is off the scan path
+    spacing: int
     shape: tuple[int, int]  # (y, x) of the grid
     bound_px: float  # largest error of a coordinate [px of the sweep]
     seen: NDArray[np.bool_]  # (knot,) of the scan path
@@ -52,8 +74,6 @@ class TieTable:
         ]
         if any(part.stop <= part.start for part in here):
             found: Floats = np.empty((0, 0, 2))
-        elif self.spacing == 1:
-            found = self.tie_points[here[0], here[1]].copy()
         else:
             found = self._between(*here)
             tie_points = self.tie_points[
@@ -90,70 +110,59 @@ class TieTable:
 
 
 def tie_table(
-    scan_path: ScanPath,
-    camera: LineCamera,
-    *,
-    along: Axis,
-    binning: int = 1,
-    origin_px: tuple[float, float],
-    spacing_px: float,
-    shape: tuple[int, int],
-    tie: int = 16,
-    tolerance_px: float = 2e-3,
-) -> TieTable:
-    """Tabulate the geolocation of a scan path over a grid: its first centre, the distance of centres [px], (y, x).
+    scan_path: ScanPath, camera: LineCamera, grid: PixelGrid, *, along: Axis, binning: int = 1
+) -> TieTable | None:
+    """Tabulate the geolocation of a scan path over a grid; None if lines lie too unevenly for tie points.
 
-    The distance of tie points starts at ``tie`` pixels. It is halved until the error of the pixels between, in lines
-    and in samples, is at most ``tolerance_px`` [px of the sweep]. The bound is an eighth of the tie points' second
+    The distance of tie points starts at 16 pixels. It is halved until the error of the pixels between, in lines
+    and in samples, is at most ``TOLERANCE_PX`` [px of the sweep]. The bound is an eighth of the tie points' second
     differences (of both axes together). The deviation of the knots from straight lines of that length is added, which
     finds a single line out of place between tie points. The error half-way between tie points is used instead if it is
     larger.
     """
     curve = KnotCurve(scan_path)
     samples = camera.samples // binning
-    corner, kept = _within_reach(curve, camera, along, (binning, origin_px, spacing_px, shape))
+    corner, kept = _within_reach(curve, camera, grid, along, binning)
 
     def exact(first: float, step: int, counts: tuple[int, int]) -> Floats:
-        origin = (origin_px[0] + spacing_px * (corner[0] + first), origin_px[1] + spacing_px * (corner[1] + first))
-        points = PixelGrid(origin, step * spacing_px, counts).points(slice(0, counts[0]), slice(0, counts[1]))
+        y, x = (start + grid.spacing_px * (at + first) for start, at in zip(grid.origin_px, corner, strict=True))
+        points = PixelGrid((y, x), step * grid.spacing_px, counts).points(slice(0, counts[0]), slice(0, counts[1]))
         return knots_of_points(curve, camera, points.reshape(-1, 2), along, binning).reshape(*counts, 2)
 
-    step_px = spacing_px * camera.ifov_rad / scan_path.width
-    while tie > 1:
+    step_px = grid.spacing_px * camera.ifov_rad / scan_path.width
+    tie = MOST_TIE_PX
+    while tie >= LEAST_TIE_PX:
         tie_points = np.empty((0, 0, 2))
         bound = _knot_bound(scan_path, tie * step_px)
-        if bound <= tolerance_px and min(kept) > 0:
+        if bound <= TOLERANCE_PX and min(kept) > 0:
             rows, columns = ((size - 1) // tie + 2 for size in kept)
             tie_points = exact(0, tie, (rows, columns))
             corners = _corners(tie_points)
             ends = np.array([len(scan_path), samples]) - 0.5
             cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(axis=-1)  # with points of it
             bound = SAFETY * (bound + _tie_bound(tie_points, cells))
-            if bound <= tolerance_px:
+            if bound <= TOLERANCE_PX:
                 middle = exact(tie / 2, tie, (rows - 1, columns - 1))
                 bound = max(bound, float(np.abs(middle - corners.mean(axis=0))[cells].max(initial=0)))
-        if bound <= tolerance_px:
-            return TieTable(tie_points, tie, shape, bound, scan_path.seen, samples, corner, kept)
+        if bound <= TOLERANCE_PX:
+            return TieTable(tie_points, tie, grid.shape, bound, scan_path.seen, samples, corner, kept)
         tie //= 2
-    pixels = exact(0, 1, kept)
-    drop_unseen(pixels, scan_path.seen, samples)
-    return TieTable(pixels, 1, shape, 0.0, scan_path.seen, samples, corner, kept)
+    return None
 
 
 def _within_reach(
-    curve: KnotCurve, camera: LineCamera, along: Axis, grid: tuple[int, tuple[float, float], float, tuple[int, int]]
+    curve: KnotCurve, camera: LineCamera, grid: PixelGrid, along: Axis, binning: int
 ) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return the first row and column of the pixels between the ends of any line of the scan path, and how many."""
-    binning, origin_px, spacing_px, shape = grid
     knots = np.concatenate([[-0.5], np.arange(len(curve.scan_path)), [len(curve.scan_path) - 0.5]])
     scan, _, across, _ = (tangent[:, None] / camera.ifov_rad for tangent in curve.at(knots))
     ends = np.array([0, camera.samples // binning * binning]) - camera.samples / 2
     x, y = points_of_scan(across, camera, scan, ends * camera.ifov_rad)  # type: ignore[arg-type]
     step = float(np.max(np.hypot(np.diff(scan[:, 0]), np.diff(across[:, 0]))))  # a curve leaves its knots by less
     low, high = [], []
-    for place, start, size in zip((y, x) if along == "x" else (x, y), origin_px, shape, strict=True):
-        low.append(int(np.clip(np.floor((place.min() - step - start) / spacing_px) - 1, 0, size)))
-        high.append(int(np.clip(np.ceil((place.max() + step - start) / spacing_px) + 2, 0, size)))
+    for place, start, size in zip((y, x) if along == "x" else (x, y), grid.origin_px, grid.shape, strict=True):
+        low.append(int(np.clip(np.floor((place.min() - step - start) / grid.spacing_px) - 1, 0, size)))
+        high.append(int(np.clip(np.ceil((place.max() + step - start) / grid.spacing_px) + 2, 0, size)))
     kept = (high[0] - low[0], high[1] - low[1])
     return ((low[0], low[1]), kept) if min(kept) > 0 else ((0, 0), (0, 0))
 
@@ -183,26 +192,6 @@ def _tie_bound(tie_points: Floats, cells: NDArray[np.bool_]) -> float:
 def _corners(tie_points: Floats) -> Floats:
     """Return the four tie points of each cell, (4, row, column, 2)."""
     return np.stack([tie_points[:-1, :-1], tie_points[:-1, 1:], tie_points[1:, :-1], tie_points[1:, 1:]])
-
-
-@dataclass(frozen=True)
-class PixelGrid:
-    """Pixels of a grid: y and x of the first centre from the scene's centre, their distance, and their number."""
-
-    origin_px: tuple[float, float]
-    spacing_px: float
-    shape: tuple[int, int]
-
-    @classmethod
-    def of_scene(cls, grid: SceneGrid) -> PixelGrid:
-        """Return the scene's own pixels."""
-        return cls(((1 - grid.height) / 2, (1 - grid.width) / 2), 1, (grid.height, grid.width))
-
-    def points(self, rows: slice, columns: slice) -> NDArray[np.float64]:
-        """Return the centres of a part of the pixels, (y, x, 2) from the scene's centre [px]."""
-        y = self.origin_px[0] + self.spacing_px * np.arange(rows.start, rows.stop)
-        x = self.origin_px[1] + self.spacing_px * np.arange(columns.start, columns.stop)
-        return np.stack(np.broadcast_arrays(y[:, None], x[None, :]), axis=-1)
 
 
 @dataclass(frozen=True)
@@ -259,12 +248,8 @@ def place(
     )
 
     def table(scan_path: ScanPath) -> TieTable | None:
-        """Return a table of the whole grid; None if lines lie too unevenly for tie points to save memory."""
-        if grid is None:
-            return None
-        of_grid = partial(tie_table, scan_path, camera, along=sweep.along, binning=sweep.binning)
-        of_shape = partial(of_grid, origin_px=grid.origin_px, spacing_px=grid.spacing_px)
-        return None if of_shape(shape=(1, 1)).spacing < LEAST_TIE_PX else of_shape(shape=grid.shape)
+        """Return the tie table of the whole grid."""
+        return None if grid is None else tie_table(scan_path, camera, grid, along=sweep.along, binning=sweep.binning)
 
     return PlacedSweep(lines, tuple((scan_path, table(scan_path)) for scan_path in scan_paths), gain)
 

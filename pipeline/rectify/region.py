@@ -5,9 +5,10 @@ A maker of tiles opens its sweeps once in every process, and keeps their raw lin
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +17,8 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rectify.mosaic import LocatedSweep, cut_runs, mosaic, read_part
-from spectralzoom.pipeline.rectify.placed import (
-    TAPS,
-    ColumnReach,
-    PixelGrid,
-    PlacedSweep,
-    ScanPathReach,
-    member_lines,
-    place,
-)
-from spectralzoom.pipeline.rectify.scan_paths import ScanPath
-from spectralzoom.pipeline.signal.lines import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
+from spectralzoom.pipeline.rectify.placed import ColumnReach, PixelGrid, PlacedSweep, ScanPathReach, member_lines, place
+from spectralzoom.pipeline.signal.lines import BLOCK_LINES, LineCache, held_samples, line_blocks
 from spectralzoom.pipeline.source import SweepLines
 
 COPIES = 5  # of a tile in memory at once: values, parts and calibrated lines, rounded, chunks and shard
@@ -60,21 +52,21 @@ def mosaic_tile(
     """Rectify and blend the sweeps on a part of a grid, given by slices with start and stop.
 
     A pixel's value does not depend on the division into tiles, bit for bit. ``cache`` holds raw lines that earlier
-    tiles read; None reads the needed lines once. ``reach`` is that of :func:`column_reach` for these columns or more;
+    tiles read; None begins an empty one. ``reach`` is that of :func:`column_reach` for these columns or more;
     None computes it.
 
     The result is (y, x, band) float32 with NaN where no line reached, and (y, x) how many sweeps did. A sweep that
     turns may count once for each of its runs.
     """
+    cache = LineCache(sys.maxsize) if cache is None else cache
     located = []
     for one, scan_paths in zip(placed, reach or column_reach(placed, camera, grid, columns), strict=True):
         for number, ((scan_path, _), near) in enumerate(zip(one.scan_paths, scan_paths, strict=True)):
             knots = slice(0, 0) if near is None else near.knots(rows)
             if near is None or knots.stop == knots.start:
                 continue
-            coordinates = one.coordinates(number, camera, grid, rows, columns)
-            reader = _reader(one, scan_path, coordinates, cache, near.samples)
-            located.append(LocatedSweep(one, scan_path, coordinates, reader))
+            window = partial(cache.window, one.lines, likely=near.samples)
+            located.append(LocatedSweep(one, scan_path, one.coordinates(number, camera, grid, rows, columns), window))
     bands = placed[0].signal.bands
     values = np.full((rows.stop - rows.start, columns.stop - columns.start, bands), np.nan, np.float32)
     coverage = np.zeros(values.shape[:2], np.intp)
@@ -108,22 +100,6 @@ def _column_groups(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
     beyond = -columns % GROUP_COLUMNS
     padded = np.pad(coordinates, ((0, 0), (0, beyond), (0, 0)), constant_values=np.nan)
     return padded.reshape(rows, (columns + beyond) // GROUP_COLUMNS, GROUP_COLUMNS, 2).swapaxes(0, 1)
-
-
-def _reader(
-    one: PlacedSweep, scan_path: ScanPath, coordinates: NDArray[np.float64], cache: LineCache | None, likely: slice
-) -> ReadWindow:
-    """Return a function that reads windows of a sweep: from the cache, or from one read of all needed lines."""
-    if cache is not None:
-        return lambda wanted, samples: cache.window(one.lines, wanted, samples, likely=likely)
-    knot = coordinates[..., 0]
-    if not np.isfinite(knot).any():
-        return lambda wanted, samples: one.lines.read(wanted.start, wanted.stop)[:, samples]
-    first, last = int(np.floor(np.nanmin(knot))), int(np.ceil(np.nanmax(knot)))
-    members = member_lines(scan_path, slice(max(first - TAPS, 0), min(last + TAPS + 1, len(scan_path))))
-    origin = int(members.min())
-    raw: Raw = one.lines.read(origin, int(members.max()) + 1)
-    return lambda wanted, samples: raw[wanted.start - origin : wanted.stop - origin, samples]
 
 
 @dataclass(frozen=True)
@@ -172,7 +148,7 @@ def _blocks_of(placed: Sequence[PlacedSweep], tile: Tile) -> dict[tuple[int, int
 
 @dataclass(frozen=True)
 class MosaicWork:
-    """PlacedSweep sweeps, camera and grid of a mosaic."""
+    """Placed sweeps, camera and grid of a mosaic."""
 
     placed: Sequence[PlacedSweep]
     camera: LineCamera

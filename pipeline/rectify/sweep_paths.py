@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,25 +17,17 @@ from spectralzoom.pipeline.rectify.registration.alignment import SweepShift
 from spectralzoom.pipeline.rectify.scan_paths import JudgedStamps, judge_stamps
 from spectralzoom.pipeline.signal.components import Components
 from spectralzoom.pipeline.signal.lines import CondensedLines, Raw
-from spectralzoom.pipeline.source import References, SweepLines
+from spectralzoom.pipeline.source import References
 
 LEAST_LINES = 2  # of a run, so that it has a direction
 CELL_PX = 4  # of the map of captures
-
-
-class StoredLines(SweepLines, CondensedLines, Protocol):
-    """The condensed lines of one sweep, and their source."""
-
-    @property
-    def source(self) -> str:
-        """Return the name of their source."""
 
 
 @dataclass(frozen=True)
 class SweepPath:
     """A captured sweep, its trusted lines, and its corrections."""
 
-    lines: StoredLines
+    lines: CondensedLines
     stamps: JudgedStamps
     shift: SweepShift
     gain: NDArray[np.float32] | None
@@ -62,7 +54,7 @@ class SweepPath:
 
 
 def sweep_paths(
-    sweeps: Sequence[StoredLines], camera: LineCamera, found: Mapping[str, Any] | None = None
+    sweeps: Sequence[CondensedLines], camera: LineCamera, found: Mapping[str, Any] | None = None
 ) -> list[SweepPath]:
     """Judge the lines of sweeps; ``found`` are a registration's corrections, by the sweeps' names."""
     paths = []
@@ -84,7 +76,7 @@ class InterlacedLines:
     """Lines of several condensed sweeps with the same components, read as the lines of one sweep."""
 
     sweep: Sweep  # of all lines together
-    parts: tuple[StoredLines, ...]
+    parts: tuple[CondensedLines, ...]
     part: NDArray[np.intp]  # (line,) number of the sweep of a line
     number: NDArray[np.intp]  # (line,) its line number there
     position: NDArray[np.float64]  # (line, 2) mirror at mid exposure
@@ -98,7 +90,7 @@ class InterlacedLines:
 
     @classmethod
     def of(
-        cls, sweep: Sweep, parts: Sequence[StoredLines], part: NDArray[np.intp], number: NDArray[np.intp]
+        cls, sweep: Sweep, parts: Sequence[CondensedLines], part: NDArray[np.intp], number: NDArray[np.intp]
     ) -> InterlacedLines:
         """Gather the columns of the sweeps' lines."""
 
@@ -109,30 +101,18 @@ class InterlacedLines:
                 found[part == taker] = column[number[part == taker]]
             return found
 
-        first = parts[0]
-        return cls(
-            sweep,
-            tuple(parts),
-            part,
-            number,
-            position=gathered("position"),
-            time_s=gathered("time_s"),
-            valid_line=gathered("valid_line"),
-            usable=gathered("usable"),
-            source=first.source,
-            references=first.references,
-            components=first.components,
-            step=first.step,
-        )
+        columns: dict[str, Any] = {name: gathered(name) for name in ("position", "time_s", "valid_line", "usable")}
+        shared = {name: getattr(parts[0], name) for name in ("source", "references", "components", "step")}
+        return cls(sweep, tuple(parts), part, number, **columns, **shared)
 
-    def read(self, start: int, stop: int) -> Raw:
-        """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> Raw:
+        """Return scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
         part, number = self.part[start:stop], self.number[start:stop]
         found: Raw | None = None
         for taker in np.unique(part).tolist():
             here = part == taker
             first = int(number[here].min())
-            raw = self.parts[taker].read(first, int(number[here].max()) + 1)
+            raw = self.parts[taker].read(first, int(number[here].max()) + 1, samples)
             found = np.empty((len(part), *raw.shape[1:]), raw.dtype) if found is None else found
             found[here] = raw[number[here] - first]
         assert found is not None

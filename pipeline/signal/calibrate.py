@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -152,18 +151,6 @@ def calibrate(
     if line_gain is not None:
         valid[~np.isfinite(line_gain)] = False
     return _scene_values(raw, elements, line_gain), valid
-
-
-def of_bands(references: References, bands: Sequence[int]) -> References:
-    """Return the references of some bands, in the order given."""
-    chosen = list(bands)
-    return replace(
-        references,
-        dark=references.dark[:, chosen],
-        white=references.white[:, chosen],
-        white_reference=references.white_reference[chosen],
-        bad=None if references.bad is None else references.bad[:, chosen],
-    )
 
 
 def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: ArrayLike | None) -> Floats32 | None:

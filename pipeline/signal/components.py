@@ -102,13 +102,9 @@ class Components:
 def broad_weights(components: Components, bands: int = BROAD_BANDS) -> tuple[NDArray[np.float32], np.float32]:
     """Return weights (component,) and offset by which scores give the mean of some bands, spread evenly."""
     known = np.flatnonzero(np.isfinite(components.mean))
-    chosen = spread_bands(known, bands) if len(known) else known
     matrix = np.zeros((components.bands, 1))
-    matrix[chosen] = 1 / max(len(chosen), 1)
+    if len(known):
+        chosen = known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]
+        matrix[chosen] = 1 / len(chosen)
     weights, offset = components.onto(matrix)
     return weights[:, 0], offset[0]
-
-
-def spread_bands(known: NDArray[np.intp], bands: int) -> NDArray[np.intp]:
-    """Choose a number of some ascending bands, evenly spread."""
-    return known[np.unique(np.linspace(0, len(known) - 1, max(bands, 1)).round().astype(np.intp))]

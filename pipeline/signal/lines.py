@@ -15,10 +15,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.geometry.grid import cuts
-from spectralzoom.pipeline.signal.calibrate import Elements, calibrate, judge_elements, of_bands
-from spectralzoom.pipeline.signal.components import BROAD_BANDS, Components, broad_weights, spread_bands
-from spectralzoom.pipeline.source import References, SweepLines
+from spectralzoom.pipeline.signal.calibrate import Elements, calibrate, judge_elements
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.source import SweepLines
 
 BLOCK_LINES = 64  # a shard of a stored sweep: one line of it takes as long to read as all
 CHUNK_SAMPLES = 32  # likewise along the line
@@ -73,27 +72,10 @@ class Signal:
             values, valid = values[:, samples], valid[:, samples]
         return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))
 
-    def broad_image(self, usable: NDArray[np.bool_], full_scale_dn: float) -> NDArray[np.float32]:
-        """Return the mean of `BROAD_BANDS` bands spread over all, (line, sample); NaN where one is not valid.
-
-        Lines are read 64 at a time. ``usable`` (line,) are those with a trusted position.
-        """
-        chosen = broad_bands(self.lines.references)
-        references = of_bands(self.lines.references, chosen.tolist())
-        saturated = full_scale_dn * self.lines.sweep.binning
-        image = np.full((len(usable), self.samples), np.nan, np.float32)
-        for part in cuts(len(usable), BLOCK_LINES):
-            raw = np.ascontiguousarray(self.lines.read(part.start, part.stop)[..., chosen])
-            at = np.where(usable[part, None], self.lines.position[part], np.nan)
-            values, valid = calibrate(raw, references, saturated_dn=saturated, position=at)
-            whole = valid if valid.ndim == 2 else valid.all(axis=2)
-            image[part] = np.where(whole & usable[part, None], values.mean(axis=2), np.nan)
-        return image
-
 
 @runtime_checkable
-class CondensedLines(Protocol):
-    """The lines of a sweep as scores of components."""
+class CondensedLines(SweepLines, Protocol):
+    """The lines of a sweep as scores of components, which it reads in steps, (line, sample, component)."""
 
     @property
     def components(self) -> Components:
@@ -107,80 +89,50 @@ class CondensedLines(Protocol):
     def usable(self) -> NDArray[np.bool_]:
         """Return (line, sample) spectra that can be used."""
 
-    def read(self, start: int, stop: int) -> Raw:
-        """Return the scores of the lines ``start`` to ``stop`` in steps, (line, sample, component)."""
+    @property
+    def source(self) -> str:
+        """Return the name of the source of its lines."""
 
 
 @dataclass(frozen=True)
 class CondensedSignal:
     """A condensed sweep's lines in scores: they are resampled and blended as scene values are."""
 
-    lines: SweepLines
+    lines: CondensedLines
     gain: NDArray[np.float32] | None = None  # (band,) what the sweep's values are multiplied by
-
-    @cached_property
-    def _condensed(self) -> CondensedLines:
-        assert isinstance(self.lines, CondensedLines)
-        return self.lines
 
     @property
     def samples(self) -> int:
         """Return the samples of a line."""
-        return int(self._condensed.usable.shape[1])
+        return int(self.lines.usable.shape[1])
 
     @property
     def bands(self) -> int:
         """Return the components of a line."""
-        return len(self._condensed.components)
+        return len(self.lines.components)
 
     @cached_property
     def _gain(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        return None if self.gain is None else self._condensed.components.scaled(self.gain)
+        return None if self.gain is None else self.lines.components.scaled(self.gain)
 
     def spectra(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the scene values (..., band) of resampled scores (..., component)."""
-        return self._condensed.components.restore(values)
+        return self.lines.components.restore(values)
 
     def values(
         self, read: ReadWindow, numbers: NDArray[np.intp], samples: slice, full_scale_dn: float
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Read (line, sample, component) scores of some lines, and which (line, sample) can be used."""
-        scores = _raw_of(read, numbers, samples).astype(np.float32) * np.float32(self._condensed.step)
+        scores = _raw_of(read, numbers, samples).astype(np.float32) * np.float32(self.lines.step)
         if self._gain is not None:
             matrix, shift = self._gain
             scores = scores @ matrix + shift
-        return scores, self._condensed.usable[numbers, samples] & self.lines.valid_line[numbers, None]
-
-    def broad_image(self, usable: NDArray[np.bool_], full_scale_dn: float) -> NDArray[np.float32]:
-        """Return the mean of `BROAD_BANDS` bands spread over all, (line, sample); NaN where one is not valid."""
-        weights, offset = broad_weights(self._condensed.components)
-        image = np.full((len(usable), self.samples), np.nan, np.float32)
-        for part in cuts(len(usable), BLOCK_LINES):
-            scores = self.lines.read(part.start, part.stop).astype(np.float32) * np.float32(self._condensed.step)
-            image[part] = np.where(self._condensed.usable[part] & usable[part, None], scores @ weights + offset, np.nan)
-        return image
+        return scores, self.lines.usable[numbers, samples] & self.lines.valid_line[numbers, None]
 
 
 def signal_of(lines: SweepLines, gain: NDArray[np.float32] | None = None) -> Signal | CondensedSignal:
     """Return the calibrated values of raw lines, or the scores of condensed ones."""
     return CondensedSignal(lines, gain) if isinstance(lines, CondensedLines) else Signal(lines, gain)
-
-
-def broad_bands(references: References) -> NDArray[np.intp]:
-    """Choose the bands of a broad-band image: spread over those that nine samples in ten are calibrated in."""
-    good = references.white > references.dark
-    if references.bad is not None:
-        good = good & ~references.bad
-    known = np.flatnonzero(good.mean(axis=0) >= 0.9)
-    return spread_bands(known if len(known) else np.arange(len(references.white_reference)), BROAD_BANDS)
-
-
-@runtime_checkable
-class WindowedLines(Protocol):
-    """A sweep that can read a part of its samples."""
-
-    def read_window(self, lines: slice, samples: slice) -> Raw:
-        """Return raw numbers of some lines and samples, (line, sample, band)."""
 
 
 @dataclass
@@ -227,12 +179,8 @@ class LineCache:
             self._blocks.move_to_end(key)
         with block.reading:
             if block.raw is None:
-                rows = slice(number * BLOCK_LINES, min((number + 1) * BLOCK_LINES, len(lines.valid_line)))
-                raw = (
-                    lines.read_window(rows, samples)
-                    if isinstance(lines, WindowedLines)
-                    else lines.read(rows.start, rows.stop)
-                )
+                stop = min((number + 1) * BLOCK_LINES, len(lines.valid_line))
+                raw = lines.read(number * BLOCK_LINES, stop, samples)
                 with self._lock:
                     block.raw = raw
                     self.bytes_held += raw.nbytes
@@ -249,10 +197,8 @@ def line_blocks(lines: slice) -> range:
 
 
 def held_samples(lines: SweepLines, samples: slice, likely: slice | None = None) -> slice:
-    """Return the samples to read and cache: whole chunks of those wanted and likely, or all if there are no chunks."""
+    """Return the samples to read and cache: whole chunks of those wanted and likely."""
     count = signal_of(lines).samples
-    if not isinstance(lines, WindowedLines):
-        return slice(0, count)
     other = samples if likely is None else likely
     first, stop = min(samples.start, other.start), max(samples.stop, other.stop)
     return slice(first // CHUNK_SAMPLES * CHUNK_SAMPLES, min(-(-stop // CHUNK_SAMPLES) * CHUNK_SAMPLES, count))

@@ -176,9 +176,9 @@ class SimulatedSweep:
     def valid_line(self) -> NDArray[np.bool_]:
         return np.ones(self.sweep.lines, bool)
 
-    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> NDArray[np.uint16]:
         """Make the lines ``start`` to ``stop``, (line, sample, band) uint16."""
-        return self.source.render(self.sweep, range(start, min(stop, self.sweep.lines)))
+        return self.source.render(self.sweep, range(start, min(stop, self.sweep.lines)))[:, samples]
 
 
 def sweep_starts(

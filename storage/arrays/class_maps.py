@@ -19,18 +19,8 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
-from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
-from spectralzoom.storage.arrays.layout import (
-    MAP_PACKING,
-    SHARD_ROWS,
-    array_of,
-    create_array,
-    image_spec,
-    open_group,
-    read_array,
-    tile_place,
-    write_counts,
-)
+from spectralzoom.storage.arrays import layout
+from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
 CONFIDENCE_STEP = 1 / 256
@@ -52,7 +42,6 @@ class ClassMap:
     confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where there is no class
     names: tuple[str, ...]
     colours: NDArray[np.uint8]  # (class, 3)
-    grid: AngularGrid | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +69,9 @@ def create_class_map(
 def _create_flat(
     group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
 ) -> None:
-    create_array(group, name, image_spec(dims, shape, dtype, whole=True), about, packing=MAP_PACKING, flat=True)
+    layout.create_array(
+        group, name, layout.image_spec(dims, shape, dtype, whole=True), about, packing=layout.MAP_PACKING, flat=True
+    )
 
 
 def write_class_tile(
@@ -91,12 +82,12 @@ def write_class_tile(
     Threads and processes may write different tiles at once. Raises ShapeError: a class has no name;
     IncompleteStoreError: there is no map.
     """
-    group = open_group(path, "r+")
+    group = layout.open_group(path, "r+")
     check_named(classes, len(legend_of(group).names))
     rounded = np.rint(np.asarray(confidence) / CONFIDENCE_STEP) * CONFIDENCE_STEP
     for name, values in (("classes", classes), ("confidence", rounded)):
-        array = array_of(group, name)
-        array[tile_place(origin, classes.shape)] = np.asarray(values, array.dtype)
+        array = layout.array_of(group, name)
+        array[layout.tile_place(origin, classes.shape)] = np.asarray(values, array.dtype)
 
 
 def check_named(classes: NDArray[np.integer], count: int) -> None:
@@ -126,10 +117,10 @@ def legend_of(group: zarr.Group) -> ClassNames:
 
 def load_class_map(path: Path) -> ClassMap:
     """Read a class map. Raises IncompleteStoreError where it is missing or damaged."""
-    group = open_group(path)
-    classes, confidence = (read_array(group, name) for name in ("classes", "confidence"))
+    group = layout.open_group(path)
+    classes, confidence = (layout.read_array(group, name) for name in ("classes", "confidence"))
     legend = legend_of(group)
-    return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))
+    return ClassMap(classes, confidence, legend.names, legend.colours)
 
 
 def class_counts(classes: NDArray[np.integer], count: int) -> NDArray[np.int64]:
@@ -145,7 +136,7 @@ def create_probabilities(
     A store of a later visit (``goes_on``) also has the previous classes of changed pixels: `OLD_CLASS`.
     """
     group, place = create_placed_group(path, "class_probabilities", grid, shape, legend.attributes)
-    write_counts(group, **{"class": len(legend.names)})
+    layout.write_counts(group, **{"class": len(legend.names)})
     about: dict[str, Any] = {
         "long_name": "natural logarithm of the probability of each class",
         "units": "1",
@@ -175,7 +166,7 @@ def old_class_flags(legend: ClassNames) -> dict[str, Any]:
 def packed_probabilities(log_probability: Floats) -> NDArray[np.uint8]:
     """Return (y, x, class) log-probabilities in stored bytes; NaN is unknown, values below `LEAST` are `UNLIKELY`."""
     packed = np.empty(log_probability.shape, np.uint8)
-    for rows in cuts(len(packed), SHARD_ROWS):  # so that temporary floats are few
+    for rows in cuts(len(packed), layout.SHARD_ROWS):  # so that temporary floats are few
         part = log_probability[rows]
         steps = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
         packed[rows] = np.where(np.isnan(part), NOTHING, np.minimum(steps, NOTHING - 1))
@@ -195,7 +186,7 @@ def write_probabilities_tile(
     A later visit has previous classes (y, x) too, 255 where unchanged.
     Raises IncompleteStoreError: the store is missing, or has no place for previous classes.
     """
-    group = open_group(path, "r+")
+    group = layout.open_group(path, "r+")
     images: dict[str, NDArray[Any] | None] = {
         "log_probability": packed,
         "age": age_days,
@@ -204,17 +195,14 @@ def write_probabilities_tile(
     }
     for name, values in images.items():
         if values is not None:
-            array_of(group, name)[tile_place(origin, age_days.shape)] = values
+            layout.array_of(group, name)[layout.tile_place(origin, age_days.shape)] = values
 
 
 class ProbabilityStore:
-    """Stored class probabilities, read in parts.
-
-    Raises IncompleteStoreError: they are missing or damaged.
-    """
+    """Stored class probabilities, read in parts (IncompleteStoreError: they are missing or damaged)."""
 
     def __init__(self, path: Path) -> None:
-        self._group = open_group(path)
+        self._group = layout.open_group(path)
         array = self._group.get("age")
         self.shape = (array.shape[0], array.shape[1]) if isinstance(array, zarr.Array) else (0, 0)
 
@@ -228,13 +216,13 @@ class ProbabilityStore:
 
         The exponentials of the log-probabilities sum to 1. Unknown pixels are NaN; without light, light is 0.
         """
-        packed = read_array(self._group, "log_probability", np.s_[rows, columns])
+        packed = layout.read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
-        age, light = (read_array(self._group, name, np.s_[rows, columns]) for name in ("age", "light"))
+        age, light = (layout.read_array(self._group, name, np.s_[rows, columns]) for name in ("age", "light"))
         return values, age, np.nan_to_num(light)
 
     def old_class(self) -> NDArray[np.uint8] | None:
         """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""
-        return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
+        return layout.read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None

@@ -15,22 +15,7 @@ from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.source import Line, References
-from spectralzoom.storage.arrays.layout import (
-    RAW_PACKING,
-    SHARD_ROWS,
-    create_array,
-    create_group,
-    damage_named,
-    image_spec,
-    open_group,
-    read_array,
-    read_bands,
-    write_bands,
-    write_counts,
-    write_small,
-)
-
-_LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
+from spectralzoom.storage.arrays import layout
 
 
 @dataclass(frozen=True)
@@ -76,12 +61,13 @@ class RawCubeWriter:
         passed_on: Callable[[Sequence[Line], NDArray[np.uint16]], None] = lambda lines, raw: None,
     ) -> None:
         self._header = header
-        self._group = create_group(path, f"raw sweep {header.sweep.name}", header.attributes)
-        bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
-        about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
-        write_counts(self._group, line=header.shape[0], sample=header.shape[1])
-        spec = image_spec(("line", "sample", "band"), header.shape, "<u2", whole=True)
-        self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
+        self._group = layout.create_group(path, f"raw sweep {header.sweep.name}", header.attributes)
+        bands = layout.write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
+        coordinates = f"{bands} time mirror_x mirror_y exposure_ms valid_line"
+        about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": coordinates}
+        layout.write_counts(self._group, line=header.shape[0], sample=header.shape[1])
+        spec = layout.image_spec(("line", "sample", "band"), header.shape, "<u2", whole=True)
+        self._dn = layout.create_array(self._group, "dn", spec, about, packing=layout.RAW_PACKING)
         write_references(self._group, header.references)
         self._passed_on = passed_on
         self._waiting: list[Line] = []
@@ -99,7 +85,7 @@ class RawCubeWriter:
         for line in lines:
             self._waiting.append(line)
             self._facts.append((line.time_s, line.mirror_x, line.mirror_y, line.exposure_ms, line.valid))
-            if len(self._waiting) == SHARD_ROWS:
+            if len(self._waiting) == layout.SHARD_ROWS:
                 self._flush()
 
     def close(self) -> None:
@@ -132,7 +118,7 @@ def write_references(group: zarr.Group, references: References) -> None:
     }
     for name, (dims, values, kind, title) in frames.items():
         if values is not None:
-            write_small(group, name, dims, np.asarray(values, kind), {"long_name": title, **about})
+            layout.write_small(group, name, dims, np.asarray(values, kind), {"long_name": title, **about})
 
 
 def write_line_facts(group: zarr.Group, facts: Iterable[ArrayLike], started: str | None) -> None:
@@ -148,7 +134,7 @@ def write_line_facts(group: zarr.Group, facts: Iterable[ArrayLike], started: str
         "valid_line": (valid, np.bool_, {"long_name": "line can be used"}),
     }
     for name, (values, kind, about) in columns.items():
-        write_small(group, name, ("line",), values.astype(kind), about)
+        layout.write_small(group, name, ("line",), values.astype(kind), about)
 
 
 @dataclass(frozen=True)
@@ -184,42 +170,35 @@ class RawCube(StoredSweep):
         """(line, sample, band)."""
         return len(self.time_s), self.references.dark.shape[0], len(self.wavelength_nm)
 
-    def read(self, start: int = 0, stop: int | None = None) -> NDArray[np.uint16]:
+    def read(self, start: int = 0, stop: int | None = None, samples: slice = slice(None)) -> NDArray[np.uint16]:
         """Return the raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16.
 
         Fastest on multiples of 64.
         """
-        return read_array(self.group, "dn", slice(start, stop))
+        return layout.read_array(self.group, "dn", (slice(start, stop), samples))
 
     def read_lines(self, numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
         """Return the raw numbers of single lines in ascending order, (line, sample, band) uint16.
 
         Each chunk is decoded once.
         """
-        parts = np.split(numbers, np.flatnonzero(np.diff(numbers // SHARD_ROWS)) + 1)
+        parts = np.split(numbers, np.flatnonzero(np.diff(numbers // layout.SHARD_ROWS)) + 1)
         return np.concatenate([self.read(int(part[0]), int(part[-1]) + 1)[part - part[0]] for part in parts])
-
-    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
-        """Return the raw numbers of some lines and samples, (line, sample, band) uint16.
-
-        Only the chunks that hold them are decoded.
-        """
-        return read_array(self.group, "dn", (lines, samples))
 
 
 def read_line_facts(group: zarr.Group, path: object) -> dict[str, Any]:
     """Return the values of `StoredSweep` by their names (IncompleteStoreError: damaged)."""
-    wavelength, fwhm = read_bands(group)
-    with damage_named(str(path)):
+    wavelength, fwhm = layout.read_bands(group)
+    with layout.damage_named(str(path)):
         sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
     return {
         "sweep": sweep,
         "wavelength_nm": wavelength,
         "fwhm_nm": fwhm,
-        "position": np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
-        "time_s": read_array(group, "time"),
-        "exposure_ms": read_array(group, "exposure_ms"),
-        "valid_line": read_array(group, "valid_line"),
+        "position": np.stack([layout.read_array(group, "mirror_x"), layout.read_array(group, "mirror_y")], axis=-1),
+        "time_s": layout.read_array(group, "time"),
+        "exposure_ms": layout.read_array(group, "exposure_ms"),
+        "valid_line": layout.read_array(group, "valid_line"),
         "source": str(group.attrs.get("source", "")),
         "started": None if "started" not in group.attrs else str(group.attrs["started"]),
         "group": group,
@@ -228,17 +207,14 @@ def read_line_facts(group: zarr.Group, path: object) -> dict[str, Any]:
 
 def read_references(group: zarr.Group) -> References:
     """Read the frames that `write_references` stored."""
-    dark, white, white_reference = (read_array(group, name) for name in ("dark", "white", "white_reference"))
-    bad = read_array(group, "bad") if "bad" in group else None
+    dark, white, white_reference = (layout.read_array(group, name) for name in ("dark", "white", "white_reference"))
+    bad = layout.read_array(group, "bad") if "bad" in group else None
     return References(dark, white, white_reference, bad, bool(group.attrs.get("by_mirror", False)))
 
 
 def open_raw_cube(path: Path) -> RawCube:
-    """Open a sweep that `RawCubeWriter` stored.
-
-    Raises IncompleteStoreError: it is missing, was not closed, or is damaged.
-    """
-    group = open_group(path)
+    """Open a sweep that `RawCubeWriter` stored (IncompleteStoreError: it is missing, was not closed, or is damaged)."""
+    group = layout.open_group(path)
     return RawCube(**read_line_facts(group, path), references=read_references(group))
 
 
@@ -252,5 +228,5 @@ STATISTICS = "statistics.npz"
 
 def read_statistics(folder: Path) -> SignalStatistics:
     """Read the statistics of a capture (IncompleteStoreError: they are missing or damaged)."""
-    with damage_named(str(folder / STATISTICS)), np.load(folder / STATISTICS) as stored:
+    with layout.damage_named(str(folder / STATISTICS)), np.load(folder / STATISTICS) as stored:
         return SignalStatistics.of_arrays(stored)

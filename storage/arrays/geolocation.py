@@ -12,21 +12,14 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.rectify.placed import TieTable
 from spectralzoom.pipeline.rectify.scan_paths import ScanPath
-from spectralzoom.storage.arrays.layout import (
-    create_group,
-    damage_named,
-    open_group,
-    read_array,
-    write_image,
-    write_small,
-)
+from spectralzoom.storage.arrays import layout
 
 Tables = Mapping[str, Sequence[tuple[ScanPath, TieTable]]]
 
 
 def write_geolocation(path: Path, tables: Tables) -> None:
     """Store the scan paths and tie tables of sweeps, by name."""
-    root = create_group(path, "lookup", {"sweeps": list(tables)})
+    root = layout.create_group(path, "lookup", {"sweeps": list(tables)})
     for number, (name, scan_paths) in enumerate(tables.items()):
         sweep = root.create_group(f"sweep_{number}", attributes={"sweep": name, "scan_paths": len(scan_paths)})
         for at, (scan_path, table) in enumerate(scan_paths):
@@ -35,9 +28,9 @@ def write_geolocation(path: Path, tables: Tables) -> None:
 
 def open_geolocation(path: Path) -> dict[str, tuple[tuple[ScanPath, TieTable], ...]]:
     """Read scan paths and tie tables of all sweeps, by name (IncompleteStoreError: the store is missing or damaged)."""
-    root = open_group(path)
+    root = layout.open_group(path)
     tables: dict[str, tuple[tuple[ScanPath, TieTable], ...]] = {}
-    with damage_named(str(path)):
+    with layout.damage_named(str(path)):
         for number, name in enumerate(root.attrs["sweeps"]):  # type: ignore[arg-type]
             sweep: Any = root[f"sweep_{number}"]
             count = int(sweep.attrs["scan_paths"])
@@ -67,19 +60,19 @@ def _write_scan_path(sweep: zarr.Group, name: str, scan_path: ScanPath, table: T
         "seen": ("knot", scan_path.seen, {"long_name": "whether any line saw the knot"}),
     }
     for array, (dim, values, attributes) in columns.items():
-        write_small(group, array, (dim,), values, attributes)
+        layout.write_small(group, array, (dim,), values, attributes)
     about = {"long_name": "knot coordinate and sample of every spacing-th pixel", "units": "1"}
-    write_image(group, "tie_points", ("tie_y", "tie_x", "coordinate"), table.tie_points, about)
+    layout.write_image(group, "tie_points", ("tie_y", "tie_x", "coordinate"), table.tie_points, about)
 
 
 def _read_scan_path(group: zarr.Group) -> tuple[ScanPath, TieTable]:
     about: dict[str, Any] = dict(group.attrs)
-    width = float(about["width"])
-    bound = float(about["bound_px"])
-    spacing = int(about["spacing"])
-    samples = int(about["samples"])
+    spacing, samples = int(about["spacing"]), int(about["samples"])
     shape, corner, kept = ((int(about[name][0]), int(about[name][1])) for name in ("shape", "corner", "kept"))
-    seen = read_array(group, "seen")
-    lines, starts = (read_array(group, name).astype(np.intp) for name in ("lines", "starts"))
-    scan_path = ScanPath(read_array(group, "scan"), read_array(group, "across"), lines, starts, seen, width)
-    return scan_path, TieTable(read_array(group, "tie_points"), spacing, shape, bound, seen, samples, corner, kept)
+    seen = layout.read_array(group, "seen")
+    lines, starts = (layout.read_array(group, name).astype(np.intp) for name in ("lines", "starts"))
+    scan_path = ScanPath(
+        layout.read_array(group, "scan"), layout.read_array(group, "across"), lines, starts, seen, float(about["width"])
+    )
+    tie_points, bound = layout.read_array(group, "tie_points"), float(about["bound_px"])
+    return scan_path, TieTable(tie_points, spacing, shape, bound, seen, samples, corner, kept)

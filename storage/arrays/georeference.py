@@ -7,7 +7,7 @@ odc-geo; its grid mapping has the GeoTransform.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ import zarr
 from affine import Affine
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.errors import PoseError
 from spectralzoom.pipeline.ground.georeference import zoomed_out
 from spectralzoom.storage.arrays.layout import SmallArray, create_group, damage_named, open_group
 
@@ -60,15 +59,9 @@ class AngularGrid:
         """
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
-        return {
-            "spatial:dimensions": ["y", "x"],
-            "spatial:shape": list(shape),
-            "spatial:transform_type": "affine",
-            "spatial:transform": [step, 0.0, left, 0.0, step, top],
-            "spatial:bbox": [left, top, left + step * shape[1], top + step * shape[0]],
-            "spatial:registration": "pixel",
-            "zarr_conventions": [_SPATIAL | {"description": _OF_ANGLES}],
-        }
+        bounds = (left, top, left + step * shape[1], top + step * shape[0])
+        conventions = [_SPATIAL | {"description": _OF_ANGLES}]
+        return _spatial(shape, (step, 0.0, left, 0.0, step, top), bounds) | {"zarr_conventions": conventions}
 
     def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
         """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
@@ -112,26 +105,31 @@ def create_placed_group(
 
 
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
-    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
-
-    Raises PoseError: the grid has no CRS.
-    """
+    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners."""
     crs = _crs_of(geobox)
     return {
         **({} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
         "proj:wkt2": crs.to_wkt(),
-        "spatial:dimensions": ["y", "x"],
-        "spatial:shape": list(geobox.shape),
-        "spatial:transform_type": "affine",
-        "spatial:transform": [float(number) for number in geobox.affine[:6]],
-        "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
-        "spatial:registration": "pixel",
+        **_spatial(geobox.shape, geobox.affine[:6], geobox.boundingbox.bbox),
         "zarr_conventions": [_PROJ, _SPATIAL],
+    }
+
+
+def _spatial(shape: Sequence[int], transform: Iterable[float], bounds: Iterable[float]) -> dict[str, Any]:
+    return {
+        "spatial:dimensions": ["y", "x"],
+        "spatial:shape": list(shape),
+        "spatial:transform_type": "affine",
+        "spatial:transform": [float(number) for number in transform],
+        "spatial:bbox": [float(number) for number in bounds],
+        "spatial:registration": "pixel",
     }
 
 
 def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
     """Return ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
+    import odc.geo.xr as odc_xr
+
     found: dict[str, SmallArray] = {}
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
@@ -142,15 +140,8 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
             about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
             centres = np.arange(size) + 0.5
         found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
-    return {**found, GRID_MAPPING: grid_mapping(geobox)}
-
-
-def grid_mapping(geobox: GeoBox) -> SmallArray:
-    """Return CRS and transform of a map as CF's grid mapping."""
-    import odc.geo.xr as odc_xr
-
     mapping = odc_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
-    return SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
+    return {**found, GRID_MAPPING: SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))}
 
 
 def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
@@ -167,8 +158,7 @@ def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
 
 
 def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
-    if geobox.crs is None:
-        raise PoseError(f"a map needs a CRS, got {geobox!r}")
+    assert geobox.crs is not None
     return geobox.crs
 
 

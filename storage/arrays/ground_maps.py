@@ -14,35 +14,11 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import IncompleteStoreError, ShapeError
 from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE
-from spectralzoom.storage.arrays.class_maps import (
-    CONFIDENCE,
-    OLD_CLASS,
-    ClassNames,
-    check_named,
-    class_flags,
-    old_class_flags,
-)
-from spectralzoom.storage.arrays.georeference import (
-    ON_THE_MAP,
-    geobox_of_group,
-    load_geobox,
-    map_attributes,
-    map_coordinates,
-)
-from spectralzoom.storage.arrays.layout import (
-    SHARD_COLUMNS,
-    SHARD_ROWS,
-    array_of,
-    create_array,
-    create_group,
-    image_spec,
-    open_group,
-    read_array,
-)
+from spectralzoom.storage.arrays import class_maps, georeference, layout
 
 PICTURE = "picture"
-NUMBERED = {"classes", OLD_CLASS}
-BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
+NUMBERED = {"classes", class_maps.OLD_CLASS}
+BLOCK = (4 * layout.SHARD_ROWS, 2 * layout.SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
 
 
 @dataclass(frozen=True)
@@ -62,21 +38,24 @@ class StoredImage:
     @property
     def geobox(self) -> GeoBox | None:
         """Return the image's grid on the earth; None where its store has none."""
-        return geobox_of_group(self.group)
+        return georeference.geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
         """Yield the number of the first row and the rows of each shard.
 
         Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
-        for first in range(0, self.shape[0], SHARD_ROWS):
-            yield first, read_array(self.group, self.name, slice(first, min(first + SHARD_ROWS, self.shape[0])))
+        for first in range(0, self.shape[0], layout.SHARD_ROWS):
+            yield (
+                first,
+                layout.read_array(self.group, self.name, slice(first, min(first + layout.SHARD_ROWS, self.shape[0]))),
+            )
 
 
 def open_image(path: Path, name: str) -> StoredImage:
     """Open one array of the store at ``path``. Raises IncompleteStoreError where it is missing or damaged."""
-    group = open_group(path)
-    array = array_of(group, name)
+    group = layout.open_group(path)
+    array = layout.array_of(group, name)
     return StoredImage(group, name, array.shape, array.dtype)
 
 
@@ -92,35 +71,40 @@ class GroundMapWriter:
     """Write a map block by block, so that it need not fit into memory."""
 
     def __init__(
-        self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any], goes_on: bool = False
+        self,
+        path: Path,
+        geobox: GeoBox,
+        legend: class_maps.ClassNames,
+        *,
+        about: Mapping[str, Any],
+        goes_on: bool = False,
     ) -> None:
         """Create a map; one of a later visit (``goes_on``) also has the previous classes."""
-        place = map_attributes(geobox)
+        place = georeference.map_attributes(geobox)
         facts = {**place, **legend.attributes, **about}
-        self._group = create_group(path, "class map on the ground", facts, map_coordinates(geobox))
+        self._group = layout.create_group(path, "class map on the ground", facts, georeference.map_coordinates(geobox))
         self._legend = legend
         images: dict[str, tuple[str, Mapping[str, Any]]] = {
-            "classes": ("|u1", class_flags(legend.names, legend.colours)),
-            "confidence": ("<f4", CONFIDENCE),
+            "classes": ("|u1", class_maps.class_flags(legend.names, legend.colours)),
+            "confidence": ("<f4", class_maps.CONFIDENCE),
             PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
         }
         if goes_on:
-            images[OLD_CLASS] = ("|u1", old_class_flags(legend))
+            images[class_maps.OLD_CLASS] = ("|u1", class_maps.old_class_flags(legend))
         self._images: dict[str, zarr.Array[Any]] = {}
         for name, (kind, attributes) in images.items():
             rest = {"rgb": 3} if name == PICTURE else {}
-            spec = image_spec(("y", "x", *rest), (*geobox.shape, *rest.values()), kind)
-            self._images[name] = create_array(self._group, name, spec, {**attributes, **place, **ON_THE_MAP})
+            spec = layout.image_spec(("y", "x", *rest), (*geobox.shape, *rest.values()), kind)
+            self._images[name] = layout.create_array(
+                self._group, name, spec, {**attributes, **place, **georeference.ON_THE_MAP}
+            )
 
     def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
-        """Store one block of all images, by name.
-
-        Raises ShapeError: an image lacks, or a class has no name.
-        """
+        """Store one block of all images, by name (ShapeError: an image lacks, or a class has no name)."""
         if set(images) != set(self._images):
             raise ShapeError(f"a block got {', '.join(images)}; give {', '.join(self._images)}, one value a pixel")
         for name in NUMBERED & set(images):
-            check_named(np.asarray(images[name], np.uint8), len(self._legend.names))
+            class_maps.check_named(np.asarray(images[name], np.uint8), len(self._legend.names))
         for name, image in images.items():
             self._images[name][rows, columns] = image
 
@@ -135,8 +119,8 @@ class GroundMapWriter:
 
 def load_ground_map(path: Path) -> GroundMap:
     """Read grid and areas of a map. Raises IncompleteStoreError where it is missing or damaged."""
-    areas: Any = dict(open_group(path).attrs).get("areas", {})
-    geobox = load_geobox(path)
+    areas: Any = dict(layout.open_group(path).attrs).get("areas", {})
+    geobox = georeference.load_geobox(path)
     if geobox is None:
         raise IncompleteStoreError(f"{path} has no grid mapping; it is no map of the ground")
     return GroundMap(geobox, areas)

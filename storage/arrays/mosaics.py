@@ -14,29 +14,8 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.signal.components import Components, broad_weights
-from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group, grid_of
-from spectralzoom.storage.arrays.layout import (
-    LARGEST_SHORT,
-    SHARD_ROWS,
-    array_of,
-    blank_pixels,
-    create_array,
-    create_group,
-    image_spec,
-    open_group,
-    opened_once,
-    read_array,
-    read_bands,
-    read_components,
-    score_spec,
-    step_of,
-    steps_within,
-    tile_place,
-    write_bands,
-    write_components,
-    write_counts,
-    write_image,
-)
+from spectralzoom.storage.arrays import layout
+from spectralzoom.storage.arrays.georeference import AngularGrid, create_placed_group
 
 CAPTURES = "capture"  # array of a mosaic whose pixels were captured in several ways
 RGB_NM = (640.0, 550.0, 460.0)  # shown as red, green and blue
@@ -55,7 +34,7 @@ class MosaicWriter:
         wavelength_nm: NDArray[np.float64],
         *,
         step: float = 1.0,
-        largest: float = LARGEST_SHORT,
+        largest: float = layout.LARGEST_SHORT,
         fwhm_nm: NDArray[np.float64] | None = None,
         grid: AngularGrid | None = None,
         simulation: Mapping[str, Any] | None = None,
@@ -64,15 +43,15 @@ class MosaicWriter:
         simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
         self.group, place = create_placed_group(path, "mosaic", grid, shape, simulated)
-        write_bands(self.group, wavelength_nm, fwhm_nm)
-        write_counts(self.group, component=len(components))
-        write_components(self.group, components)
+        layout.write_bands(self.group, wavelength_nm, fwhm_nm)
+        layout.write_counts(self.group, component=len(components))
+        layout.write_components(self.group, components)
         about = {"long_name": "score of a component", "units": "1", "scale_factor": step, **place}
-        spec = score_spec(("component", "y", "x"), (len(components), *shape), largest / step)
-        self._scores = create_array(self.group, "scores", spec, about | {"_FillValue": _unseen(spec.dtype)})
+        spec = layout.score_spec(("component", "y", "x"), (len(components), *shape), largest / step)
+        self._scores = layout.create_array(self.group, "scores", spec, about | {"_FillValue": _unseen(spec.dtype)})
         about = {"long_name": "sweeps that saw a pixel", "units": "1", **place}
         self._step = step
-        self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "|u1"), about)
+        self._coverage = layout.create_array(self.group, "coverage", layout.image_spec(("y", "x"), shape, "|u1"), about)
 
     @property
     def tile_shape(self) -> tuple[int, int]:
@@ -94,10 +73,10 @@ class MosaicWriter:
         count = self._scores.shape[0]
         if scores.shape != (*coverage.shape, count):  # Zarr would broadcast a smaller tile
             raise ShapeError(f"a tile of the mosaic has the shape {scores.shape}, expected {(*coverage.shape, count)}")
-        rows, columns = tile_place((first_row, first_column), coverage.shape)
+        rows, columns = layout.tile_place((first_row, first_column), coverage.shape)
         seen = coverage > 0
         if count:
-            steps = steps_within(scores, self._step, self._scores.dtype)
+            steps = layout.steps_within(scores, self._step, self._scores.dtype)
             seen = seen & np.isfinite(scores).all(axis=2)
             steps = np.where(seen[..., None], steps, np.float32(_unseen(self._scores.dtype.str)))
             self._scores[:, rows, columns] = np.ascontiguousarray(steps.transpose(2, 0, 1)).astype(self._scores.dtype)
@@ -105,22 +84,19 @@ class MosaicWriter:
 
     def write_rows(self, first: int, scores: NDArray[np.floating], seen: NDArray[np.bool_]) -> None:
         """Store rows of scores (y, x, component) and of the mask ``seen`` (y, x); ``first`` is a multiple of 64."""
-        deep, wide = self.tile_shape
-        for rows in cuts(len(scores), deep):
-            for columns in cuts(scores.shape[1], wide):
-                self.write_tile(first + rows.start, columns.start, scores[rows, columns], seen[rows, columns])
+        self.write_tile(first, 0, scores, seen)
 
     def blank(self, where: NDArray[np.bool_] | None) -> None:
         """Set the (y, x) pixels ``where``, which show no scene, to unseen; None: all show it."""
         if where is not None:
-            blank_pixels(self.path, where, {"scores": _unseen(self._scores.dtype.str), "coverage": 0})
+            layout.blank_pixels(self.path, where, {"scores": _unseen(self._scores.dtype.str), "coverage": 0})
 
     def write_captures(self, specs: Sequence[Sequence[float]], number: NDArray[np.integer[Any]]) -> None:
         """Store the kind of capture of each pixel: ``number`` (y, x) is an index into ``specs``, which may repeat."""
         kinds = list(dict.fromkeys(map(tuple, specs)))
         of_spec = np.array([kinds.index(tuple(one)) for one in specs], np.min_scalar_type(max(len(kinds) - 1, 0)))
         about = {"long_name": "kind of capture", "units": "1", "kinds": [list(one) for one in kinds]}
-        write_image(self.group, CAPTURES, ("y", "x"), of_spec[number], about)
+        layout.write_image(self.group, CAPTURES, ("y", "x"), of_spec[number], about)
 
 
 def _unseen(dtype: str) -> int:
@@ -136,13 +112,11 @@ class Mosaic:
     components: Components
     step: float
     wavelength_nm: NDArray[np.float64]  # (band,)
-    fwhm_nm: NDArray[np.float64] | None
-    grid: AngularGrid | None
 
     @property
     def shape(self) -> tuple[int, int]:
         """(y, x) [px]."""
-        y, x = array_of(self.group, "coverage").shape
+        y, x = layout.array_of(self.group, "coverage").shape
         return y, x
 
     def scores(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.float32]:
@@ -150,7 +124,7 @@ class Mosaic:
 
         Raises IncompleteStoreError: a checksum says that the bytes have changed.
         """
-        steps = read_array(self.group, "scores", (slice(None), rows, columns)).transpose(1, 2, 0)
+        steps = layout.read_array(self.group, "scores", (slice(None), rows, columns)).transpose(1, 2, 0)
         found = steps.astype(np.float32) * np.float32(self.step)
         if steps.shape[2]:
             found[steps[..., 0] == np.iinfo(steps.dtype).min] = np.nan
@@ -158,7 +132,7 @@ class Mosaic:
 
     def coverage(self, rows: slice = slice(None), columns: slice = slice(None)) -> NDArray[np.uint8]:
         """Return the number of sweeps that saw each pixel, (y, x)."""
-        return read_array(self.group, "coverage", (rows, columns))
+        return layout.read_array(self.group, "coverage", (rows, columns))
 
     def captures(
         self, rows: slice = slice(None), columns: slice = slice(None)
@@ -170,7 +144,7 @@ class Mosaic:
         if CAPTURES not in self.group:
             return None
         kinds: Any = self.group[CAPTURES].attrs["kinds"]
-        return [tuple(one) for one in kinds], read_array(self.group, CAPTURES, (rows, columns))
+        return [tuple(one) for one in kinds], layout.read_array(self.group, CAPTURES, (rows, columns))
 
     def values(
         self, rows: slice = slice(None), columns: slice = slice(None), bands: Sequence[int] | None = None
@@ -193,7 +167,9 @@ class Mosaic:
 
         They are read a shard's rows at a time.
         """
-        blocks = (self.scores(rows)[-rows.start % step :: step, ::step] for rows in cuts(self.shape[0], SHARD_ROWS))
+        blocks = (
+            self.scores(rows)[-rows.start % step :: step, ::step] for rows in cuts(self.shape[0], layout.SHARD_ROWS)
+        )
         return np.concatenate([self.spectra(block, bands) for block in blocks])
 
     def brightness(self, bands: int | None = None) -> NDArray[np.float32]:
@@ -205,17 +181,16 @@ class Mosaic:
         """Yield the scores of a window, (y, x, component), from the top down in blocks that end at shards."""
         first, last, _ = rows.indices(self.shape[0])
         while first < last:
-            below = min((first // SHARD_ROWS + 1) * SHARD_ROWS, last)
+            below = min((first // layout.SHARD_ROWS + 1) * layout.SHARD_ROWS, last)
             yield self.scores(slice(first, below), columns)
             first = below
 
 
-@opened_once
+@layout.opened_once
 def open_mosaic(path: Path) -> Mosaic:
     """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
-    group = open_group(path)
-    wavelength, fwhm = read_bands(group)
-    return Mosaic(group, read_components(group), step_of(group), wavelength, fwhm, grid_of(dict(group.attrs)))
+    group = layout.open_group(path)
+    return Mosaic(group, layout.read_components(group), layout.step_of(group), layout.read_bands(group)[0])
 
 
 @dataclass(frozen=True)
@@ -229,15 +204,15 @@ class Attention:
 
 def write_attention(path: Path, attention: Attention) -> None:
     """Store scores and ranks."""
-    group = create_group(path, "attention", {"policy": attention.policy})
-    write_counts(group, patch_y=attention.score.shape[0], patch_x=attention.score.shape[1])
+    group = layout.create_group(path, "attention", {"policy": attention.policy})
+    layout.write_counts(group, patch_y=attention.score.shape[0], patch_x=attention.score.shape[1])
     images: dict[str, tuple[Any, type[np.generic], str]] = {
         "score": (attention.score, np.float64, f"worth of a fine look, policy {attention.policy}"),
         "rank": (attention.rank, np.int32, "order in which the patch was chosen, from 0; -1 where it was not"),
     }
     for name, (values, kind, title) in images.items():
         about = {"long_name": title, "units": "1"}
-        write_image(group, name, ("patch_y", "patch_x"), np.asarray(values, kind), about)
+        layout.write_image(group, name, ("patch_y", "patch_x"), np.asarray(values, kind), about)
 
 
 def chosen_patches(path: Path) -> NDArray[np.int64]:
@@ -245,7 +220,7 @@ def chosen_patches(path: Path) -> NDArray[np.int64]:
 
     Raises IncompleteStoreError: missing or damaged.
     """
-    return np.flatnonzero(read_array(open_group(path), "rank").ravel() >= 0)
+    return np.flatnonzero(layout.read_array(layout.open_group(path), "rank").ravel() >= 0)
 
 
 def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, int], str]:

@@ -96,14 +96,6 @@ def test_two_processes_may_compile_at_once(file: Path) -> None:
     assert doubled(opened(file)) == [0, 2, 4]
 
 
-def test_other_types_are_refused() -> None:
-    """Only the declared signature is compiled."""
-    module = ModuleType("doubling")
-    exec(compile(LOOP, "<nowhere>", "exec"), module.__dict__)
-    with pytest.raises(TypeError, match="No matching definition"):
-        module.double(np.arange(3, dtype=np.float32), np.empty(3))
-
-
 def test_a_compilation_error_is_reported() -> None:
     """Code that cannot be compiled is not mistaken for a cache that cannot be written."""
     with pytest.raises(numba.TypingError):

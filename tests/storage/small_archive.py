@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
+from spectralzoom.storage.arrays.georeference import AngularGrid
 from spectralzoom.storage.runs import verify_everything
 from spectralzoom.storage.store import Archive, Ref, manifest_text
 
@@ -92,7 +93,7 @@ def problems(archive: Archive) -> list[str]:
     return [f"{one.uri} {one.problem}" for one in verify_everything(archive) if one.problem is not None]
 
 
-def write_class_map(path: Path, found: ClassMap) -> None:
+def write_class_map(path: Path, found: ClassMap, grid: AngularGrid | None = None) -> None:
     """Store a whole class map at once; stages write it tile by tile."""
-    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
+    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=grid)
     write_class_tile(path, (0, 0), found.classes, found.confidence)

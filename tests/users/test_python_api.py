@@ -17,7 +17,7 @@ import spectralzoom
 from spectralzoom.opened import OpenedRun
 from spectralzoom.pipeline.errors import NoRunError
 from spectralzoom.storage.arrays.class_maps import load_class_map
-from spectralzoom.storage.arrays.ground_maps import load_geobox
+from spectralzoom.storage.arrays.georeference import load_geobox
 from tests.conftest import WeightsMaker
 from tests.flows.small_fields import write_field
 from tests.prior_work import without_effects

@@ -354,16 +354,12 @@ def solve_sweeps(
 
 def tied_to(windows: Sequence[WindowShift], sweep: int, sweeps: int) -> frozenset[int]:
     """Return the sweeps that windows join to one, itself included."""
-    joined = {sweep}
-    waiting = [sweep]
-    while waiting:
-        here = waiting.pop()
-        for window in windows:
-            pair = {window.reference, window.moving}
-            if here in pair:
-                waiting += pair - joined
-                joined |= pair
-    return frozenset(joined & set(range(sweeps)))
+    if not sweeps:
+        return frozenset()
+    pairs = np.array([(window.reference, window.moving) for window in windows], np.intp).reshape(-1, 2)
+    joins = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), (sweeps, sweeps))
+    _, group = scipy.sparse.csgraph.connected_components(joins, directed=False)
+    return frozenset(np.flatnonzero(group == group[sweep]).tolist())
 
 
 def _robust(system: Floats, measured: Floats, error: Floats) -> Floats:

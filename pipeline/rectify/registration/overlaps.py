@@ -12,15 +12,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.grid import cuts
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, shifted_position
 from spectralzoom.pipeline.rectify.geolocation import path_geolocation
 from spectralzoom.pipeline.rectify.resample import resample
 from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
-from spectralzoom.pipeline.signal.lines import signal_of
-from spectralzoom.pipeline.source import SweepLines
+from spectralzoom.pipeline.signal.components import broad_weights
+from spectralzoom.pipeline.signal.lines import BLOCK_LINES, CondensedLines
 
 LEAST_OVERLAP_PX = 64.0  # of the smaller side of a window, after the largest shift; below it errors grow fast
 EDGE_LINES = 16  # a sweep's edges are computed at every 16th line; they bend by 1e-3 px between
@@ -28,7 +28,7 @@ EDGE_LINES = 16  # a sweep's edges are computed at every 16th line; they bend by
 
 @dataclass(frozen=True)
 class BroadSweep:
-    """A sweep for registration: one image, the mean of a few bands, 4 bytes a sample."""
+    """A sweep for registration: one image, the mean of 16 bands spread over all."""
 
     sweep: Sweep
     position: Floats  # (line, 2) mirror X and Y as reported
@@ -36,14 +36,15 @@ class BroadSweep:
     image: NDArray[np.float32]  # (line, sample), NaN where a band is not valid
 
     @classmethod
-    def read(cls, lines: SweepLines, camera: LineCamera, *, usable: NDArray[np.bool_] | None = None) -> BroadSweep:
-        """Read and calibrate a sweep's lines, 64 at a time, and return the mean of 16 bands spread over all.
-
-        ``usable`` (line,) are lines with a trusted position; None takes ``lines.valid_line``.
-        """
-        position = np.asarray(lines.position, np.float64)
-        usable = (lines.valid_line if usable is None else usable) & np.isfinite(position).all(axis=1)
-        return cls(lines.sweep, position, usable, signal_of(lines).broad_image(usable, camera.full_scale_dn))
+    def read(cls, lines: CondensedLines, *, usable: NDArray[np.bool_]) -> BroadSweep:
+        """Read a sweep's scores, 64 lines at a time; ``usable`` (line,) are lines with a trusted position."""
+        usable = usable & np.isfinite(lines.position).all(axis=1)
+        weights, offset = broad_weights(lines.components)
+        image = np.full(lines.usable.shape, np.nan, np.float32)
+        for part in cuts(len(usable), BLOCK_LINES):
+            scores = lines.read(part.start, part.stop).astype(np.float32) * np.float32(lines.step)
+            image[part] = np.where(lines.usable[part] & usable[part, None], scores @ weights + offset, np.nan)
+        return cls(lines.sweep, lines.position, usable, image)
 
 
 @dataclass(frozen=True)
@@ -95,11 +96,8 @@ class PlacedImage:
         scan, line = (values.ravel() for values in np.meshgrid(scan_px, along_px, indexing="ij"))
         points = np.stack([scan, line] if sweep.along == "x" else [line, scan], axis=-1)
         for scan_path, image in self.scan_paths:
-            yield (
-                scan_path,
-                image,
-                path_geolocation(scan_path, self.camera, points, along=sweep.along, binning=sweep.binning),
-            )
+            at = path_geolocation(scan_path, self.camera, points, along=sweep.along, binning=sweep.binning)
+            yield scan_path, image, at
 
     def line_and_turn(self, along_px: float, scan_px: float) -> tuple[float, Floats] | None:
         """Return the line that sees a place, and the place's derivative (2, 2) by its centre; None off the sweep."""
@@ -159,8 +157,6 @@ def overlap_windows(images: Sequence[PlacedImage], *, window_px: float) -> list[
 
     A window is as wide as both sweeps reach along all of it; narrow ones are included.
     """
-    if not window_px >= LEAST_OVERLAP_PX:
-        raise SettingsError(f"windows must be at least {LEAST_OVERLAP_PX:.0f} px long, got {window_px} px")
     seen = [number for number, image in enumerate(images) if image.broad.usable.any()]
     return [
         window

@@ -85,7 +85,7 @@ def register_sweeps(
     ``prior_px`` is the largest pointing error of a sweep in either axis; a pair may be apart by twice that. Overlaps
     need 64 px beyond.
 
-    Raises SettingsError: windows that are too short. Raises PoseError: a corrected position is beyond the mirror's rim.
+    Raises PoseError: a corrected position is beyond the mirror's rim.
     """
     names = [one.sweep.name for one in sweeps]
     lines = [len(one.position) for one in sweeps]

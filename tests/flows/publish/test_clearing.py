@@ -95,8 +95,8 @@ def test_raw_lines_that_differ_from_the_signal_are_kept(
     """One changed score suffices; the reason names the sweep and its line."""
     read = signal_cubes.SignalCube.read
 
-    def off(self: signal_cubes.SignalCube, start: int = 0, stop: int | None = None) -> Any:
-        values = read(self, start, stop).copy()
+    def off(self: signal_cubes.SignalCube, start: int = 0, stop: int | None = None, *samples: slice) -> Any:
+        values = read(self, start, stop, *samples).copy()
         if start == 0 and self.sweep.name == "coarse-0":
             values[3, 7, 0] += 2
         return values

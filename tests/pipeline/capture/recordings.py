@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,31 +26,18 @@ def simulated(camera: LineCamera = CAMERA) -> SimulatedSource:
     return SimulatedSource(image_scene(values, camera, np.linspace(450, 850, 3)), Rig(camera), seed=3)
 
 
-@dataclass
-class Counted:
-    """Numbers of the lines that were read from a recorded sweep."""
-
-    numbers: list[int] = field(default_factory=list)
-
-
-def record(source: SimulatedSource, sweep: Sweep, counted: Counted | None = None) -> RecordedSweep:
+def record(source: SimulatedSource, sweep: Sweep, counted: list[int] | None = None) -> RecordedSweep:
     """Record one sweep of the simulated rig. Later reads append their line numbers to ``counted``."""
     lines = SimulatedSweep(source, sweep)
     exposure_ms = source.camera.exposure_ms if sweep.exposure_ms is None else sweep.exposure_ms
 
     def read(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        if counted is not None:
+            counted.extend(numbers.tolist())
         return np.concatenate([lines.read(first, stop) for first, stop in line_runs(numbers)])
 
     facts = lines.references, lines.position, lines.time_s, np.full(sweep.lines, exposure_ms), lines.valid_line
-    recorded = RecordedSweep(sweep, *facts, read)
-    if counted is None:
-        return recorded
-
-    def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
-        counted.numbers += numbers.tolist()
-        return recorded.read_lines(numbers)
-
-    return replace(recorded, read_lines=read_lines)
+    return RecordedSweep(sweep, *facts, read)
 
 
 def recorded_source(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) -> RecordedSource:

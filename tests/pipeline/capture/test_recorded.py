@@ -13,7 +13,7 @@ from spectralzoom.pipeline.capture.recorded import RecordedSweep, nearest_line
 from spectralzoom.pipeline.errors import NotRecordedError
 from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
 from spectralzoom.pipeline.source import References
-from tests.pipeline.capture.recordings import CAMERA, FULL, Counted, assert_same, record, recorded_source, simulated
+from tests.pipeline.capture.recordings import CAMERA, FULL, assert_same, record, recorded_source, simulated
 
 
 def assert_same_references(found: References, expected: References) -> None:
@@ -35,7 +35,7 @@ def test_a_recorded_sweep_returns_its_lines_unchanged(sweep: Sweep) -> None:
 def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
     """Each coarse line is the recorded line just before its middle. The other lines are not read."""
     source = simulated()
-    counted = Counted()
+    counted: list[int] = []
     recorded = recorded_source(source, [record(source, FULL, counted)])
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     found, full = list(recorded.lines(coarse)), list(source.lines(FULL))
@@ -43,20 +43,20 @@ def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
         of = full[4 * number + 1]  # the middle, 1.5 px after the first held position, lies between lines 1 and 2
         np.testing.assert_array_equal(line.data, of.data)
         assert (line.number, line.mirror_x, line.mirror_y, line.time_s) == (number, of.mirror_x, of.mirror_y, of.time_s)
-    assert counted.numbers == list(range(1, 80, 4))
+    assert counted == list(range(1, 80, 4))
     assert_same_references(recorded.references(coarse), source.references(coarse))
 
 
 def test_fine_lines_of_a_full_scan_are_found_by_position() -> None:
     """A planned run of lines reads only those lines and returns them as recorded."""
     source = simulated()
-    counted = Counted()
+    counted: list[int] = []
     recorded = recorded_source(source, [record(source, FULL, counted)])
     found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
     assert_same([replace(line, number=line.number + 30) for line in found], list(source.lines(FULL))[30:42])
-    assert counted.numbers == list(range(30, 42))
+    assert counted == list(range(30, 42))
     list(recorded.lines(Sweep("fine-1", "fine", "x", 0.0, -1.5, 8)))
-    assert counted.numbers[12:] == list(range(38, 46))
+    assert counted[12:] == list(range(38, 46))
 
 
 def test_a_recorded_coarse_sweep_is_preferred_to_the_full_scan() -> None:
@@ -140,11 +140,11 @@ def test_a_recorded_line_that_serves_two_planned_lines_is_valid_once() -> None:
 def test_a_missing_line_is_named_before_any_line_is_read(asked: Sweep, message: str) -> None:
     """Lines beyond the end of the recording, on another swath or along the other axis are refused."""
     source = simulated()
-    counted = Counted()
+    counted: list[int] = []
     recorded = recorded_source(source, [record(source, FULL, counted)])
     with pytest.raises(NotRecordedError, match=message):
         next(recorded.lines(asked))
-    assert counted.numbers == []
+    assert counted == []
 
 
 def test_a_plan_is_cut_to_the_recorded_lines() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,7 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.rectify.region import mosaic_rows
 from spectralzoom.pipeline.simulator.rig_model import Rig
-from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from spectralzoom.pipeline.source import SweepLines
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source
 from tests.pipeline.simulator.small_scenes import image_scene
 
@@ -27,7 +28,11 @@ def _ramp() -> SimulatedSource:
     return SimulatedSource(image_scene(values, CAMERA, np.array([500.0, 700.0])), Rig(CAMERA), chosen={})
 
 
-def _mosaic(lines: SweepLines) -> NDArray[np.float32]:
+def _mosaic(recorded: RecordedSweep) -> NDArray[np.float32]:
+    facts = {one.name: getattr(recorded, one.name) for one in fields(recorded)}
+    lines: Any = SimpleNamespace(
+        **facts, read=lambda start, stop, at: recorded.read_lines(np.arange(start, stop))[:, at]
+    )
     return np.concatenate(list(mosaic_rows([lines], CAMERA, GRID, rows=80)))
 
 
@@ -51,7 +56,7 @@ def test_a_coarse_pass_of_single_recorded_lines_is_not_displaced() -> None:
     found = _mosaic(captured)[8:-8, 8:-8, 0]
     expected = 0.1 + 0.01 * np.arange(80)
     np.testing.assert_allclose(found, np.broadcast_to(expected[8:-8, None], found.shape), atol=1e-3)
-    np.testing.assert_allclose(found, _mosaic(SimulatedSweep(source, COARSE))[8:-8, 8:-8, 0], atol=1e-3)
+    np.testing.assert_allclose(found, _mosaic(record(source, COARSE))[8:-8, 8:-8, 0], atol=1e-3)
 
 
 def test_mosaics_use_recorded_positions_not_the_planned_swath() -> None:

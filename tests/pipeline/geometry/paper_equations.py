@@ -61,11 +61,7 @@ def line_points(
 
     L0 no rotation; L1 the paper's -atan(dY/dX); L2 the exact rotation; L3 exact rotation and local scale; L4 exact
     rays. L0 to L2 keep the scale of the undeflected line. ``scan_px`` is (line,).
-
-    Raises ValueError: no such model.
     """
-    if model not in LINE_MODELS:
-        raise ValueError(f"line model must be one of {', '.join(LINE_MODELS)}, got {model!r}")
     slopes = camera.pixel_slopes()
     if model == "L4":
         return points_of_scan(swath_px, camera, scan_px[:, None], slopes)

@@ -20,7 +20,7 @@ from spectralzoom.pipeline.ground.field_places import (
 )
 from spectralzoom.pipeline.ground.georeference import pixel_rows_m2
 from spectralzoom.pipeline.ground.map_grid import ground_grid
-from spectralzoom.pipeline.ground.view import GroundView, RigPose, pixel_places
+from spectralzoom.pipeline.ground.view import pixel_places
 from tests.pipeline.ground.test_view import view
 
 SHAPE = (600, 30)  # more rows than one block holds
@@ -53,17 +53,9 @@ def test_numbers_out_of_range_are_left_out_and_an_unknown_scale_gives_none() -> 
     assert areas_by_number(NoPlace((2, 3)), numbers, 2) is None
 
 
-def looking(tilt_deg: float, *, heading_deg: float = 30.0, roll_deg: float = 0.0, height_m: float = 12.0) -> GroundView:
-    """Return the view of a rig with pixels of 0.1 mrad above level ground."""
-    pose = RigPose(
-        lon_deg=9.5, lat_deg=52.1, heading_deg=heading_deg, tilt_deg=tilt_deg, roll_deg=roll_deg, height_m=height_m
-    )
-    return GroundView(pose, IFOV)
-
-
 def test_a_view_straight_down_has_the_area_of_its_pixels():
     """From 100 m, 400 x 600 pixels of 0.1 mrad, 1 cm each, cover 4 x 6 m. In 8.64 s that is 1 ha an hour."""
-    found = scale_of_view(looking(90, height_m=100), (400, 600))
+    found = scale_of_view(view(IFOV, tilt_deg=90, height_m=100), (400, 600))
     assert found.pixel_m == pytest.approx(0.01)
     assert (found.footprint.width_m, found.footprint.depth_m) == pytest.approx((6, 4))
     assert found.area_m2 == pytest.approx(24)
@@ -73,7 +65,7 @@ def test_a_view_straight_down_has_the_area_of_its_pixels():
 
 def test_range_is_the_length_of_the_oblique_ray():
     """At 30 deg below the horizon the ground is twice as far away as the rig is high."""
-    near, middle, far = footprint_of(looking(30), (21, 21)).range_m
+    near, middle, far = footprint_of(view(IFOV, tilt_deg=30), (21, 21)).range_m
     assert near < middle < far
     assert middle == pytest.approx(24, rel=1e-4)
 
@@ -81,24 +73,24 @@ def test_range_is_the_length_of_the_oblique_ray():
 @given(tilt=st.floats(15, 90), heading=st.floats(-360, 360), roll=st.floats(-20, 20))
 def test_footprint_area_is_the_sum_of_the_pixel_areas(tilt: float, heading: float, roll: float):
     """The sum of pixel areas and the area within the corners agree for any tilt, heading and roll."""
-    view = looking(tilt, heading_deg=heading, roll_deg=roll)
+    rig = view(IFOV, tilt_deg=tilt, heading_deg=heading, roll_deg=roll)
     shape = (60, 90)
     places = np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)
-    found = footprint_of(view, shape)
-    assert found.area_m2 == pytest.approx(float(view.area_m2(places).sum()), rel=1e-4)
+    found = footprint_of(rig, shape)
+    assert found.area_m2 == pytest.approx(float(rig.area_m2(places).sum()), rel=1e-4)
     assert found.area_m2 <= found.width_m * found.depth_m * (1 + 1e-9)
 
 
 @given(tilt=st.floats(15, 90), turn=st.floats(-360, 360))
 def test_heading_does_not_change_the_footprint_size(tilt: float, turn: float):
     """Width, depth, area and range depend on the view and not on the compass direction."""
-    one, other = (footprint_of(looking(tilt, heading_deg=heading), (80, 50)) for heading in (0, turn))
+    one, other = (footprint_of(view(IFOV, tilt_deg=tilt, heading_deg=heading), (80, 50)) for heading in (0, turn))
     assert (other.width_m, other.depth_m, other.area_m2) == pytest.approx((one.width_m, one.depth_m, one.area_m2))
     assert other.range_m == pytest.approx(one.range_m)
 
 
 def test_a_view_of_the_horizon_has_a_finite_footprint():
     """The footprint covers only the part of the field that is mapped, below the horizon."""
-    found = footprint_of(looking(1), (800, 400))
+    found = footprint_of(view(IFOV, tilt_deg=1), (800, 400))
     assert np.isfinite([found.width_m, found.depth_m, found.area_m2]).all()
     assert found.range_m[2] < 100 * 12 / np.tan(np.deg2rad(1))

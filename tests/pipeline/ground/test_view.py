@@ -21,10 +21,10 @@ SEMI_MAJOR_M, FLATTENING = 6378137.0, 1 / 298.257223563
 ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 
 
-def view(**changes: float | None) -> GroundView:
+def view(ifov_rad: float = IFOV, **changes: float | None) -> GroundView:
     """Return a rig 12 m above ground near Hanover that looks down at 40 deg, with ``changes``."""
     given: dict[str, Any] = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 30.0, "tilt_deg": 40.0, "height_m": 12.0}
-    return GroundView(RigPose(**(given | changes)), IFOV)
+    return GroundView(RigPose(**(given | changes)), ifov_rad)
 
 
 poses = st.builds(

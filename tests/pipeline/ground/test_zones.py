@@ -115,14 +115,6 @@ def test_a_georeferenced_image_maps_polygons_by_its_transform(turn: float) -> No
     )  # area on the ground, not on the map
 
 
-def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
-    """A pixel of a hundredth of a second at 52 N is 0.309 m north and 0.191 m east."""
-    step = 0.01 / 3600
-    place = PlacedPicture(GeoBox(SHAPE, Affine(step, 0, 7.6, 0, -step, 52.0), 4326))
-    areas = place.pixel_areas_m2(slice(10, 12), slice(5, 6))
-    assert areas.ravel() == pytest.approx(np.full(2, 0.30903 * 0.19068), rel=1e-3)
-
-
 @given(polygons)
 def test_a_patch_counts_by_its_pixels_inside(area: Any) -> None:
     """The fraction of a patch is the mean of the mask over its pixels on the scene."""

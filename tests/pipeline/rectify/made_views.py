@@ -1,10 +1,19 @@
-"""Two views of one place, shifted: random waves, and crop rows."""
+"""Two views of one place, shifted: random waves, and crop rows. Lines whose scores are their bands."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.rectify.registration.overlaps import BroadSweep
+from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.signal.components import Components
+from spectralzoom.pipeline.source import SweepLines
 
 Floats = NDArray[np.float64]
 ROW_PX = 12.0
@@ -49,3 +58,23 @@ def row_views(seed: int, shape: tuple[int, int], shift: Floats, snr: float, gaps
         return seen / seen.std() + rng.normal(size=shape) / snr
 
     return view(0.0, 0.0), view(*shift)
+
+
+def broad_sweep(lines: SweepLines, camera: LineCamera, usable: NDArray[np.bool_] | None = None) -> BroadSweep:
+    """Return the broad-band image of a sweep of raw lines."""
+    values, valid = calibrate(
+        lines.read(0, lines.sweep.lines),
+        lines.references,
+        saturated_dn=camera.full_scale_dn * lines.sweep.binning,
+        position=lines.position,
+    )
+    bands = values.shape[2]
+    scores: Any = SimpleNamespace(
+        sweep=lines.sweep,
+        position=lines.position,
+        components=Components(np.zeros(bands), np.eye(bands), np.ones(bands)),
+        step=1.0,
+        usable=valid & lines.valid_line[:, None],
+        read=lambda start, stop: values[start:stop],
+    )
+    return BroadSweep.read(scores, usable=lines.valid_line if usable is None else usable)

@@ -103,8 +103,8 @@ def test_drift_between_captured_sweeps_is_removed():
     plain, other = (SimulatedSweep(source, sweep) for sweep in sweeps)
     dark = other.references.dark
 
-    def read(start: int, stop: int) -> np.ndarray:
-        return np.rint((other.read(start, stop) - dark) * light * 0.8 + dark).astype(np.uint16)
+    def read(start: int, stop: int, samples: slice) -> np.ndarray:
+        return np.rint((other.read(start, stop) - dark) * light * 0.8 + dark).astype(np.uint16)[:, samples]
 
     told = {name: getattr(other, name) for name in ("sweep", "references", "position", "time_s", "valid_line")}
     placed = [place(plain, camera), place(SimpleNamespace(**told, read=read), camera)]  # type: ignore[arg-type]

@@ -35,23 +35,13 @@ class Taken:
     position: NDArray[np.float64]
     asked: list[tuple[int, ...]] = field(default_factory=list)
 
-    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Return whole lines."""
-        self.asked.append((start, stop))
-        return self.raw[start:stop]
-
-
-@dataclass(frozen=True)
-class Cropped(Taken):
-    """The same sweep, read by lines and samples."""
-
-    def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
+    def read(self, start: int, stop: int, samples: slice = slice(None)) -> NDArray[np.uint16]:
         """Return samples of some lines."""
-        self.asked.append((lines.start, lines.stop, samples.start, samples.stop))
-        return self.raw[lines, samples]
+        self.asked.append((start, stop, samples.start, samples.stop))
+        return self.raw[start:stop, samples]
 
 
-def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Taken, faults: bool = False) -> Taken:
+def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, faults: bool = False) -> Taken:
     """Return a sweep of noise; with ``faults`` also with dead lines and saturated and bad elements."""
     rng = np.random.default_rng(seed)
     raw = rng.integers(100, 3000, (sweep.lines, CAMERA.samples, bands)).astype(np.uint16)
@@ -65,7 +55,7 @@ def taken(sweep: Sweep, *, bands: int = 3, seed: int = 0, kind: type[Taken] = Ta
         white = rng.uniform(500, 4000, frame).astype(np.float32)
         references = replace(references, bad=bad, by_mirror=True, white=white)
         valid = rng.random(sweep.lines) > 0.02
-    return kind(sweep, raw, references, valid, line_positions(sweep, CAMERA))
+    return Taken(sweep, raw, references, valid, line_positions(sweep, CAMERA))
 
 
 def in_tiles(
@@ -83,7 +73,7 @@ def in_tiles(
 def two_turned(grid: PixelGrid | None) -> list[PlacedSweep]:
     """Return two overlapping sweeps of turned lines with all kinds of faults, one with a partly lit slit."""
     sweep = replace(TURNED, name="other", swath_px=-4600.0, start_px=3010.0)
-    other = taken(sweep, seed=1, kind=Cropped, faults=True)
+    other = taken(sweep, seed=1, faults=True)
     sample, band = np.mgrid[: CAMERA.samples, : other.raw.shape[2]]
     white = other.references.white.copy()  # as real ones: each band is unlit somewhere, most in one part of the slit
     white[(sample + 20 * band) % 60 < 15] = 0
@@ -117,11 +107,10 @@ def test_cutting_a_tile_into_runs_changes_no_bit(monkeypatch: pytest.MonkeyPatch
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("kind", [Taken, Cropped])
-def test_a_block_of_lines_is_read_once_in_a_column_of_tiles(kind: type[Taken]) -> None:
+def test_a_block_of_lines_is_read_once_in_a_column_of_tiles() -> None:
     """In the order of the tiles, with a cache of the projected size, no block of a column is read twice."""
     grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
-    lines = taken(TURNED, kind=kind)
+    lines = taken(TURNED)
     placed = [place(lines, CAMERA)]
     for tiles in (plan_tiles(placed, CAMERA, grid, (32, 120)), plan_tiles(placed, CAMERA, grid, (32, 60))[:5]):
         lines.asked.clear()
@@ -132,11 +121,10 @@ def test_a_block_of_lines_is_read_once_in_a_column_of_tiles(kind: type[Taken]) -
         assert len(lines.asked) == len(set(lines.asked)) > 1
 
 
-@pytest.mark.parametrize("kind", [Taken, Cropped])
-def test_projected_cache_size_covers_the_raw_lines(kind: type[Taken]) -> None:
-    """A tile holds at most the projected bytes: whole lines, or whole chunks of samples if the sweep reads these."""
+def test_projected_cache_size_covers_the_raw_lines() -> None:
+    """A tile holds at most the projected bytes: whole chunks of samples of whole blocks of lines."""
     grid = PixelGrid((3010.0, -4770.0), 1, (160, 120))
-    placed = [place(taken(TURNED, kind=kind), CAMERA)]
+    placed = [place(taken(TURNED), CAMERA)]
     tiles = plan_tiles(placed, CAMERA, grid, (32, 20))
     whole = LineCache(2**30)
     for tile in tiles:

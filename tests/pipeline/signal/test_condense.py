@@ -122,13 +122,6 @@ def test_many_components_and_few_valid_bands_mark_nothing() -> None:
     assert not marked(made.values, found, find_components(found), valid).any()
 
 
-def test_lines_without_light_are_unusable() -> None:
-    """Without a value in any band there are no scores."""
-    seen = score_lines(np.full((2, 3, 12), np.nan, np.float32), np.zeros((2, 3), np.bool_), Components.empty(12))
-    assert seen.scores.shape == (2, 3, 0)
-    assert (seen.quality == UNUSABLE).all()
-
-
 def test_one_of_two_bands_suffices() -> None:
     """The valid band is restored, and the other one by their correlation in the field."""
     made = field_of(1, bands=2, materials=1)

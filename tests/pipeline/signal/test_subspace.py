@@ -326,16 +326,6 @@ def test_an_effect_shared_by_the_bands_of_a_line_is_one_component(what: str) -> 
     assert np.abs(left[there].mean(axis=(0, 1))).max() < 0.15
 
 
-def test_full_scale_integers_keep_the_number_of_components() -> None:
-    """A raster has values from 0 to more than 30 000, with noise of some counts."""
-    made = field_of(4, materials=2, signal=1000)
-    values = np.rint(made.values * 4000 - (made.values * 4000).min()).astype(np.float32)
-    components = find_components(statistics_of(values), least=1)
-    assert values.max() > 30_000
-    assert len(components) == 2
-    np.testing.assert_allclose(components.noise, made.noise * 4000, rtol=0.03)
-
-
 def test_a_direction_shared_by_rare_spectra_becomes_a_component() -> None:
     """Residuals of 200 rare spectra along one direction add it as the last axis, orthonormal to the others."""
     components = find_components(statistics_of(field_of(3).values), least=1)

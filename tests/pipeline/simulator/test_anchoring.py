@@ -11,11 +11,11 @@ from scipy.ndimage import gaussian_filter
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Axis, Sweep
-from spectralzoom.pipeline.rectify.registration.overlaps import BroadSweep
 from spectralzoom.pipeline.rectify.registration.seams import Anchor, anchor_sweep
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.rectify.made_views import broad_sweep
 from tests.pipeline.simulator.small_scenes import CommonOffset, effects_on, image_scene, seen_at
 
 CAMERA = LineCamera(samples=96)
@@ -39,7 +39,7 @@ def anchored(sweep: Sweep, offset: tuple[float, float], *, prior_px: float = 16)
     seen = textured()
     effects = effects_on("rotation", "read-noise")
     source = SimulatedSource(seen, Rig(CAMERA), 0, effects, pointing=CommonOffset(way_px=offset))
-    broad = BroadSweep.read(SimulatedSweep(source, sweep), CAMERA)
+    broad = broad_sweep(SimulatedSweep(source, sweep), CAMERA)
     return anchor_sweep(broad, CAMERA, GRID, brightness(seen), prior_px=prior_px)
 
 
@@ -82,10 +82,10 @@ def test_sweep_with_an_offset_beyond_the_prior_is_not_moved() -> None:
 def test_sweep_without_common_pixels_with_the_mosaic_is_empty() -> None:
     """Without a usable line, beside the field, or on a mosaic of NaN, there is nothing to compare."""
     source = SimulatedSource(textured(), Rig(CAMERA), 0, effects_on("rotation"))
-    broad = BroadSweep.read(SimulatedSweep(source, sweep_of()), CAMERA)
+    broad = broad_sweep(SimulatedSweep(source, sweep_of()), CAMERA)
     blind = replace(broad, usable=np.zeros(140, bool))
     mosaic = brightness(textured())
     assert anchor_sweep(blind, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"
     assert anchor_sweep(broad, CAMERA, GRID, np.full_like(mosaic, np.nan), prior_px=8).found.status == "empty"
-    beside = BroadSweep.read(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)
+    beside = broad_sweep(SimulatedSweep(source, sweep_of(swath=400.0)), CAMERA)
     assert anchor_sweep(beside, CAMERA, GRID, mosaic, prior_px=8).found.status == "empty"

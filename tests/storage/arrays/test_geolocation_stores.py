@@ -12,7 +12,7 @@ import zarr
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_position, scene_to_direction
-from spectralzoom.pipeline.rectify.placed import TieTable, tie_table
+from spectralzoom.pipeline.rectify.placed import PixelGrid, TieTable, tie_table
 from spectralzoom.pipeline.rectify.scan_paths import ScanPath, make_scan_paths
 from spectralzoom.storage.arrays.geolocation import open_geolocation, write_geolocation
 
@@ -23,8 +23,8 @@ def tabulated(scan_px: np.ndarray) -> list[tuple[ScanPath, TieTable]]:
     """Return the scan paths of lines at these positions, each with its table."""
     tangents = np.stack([np.full_like(scan_px, 100.0), scan_px], axis=-1) * CAMERA.ifov_rad
     scan_paths = make_scan_paths(direction_to_position(scene_to_direction(tangents)), CAMERA)
-    grid = {"origin_px": (-5.0, -250.0), "spacing_px": 1.0, "shape": (60, 700)}
-    return [(scan_path, tie_table(scan_path, CAMERA, along="x", **grid)) for scan_path in scan_paths]  # type: ignore[arg-type]
+    grid = PixelGrid((-5.0, -250.0), 1.0, (60, 700))
+    return [(scan_path, tie_table(scan_path, CAMERA, grid, along="x")) for scan_path in scan_paths]
 
 
 def test_geolocation_tables_round_trip(tmp_path: Path) -> None:

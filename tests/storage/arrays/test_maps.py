@@ -12,27 +12,10 @@ from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
-from spectralzoom.pipeline.errors import IncompleteStoreError, PoseError, ShapeError
+from spectralzoom.pipeline.errors import IncompleteStoreError, ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.storage.arrays import class_maps
-from spectralzoom.storage.arrays.georeference import (
-    ON_THE_MAP,
-    AngularGrid,
-    load_geobox,
-    map_attributes,
-    map_coordinates,
-)
-from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
-from spectralzoom.storage.arrays.layout import (
-    NO_CLASS,
-    SHARD_COLUMNS,
-    SHARD_ROWS,
-    blank_pixels,
-    create_group,
-    open_group,
-    read_array,
-    write_image,
-)
+from spectralzoom.storage.arrays import class_maps, georeference, layout
+from spectralzoom.storage.arrays.ground_maps import GroundMapWriter, load_ground_map
 from tests.storage.small_archive import write_class_map
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
@@ -61,13 +44,13 @@ def test_a_map_written_in_blocks_round_trips(tmp_path: Path, goes_on: bool) -> N
     writer = begin(tmp_path / "a.zarr", (150, 700), goes_on=goes_on)
     whole = block((150, 700), goes_on=goes_on)
     for rows in (slice(0, 64), slice(64, 150)):
-        for columns in (slice(0, SHARD_COLUMNS), slice(SHARD_COLUMNS, 700)):
+        for columns in (slice(0, layout.SHARD_COLUMNS), slice(layout.SHARD_COLUMNS, 700)):
             writer.write_block(rows, columns, {name: image[rows, columns] for name, image in whole.items()})
     writer.finish(np.zeros(2))
     found = load_ground_map(tmp_path / "a.zarr")
-    group = open_group(tmp_path / "a.zarr")
+    group = layout.open_group(tmp_path / "a.zarr")
     for name, image in whole.items():
-        np.testing.assert_array_equal(read_array(group, name), image)
+        np.testing.assert_array_equal(layout.read_array(group, name), image)
     assert ("changed_from" in group) == goes_on
     legend = class_maps.legend_of(group)
     assert legend.names == LEGEND.names
@@ -121,14 +104,9 @@ def test_a_block_must_have_the_images_of_its_map(tmp_path: Path, goes_on: bool) 
         writer.write_block(slice(0, 64), slice(0, 90), block((64, 90), goes_on=not goes_on))
 
 
-def test_the_default_block_is_a_whole_number_of_shards() -> None:
-    """The stage that writes maps in these blocks therefore splits no shard."""
-    assert BLOCK[0] % SHARD_ROWS == BLOCK[1] % SHARD_COLUMNS == 0
-
-
 def test_load_ground_map_refuses_an_angular_map(tmp_path: Path) -> None:
     """The error says that the store has no grid mapping."""
-    create_group(tmp_path / "a.zarr", "class map", {})
+    layout.create_group(tmp_path / "a.zarr", "class map", {})
     with pytest.raises(IncompleteStoreError, match="no grid mapping; it is no map of the ground"):
         load_ground_map(tmp_path / "a.zarr")
 
@@ -140,9 +118,11 @@ def box(epsg: int = 32632, resolution: float = 0.03) -> GeoBox:
 
 def write(path: Path, geobox: GeoBox) -> Path:
     """Write a store with one image on the map grid, and return its path."""
-    group = create_group(path, "a map", map_attributes(geobox), map_coordinates(geobox))
+    group = layout.create_group(
+        path, "a map", georeference.map_attributes(geobox), georeference.map_coordinates(geobox)
+    )
     image = np.arange(np.prod(geobox.shape), dtype=np.float32).reshape(geobox.shape)
-    write_image(group, "height", ("y", "x"), image, {"units": "m", **ON_THE_MAP})
+    layout.write_image(group, "height", ("y", "x"), image, {"units": "m", **georeference.ON_THE_MAP})
     return path
 
 
@@ -154,7 +134,7 @@ def test_xarray_reads_the_same_geobox(tmp_path: Path, epsg: int, resolution: flo
     with xr.open_zarr(path, consolidated=False) as content:
         assert content.odc.geobox == geobox
         assert content["height"].odc.geobox == geobox
-    assert load_geobox(path) == geobox
+    assert georeference.load_geobox(path) == geobox
 
 
 def test_coordinates_and_grid_mapping_follow_cf(tmp_path: Path) -> None:
@@ -180,12 +160,12 @@ def test_a_geographic_crs_has_longitude_and_latitude(tmp_path: Path) -> None:
     with xr.open_zarr(write(tmp_path / "a.zarr", geobox), consolidated=False) as content:
         assert content.x.attrs["standard_name"] == "longitude"
         assert (content.y.attrs["standard_name"], content.y.attrs["units"]) == ("latitude", "degrees_north")
-        assert content.odc.geobox == load_geobox(tmp_path / "a.zarr") == geobox
+        assert content.odc.geobox == georeference.load_geobox(tmp_path / "a.zarr") == geobox
 
 
 def test_geozarr_attributes_match_the_grid() -> None:
     """`proj:` has code and WKT2, `spatial:` has transform and bounding box, and both conventions are registered."""
-    found = map_attributes(box())
+    found = georeference.map_attributes(box())
     assert found["proj:code"] == "EPSG:32632"
     assert CRS(found["proj:wkt2"]) == CRS.from_epsg(32632)
     a, b, c, d, e, f = found["spatial:transform"]
@@ -201,29 +181,23 @@ def test_geozarr_attributes_match_the_grid() -> None:
 
 def test_an_angular_store_has_no_geobox(tmp_path: Path) -> None:
     """A store without a position on the earth has no CRS and no grid mapping."""
-    grid = AngularGrid(1e-4, (20, 30))
-    group = create_group(tmp_path / "a.zarr", "a mosaic", grid.attributes((20, 30)))
-    write_image(group, "values", ("y", "x"), np.zeros((20, 30), np.float32), grid.attributes((20, 30)))
-    assert load_geobox(tmp_path / "a.zarr") is None
+    grid = georeference.AngularGrid(1e-4, (20, 30))
+    group = layout.create_group(tmp_path / "a.zarr", "a mosaic", grid.attributes((20, 30)))
+    layout.write_image(group, "values", ("y", "x"), np.zeros((20, 30), np.float32), grid.attributes((20, 30)))
+    assert georeference.load_geobox(tmp_path / "a.zarr") is None
     assert not {"proj:code", "proj:wkt2"} & set(group.attrs)
 
 
 def test_load_geobox_refuses_a_damaged_store(tmp_path: Path) -> None:
     """A missing store and an empty grid mapping each raise an error."""
     with pytest.raises(IncompleteStoreError, match="cannot be read"):
-        load_geobox(tmp_path / "none.zarr")
+        georeference.load_geobox(tmp_path / "none.zarr")
     path = write(tmp_path / "a.zarr", box())
     group = zarr.open_group(path, mode="r+")
     group["spatial_ref"].attrs.put({})
     group.attrs.put({})
     with pytest.raises(IncompleteStoreError, match=r"the grid of .*a\.zarr cannot be read"):
-        load_geobox(path)
-
-
-def test_map_attributes_require_a_crs() -> None:
-    """A grid without a CRS raises PoseError."""
-    with pytest.raises(PoseError, match="a map needs a CRS"):
-        map_attributes(GeoBox(box().shape, box().affine, None))
+        georeference.load_geobox(path)
 
 
 # --- class maps on the grid of a mosaic ---------------------------------------------------------------------------
@@ -245,8 +219,8 @@ def _drawn() -> tuple[np.ndarray, np.ndarray]:
 def test_class_map_tiles_equal_the_map_written_at_once(tmp_path: Path) -> None:
     """Tiles of whole shards, in any order, give the same files byte by byte."""
     classes, confidence = _drawn()
-    grid = AngularGrid(1e-4, SHAPE)
-    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours, grid))
+    grid = georeference.AngularGrid(1e-4, SHAPE)
+    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours), grid)
     class_maps.create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
     begun = class_maps.load_class_map(tmp_path / "tiles.zarr")
     assert (begun.classes == 255).all()  # unwritten tiles
@@ -273,10 +247,10 @@ def test_blank_pixels_clears_only_the_chosen_pixels(tmp_path: Path) -> None:
     write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
     before = _contents(tmp_path / "m.zarr")
     gone = np.zeros(SHAPE, np.bool_)
-    blank_pixels(tmp_path / "m.zarr", gone, NO_CLASS)
+    layout.blank_pixels(tmp_path / "m.zarr", gone, layout.NO_CLASS)
     assert _contents(tmp_path / "m.zarr") == before
     gone[60:70, 630:650], gone[149, 699] = True, True
-    blank_pixels(tmp_path / "m.zarr", gone, NO_CLASS)
+    layout.blank_pixels(tmp_path / "m.zarr", gone, layout.NO_CLASS)
     left = class_maps.load_class_map(tmp_path / "m.zarr")
     np.testing.assert_array_equal(left.classes, np.where(gone, 255, classes))
     np.testing.assert_allclose(left.confidence, np.where(gone, np.nan, confidence), atol=class_maps.CONFIDENCE_STEP / 2)
@@ -288,7 +262,7 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
     colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
-    made = class_maps.ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, AngularGrid(1e-4, (50, 70)))
+    made = class_maps.ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours)
     write_class_map(tmp_path / "c.zarr", made)
     found = class_maps.load_class_map(tmp_path / "c.zarr")
     np.testing.assert_array_equal(found.classes, classes)

@@ -133,12 +133,6 @@ def test_a_first_visit_has_no_old_classes(tmp_path: Path) -> None:
         class_maps.write_probabilities_tile(path, (0, 0), packed, *nothing, packed[..., 0])
 
 
-def test_missing_probabilities_are_refused(tmp_path: Path) -> None:
-    """The error names the store."""
-    with pytest.raises(IncompleteStoreError, match="cannot be read"):
-        class_maps.ProbabilityStore(tmp_path / "none.zarr")
-
-
 def test_a_probability_of_1_is_not_read_as_unknown(tmp_path: Path) -> None:
     """A probability of 1 is stored below 255, the byte for unknown."""
     path = tmp_path / "class_probabilities.zarr"

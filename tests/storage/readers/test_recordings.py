@@ -41,7 +41,7 @@ def write_raw(folder: Path, source: SimulatedSource, sweep: Sweep) -> RawCube:
 def assert_is_recording_of(found: Any, cube: RawCube) -> None:
     """Check a recorded sweep's numbers, positions, times, exposures, flags and references against a raw cube."""
     assert replace(found.sweep, name=cube.sweep.name) == cube.sweep
-    np.testing.assert_array_equal(found.read(0, cube.shape[0]), cube.read())
+    np.testing.assert_array_equal(found.read_lines(np.arange(cube.shape[0])), cube.read())
     for name in ("position", "time_s", "exposure_ms", "valid_line"):
         np.testing.assert_array_equal(getattr(found, name), getattr(cube, name))
     for name, value in asdict(cube.references).items():
@@ -171,7 +171,7 @@ def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
     there, back = open_recording(files, CAMERA, RecordedWith(pointing=tmp_path / "turns.csv")).sweeps
     assert (there.sweep.name, there.sweep.lines, there.sweep.start_px) == ("there", 40, pytest.approx(-39.5, abs=1e-5))
     assert (back.sweep.name, back.sweep.lines, back.sweep.start_px) == ("back", 38, -38.5)
-    np.testing.assert_array_equal(back.read(0, 38), cube.read(42, 80))
+    np.testing.assert_array_equal(back.read_lines(np.arange(38)), cube.read(42, 80))
 
 
 write_envi_cube = partial(write_envi, wavelength_units="nm", wavelength="{500, 600, 700}")
@@ -261,7 +261,7 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
     write_envi_cube(tmp_path / "whiteReference", np.full((2, 16, 3), 3000, "<u2"))
     recording = open_recording(tmp_path)
     (sweep,) = recording.sweeps
-    np.testing.assert_array_equal(sweep.read(2, 6), VALUES[2:])
+    np.testing.assert_array_equal(sweep.read_lines(np.arange(2, 6)), VALUES[2:])
     np.testing.assert_allclose(sweep.time_s, 0.002 + 0.01 * np.arange(6), atol=1e-12)
     assert (sweep.exposure_ms.tolist(), recording.camera.exposure_ms) == ([4.0] * 6, 4.0)
     assert recording.camera.frame_ms == pytest.approx(10.0)
@@ -340,7 +340,7 @@ def test_nodata_values_are_invalid(tmp_path: Path, kind: str, void: int) -> None
     recording = open_recording(tmp_path / "a.hdr")
     (sweep,) = recording.sweeps
     source = recording.source((6, 16))
-    np.testing.assert_array_equal(sweep.read(0, 6), np.where(values == void, np.int32(65535), values))
+    np.testing.assert_array_equal(sweep.read_lines(np.arange(6)), np.where(values == void, np.int32(65535), values))
     assert [line.valid for line in source.lines(sweep.sweep)] == [True, True, False, True, True, True]
     assert recording.camera.bits == 12
     assert f"a: the number {void} is no data, as the file says" in recording.notes
