@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,6 @@ from spectralzoom.flows.stages.ground import colours_of
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out
-from spectralzoom.pipeline.products.indices import SpectralIndex, find_index
 from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
@@ -56,23 +55,17 @@ class ProductFlags:
 NO_PRODUCTS = ProductFlags()
 
 
-@dataclass(frozen=True)
-class ProductChoice:
-    """The parsed flags. Doses are by class and empty without the flag; they make polygons."""
-
-    reflectance: bool
-    indices: tuple[SpectralIndex, ...]
-    polygons: bool
-    doses: Mapping[str, float]
+def split_names(flag: str, given: str | None) -> tuple[str, ...]:
+    """Return the parts of a flag's list (SettingsError: it has none)."""
+    if given is not None and not split_list(given):
+        raise SettingsError(f"--{flag} {given!r} names nothing; give names with commas, or leave it out")
+    return split_list(given)
 
 
-def choose_products(flags: ProductFlags) -> ProductChoice:
-    """Parse the flags (SettingsError: a number or an index is wrong)."""
-    for name in ("dose", "indices"):
-        if (given := getattr(flags, name)) is not None and not split_list(given):
-            raise SettingsError(f"--{name} {given!r} names nothing; give names with commas, or leave it out")
-    doses = {}
-    for part in split_list(flags.dose):
+def parse_doses(given: str | None) -> dict[str, float]:
+    """Return the doses of a flag by class (SettingsError: one is no number, or a class is named twice)."""
+    doses: dict[str, float] = {}
+    for part in split_names("dose", given):
         name, _, number = part.rpartition("=")
         if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
             raise SettingsError(
@@ -82,13 +75,11 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
         if name.strip() in doses:
             raise SettingsError(f"--dose names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)
-    indices = tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices)))
-    return ProductChoice(flags.reflectance, indices, flags.polygons or bool(doses), doses)
+    return doses
 
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
-RGB = ("red", "green", "blue")
-PROBABILITIES = "class_probabilities"
+CLASS, RGB = ("class",), ("red", "green", "blue")  # names of bands
 
 
 @dataclass(frozen=True)
@@ -185,7 +176,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     legend = legend_of(open_group(run.path(product)))
     roles = ("data", "confidence")
     return [
-        image_layer(run, product, "classes", "class_map", "Class map", nodata=UNLABELLED, legend=legend, band="class"),
+        image_layer(run, product, "classes", "class_map", "Class map", bands=CLASS, nodata=UNLABELLED, legend=legend),
         image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),
         _gain_layer(run),
         _picture(run),
@@ -221,7 +212,7 @@ def image_layer(
     title: str,
     *,
     roles: tuple[str, ...] = ("data",),
-    band: str | None = None,
+    bands: tuple[str, ...] | None = None,
     nodata: float = np.nan,
     unit: str | None = None,
     legend: ClassNames | None = None,
@@ -229,7 +220,7 @@ def image_layer(
     """Return an image of a store on the store's own grid."""
     stored = open_image(run.path(product), array)
     geobox = geobox_of(run, stored)
-    image = CogImage(geobox, stored.dtype.name, (band or array,), nodata, legend, layer_tags(run, product, geobox))
+    image = CogImage(geobox, stored.dtype.name, bands or (array,), nodata, legend, layer_tags(run, product, geobox))
     return Layer(name, title, roles, image, stored.rows, unit)
 
 
@@ -256,8 +247,7 @@ def _picture(run: ExportedRun) -> Layer:
     title = "Picture of the coarse pass"
     roles = ("visual", "overview")
     if run.map_product == "ground_map":
-        drawn = image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, nodata=0)
-        return replace(drawn, image=replace(drawn.image, bands=RGB))
+        return image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, bands=RGB, nodata=0)
     geobox = geobox_of(run, open_image(run.path("mosaic"), "coverage"))
     ref = run.store("mosaic")
     assert ref is not None
@@ -270,9 +260,9 @@ def _picture(run: ExportedRun) -> Layer:
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
     """Return what a prior map adds: the previous classes of changed pixels."""
-    product = "ground_map" if run.map_product == "ground_map" else PROBABILITIES
+    product = "ground_map" if run.map_product == "ground_map" else "class_probabilities"
     if run.store(product) is None or OLD_CLASS not in (group := open_group(run.path(product))):
         return []
     title = "Class of the prior map, where the map is sure of another one"
     legend = legend_of(group)
-    return [image_layer(run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend, band="class")]
+    return [image_layer(run, product, OLD_CLASS, OLD_CLASS, title, bands=CLASS, nodata=UNLABELLED, legend=legend)]

@@ -16,7 +16,7 @@ import shapely
 from affine import Affine
 
 from spectralzoom.flows.archive.export_command import run_export
-from spectralzoom.flows.archive.export_layers import ProductFlags, choose_products
+from spectralzoom.flows.archive.export_layers import ProductFlags, parse_doses
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import SettingsError, WavelengthError
@@ -37,8 +37,7 @@ FLAGS = {"reflectance": True, "indices": "NDVI,SAVI", "polygons": True, "dose": 
 
 def exported(archive: Path, out: Path, receipt: Any, **flags: Any) -> Exported:
     """Export the newest run of an archive with the given flags."""
-    choice = choose_products(ProductFlags(**flags))
-    return Exported(archive, receipt, out, run_export(archive, None, out, QUIET, choice))
+    return Exported(archive, receipt, out, run_export(archive, None, out, QUIET, ProductFlags(**flags)))
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +154,7 @@ def test_impossible_flags_are_refused_first(posed: Exported, tmp_path: Path, fla
 
 def test_a_class_name_may_contain_an_equals_sign() -> None:
     """The dose follows the last equals sign."""
-    assert choose_products(ProductFlags(dose="a=1=2.5,b=1")).doses == {"a=1": 2.5, "b": 1.0}
+    assert parse_doses("a=1=2.5,b=1") == {"a=1": 2.5, "b": 1.0}
 
 
 def test_a_survey_without_a_place_exports_polygons_and_ratio_indices(surveyed_png: Any, tmp_path: Path) -> None:
