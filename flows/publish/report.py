@@ -20,7 +20,7 @@ from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
 from spectralzoom.flows.publish.field_map import FieldMap
-from spectralzoom.flows.publish.panels import data_address
+from spectralzoom.flows.publish.quicklook import data_address
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.publish.receipt_table import (
     finding_rows,
@@ -77,19 +77,10 @@ def _environment(*, markdown: bool) -> Environment:
     found.filters |= {
         "percent": format_percent,
         "points": format_points,
-        # data for scripts, which cannot end their tag
-        "data": lambda content: htmlsafe_json_dumps(_format_visible(content), separators=(",", ":")),
+        "data": lambda content: htmlsafe_json_dumps(content, separators=(",", ":")),  # which cannot end its tag
     }
     found.globals["part"] = lambda name: Markup(part(name))
     return found
-
-
-def _format_visible(content: Any) -> Any:
-    if isinstance(content, str):
-        return visible(content)
-    if isinstance(content, Mapping):
-        return {visible(name): _format_visible(item) for name, item in content.items()}
-    return [_format_visible(item) for item in content] if isinstance(content, list | tuple) else content
 
 
 def _plain(value: object) -> object:

@@ -28,8 +28,7 @@ from spectralzoom.flows.publish.findings import (
     find_zones,
     plots_csv,
 )
-from spectralzoom.flows.publish.panels import thinned
-from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook
+from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
 from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths

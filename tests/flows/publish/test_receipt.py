@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from spectralzoom.flows.publish.field_map import ERROR_COLOURS, FieldMap, error_address
+from spectralzoom.flows.publish.field_map import RIGHT_RGB, WRONG_RGB, FieldMap, error_address
 from spectralzoom.flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
 from spectralzoom.flows.publish.receipt_table import format_score, headline, print_summary
 from spectralzoom.flows.publish.report import render_report
@@ -270,7 +270,6 @@ def test_an_error_map_shows_where_map_and_labels_differ() -> None:
     address = error_address(classes, labels)
     with Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))) as opened:
         shown = np.asarray(opened.convert("RGBA"))
-    right, wrong = ((*bytes.fromhex(one[1:]), 255) for one in ERROR_COLOURS.values())
-    assert tuple(shown[0, 0]) == right
-    assert tuple(shown[0, 1]) == wrong
+    assert tuple(shown[0, 0]) == (*RIGHT_RGB, 255)
+    assert tuple(shown[0, 1]) == (*WRONG_RGB, 255)
     assert shown[1, :, 3].tolist() == [0, 0]
