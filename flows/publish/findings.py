@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -38,32 +36,28 @@ def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
     Without a planned fine pass, ``fine``, its seconds are those that the budget leaves. Hectares are those within the
     zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
-    scale = plan.field.zones.place.scale(plan.field.camera.ifov_rad)
-    fine_s = plan.passes.fine_s if fine is None else fine.seconds
-    seconds = plan.passes.coarse_s + fine_s
-    kept = scale
-    if plan.field.zones.kept is not None and scale.area_m2 is not None:
-        kept = replace(scale, area_m2=_ground_m2(plan, plan.field.zones.kept))  # the area within the zones
+    zones, passes = plan.field.zones, plan.passes
+    scale = kept = zones.place.scale(plan.field.camera.ifov_rad)
+    if zones.kept is not None and scale.area_m2 is not None:
+        kept = replace(scale, area_m2=_ground_m2(plan, zones.kept))  # the area within the zones
     footprint = scale.footprint
     captured = plan.field.raster is None
-    camera_s = {"coarse": plan.passes.coarse_s, "fine": fine_s, "all": seconds, "full_scan": plan.passes.full_s}
-    lines = {
-        "coarse": sum(sweep.lines for sweep in plan.passes.coarse),
-        "fine": None if fine is None else fine.lines,
-        "full_scan": sum(sweep.lines for sweep in plan.passes.full),
-    }
+    fine_s = passes.fine_s if fine is None else fine.seconds
+    seconds = passes.coarse_s + fine_s
+    camera_s = {"coarse": passes.coarse_s, "fine": fine_s, "all": seconds, "full_scan": passes.full_s}
+    coarse, full = (sum(sweep.lines for sweep in sweeps) for sweeps in (passes.coarse, passes.full))
+    lines = {"coarse": coarse, "fine": None if fine is None else fine.lines, "full_scan": full}
+    ranges = None if footprint is None else zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)
     return {
         "size_px": [scale.shape[1], scale.shape[0]],
         "view_deg": [scale.view_deg[1], scale.view_deg[0]] if captured or footprint is not None else None,
         "ground_pixel_m": scale.pixel_m,
-        "range_m": None
-        if footprint is None
-        else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
+        "range_m": None if ranges is None else dict(ranges),
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
         "hectares": kept.hectares,
-        "kept_fraction": None if plan.field.zones.kept is None else float(plan.field.zones.kept.mean()),
+        "kept_fraction": None if zones.kept is None else float(zones.kept.mean()),
         "camera_s": camera_s if captured else None,
-        "fine_planned": fine is not None or plan.passes.plain,
+        "fine_planned": fine is not None or passes.plain,
         "lines": lines if captured else None,
         "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not plan.part else None,
     }
@@ -128,17 +122,14 @@ def changed_hectares(
 def find_zones(plan: SurveyPlan, drawn: ClassMap) -> dict[str, Any]:
     """Return ``zones``, the size of the mapped part, and ``plots``, a row each; empty without either."""
     found: dict[str, Any] = {}
-    if plan.field.zones.kept is not None:
-        kept = plan.field.zones.kept
-        found["zones"] = {
-            "kept_px": int(np.count_nonzero(kept)),
-            "field_px": kept.size,
-            "kept_m2": _ground_m2(plan, kept),
-        }
-    if plan.field.zones.plots is not None:
+    zones = plan.field.zones
+    if (kept := zones.kept) is not None:
+        pixels = int(np.count_nonzero(kept))
+        found["zones"] = {"kept_px": pixels, "field_px": kept.size, "kept_m2": _ground_m2(plan, kept)}
+    if zones.plots is not None:
         found["plots"] = [
-            asdict(figures_of_plot(name, shape, plan.field.zones.place, drawn.classes, drawn.confidence, drawn.names))
-            for name, shape in plan.field.zones.plots.items()
+            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in zones.plots.items()
         ]
     return found
 
@@ -151,15 +142,13 @@ def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
+    import pandas as pd
+
     names = list(plots[0]["fractions"]) if plots else []
     head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*head, *(f"fraction_{name}" for name in names)])
-    for plot in plots:
-        cells = [*(plot[name] for name in head), *(plot["fractions"][name] for name in names)]
-        table.writerow(["" if cell is None else cell for cell in cells])
-    return text.getvalue()
+    cells = [[*(plot[name] for name in head), *(plot["fractions"][name] for name in names)] for plot in plots]
+    table = pd.DataFrame(cells, columns=[*head, *(f"fraction_{name}" for name in names)])
+    return str(table.to_csv(index=False, lineterminator="\n"))
 
 
 def find_map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:

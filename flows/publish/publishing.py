@@ -36,11 +36,6 @@ class RunRef:
     folder: Path
     stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
 
-    @property
-    def name(self) -> str:
-        """Return the name of the run's folder."""
-        return self.folder.name
-
 
 def publish(stores: Stores, plan: SurveyPlan, products: Products, *, started: datetime, note: Note) -> RunRef:
     """Publish the run of a class map, with its accuracy where it was evaluated; in a flow as a task."""

@@ -120,7 +120,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
         started=in_seconds(started),
         finished=in_seconds(datetime.now(UTC)),
         versions=versions(),
-        settings=asked_settings(plan),
+        settings={**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)},
         stages=[_stage_row(row) for row in stores.rows.values()],
         savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)),
         data_bytes=count_bytes(stores, plan, products, fine),
@@ -149,25 +149,15 @@ def in_seconds(moment: datetime) -> str:
 
 
 def _stage_row(row: Row) -> dict[str, Any]:
-    costs = (row.wall_s, row.cpu_s, row.peak_rss_bytes, row.bytes_in, row.bytes_out)
-    return {"name": row.name, "key": row.ref.key, "state": row.state, **dict(zip(COSTS_OF_STAGE, costs, strict=True))}
-
-
-def asked_settings(plan: SurveyPlan) -> dict[str, object]:
-    """Return the settings with absolute paths, and the notes on assumptions."""
-    return {**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)}
+    costs = {name: getattr(row, name) for name in COSTS_OF_STAGE}
+    return {"name": row.name, "key": row.ref.key, "state": row.state, **costs}
 
 
 def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
-    did = plan.work_done(read)
-    of_model = {
-        "patches": SavingEntry(len(read), len(plan.field.kept_patches)).as_dict(),
-        "multiply_adds": {
-            **SavingEntry(did.total, plan.costs.of_map(plan.field.kept_patches).total).as_dict(),
-            **asdict(did),
-        },
-    }
+    did, patches = plan.work_done(read), plan.field.kept_patches
+    work = SavingEntry(did.total, plan.costs.of_map(patches).total).as_dict()
+    of_model = {"patches": SavingEntry(len(read), len(patches)).as_dict(), "multiply_adds": {**work, **asdict(did)}}
     if plan.field.raster is not None:
         return of_model
     entries = capture_savings([*plan.passes.coarse, *fine.sweeps], plan.passes.full, plan.field.camera, plan.field.grid)
@@ -221,11 +211,11 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
     prior = None
     if plan.field.prior is not None:
         prior = {"run": plan.field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
-    if plan.field.recorded is not None:
+    if (recorded := plan.field.recorded) is not None:
         found["recording"] = {
             "sweeps": str(plan.settings.sweeps),
-            "lines_read": plan.field.recorded.lines_served([*plan.passes.coarse, *fine.sweeps]),
-            "lines_recorded": sum(int(one.valid_line.sum()) for one in plan.field.recorded.source.sweeps),
+            "lines_read": recorded.lines_served([*plan.passes.coarse, *fine.sweeps]),
+            "lines_recorded": sum(int(one.valid_line.sum()) for one in recorded.source.sweeps),
             "passes_s": plan.passes.coarse_s + fine.seconds,
             "full_scan_s": plan.settings.cost.seconds(plan.passes.full, plan.field.camera),
         }
@@ -253,9 +243,7 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
     found |= find_zones(plan, drawn) | find_map(plan, products.class_map, drawn)
     if plan.field.raster is not None:
         return found
-    record = products.mosaic.path / SIGNAL_RECORD
-    saturated = read_table(record).get("saturated") if record.is_file() else None  # archives of before 2026-11-27
-    if saturated:
+    if saturated := read_table(products.mosaic.path / SIGNAL_RECORD).get("saturated"):
         found["signal"] = {"saturated": saturated}
     lines = read_table(products.mosaic.path / "lines.json")
     if troubled := {name: facts for name, facts in lines.items() if any(facts.values())}:
