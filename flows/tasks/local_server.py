@@ -153,7 +153,7 @@ def create_database(path: Path) -> None:
     each archive gets a copy. A user without such a folder waits for them in each new archive.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    cache = cache_folder(os.environ)
+    cache = cache_folder()
     if path.exists() or cache is None:
         return
     import prefect
