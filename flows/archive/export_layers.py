@@ -15,7 +15,7 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.publish.receipt import Receipt, check_receipt
+from spectralzoom.flows.publish.receipt import Receipt, load_receipt
 from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import RIG
@@ -29,7 +29,7 @@ from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
 from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import LATEST, Archive, Ref, damage, uri_of
+from spectralzoom.storage.store import LATEST, Archive, Ref, uri_of
 
 
 @Parameter(name="*")
@@ -148,14 +148,10 @@ def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     Raises NoRunError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
     """
     folder = archive.run_folder(name or LATEST)
-    run = read_run(folder)
-    if run.problem is not None:
-        raise damage(folder, run.problem)
     try:
-        receipt = check_receipt(run.receipt)
+        return ExportedRun(archive, folder, load_receipt(folder))
     except ShapeError as error:
         raise IncompleteStoreError(f"{folder / RECEIPT} is no survey's: {error}; export another run") from error
-    return ExportedRun(archive, folder, receipt)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from spectralzoom.flows.publish.findings import (
     plots_csv,
 )
 from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
-from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
+from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
@@ -49,8 +49,8 @@ from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
-from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import Ref, damage, read_table
+from spectralzoom.storage.runs import RECEIPT
+from spectralzoom.storage.store import Ref, read_table
 from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
@@ -64,14 +64,6 @@ class Published:
 
     receipt: Receipt
     folder: Path
-
-
-def load_receipt(folder: Path) -> Receipt:
-    """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
-    found = read_run(folder)
-    if found.problem is not None:
-        raise damage(folder, found.problem)
-    return check_receipt(found.receipt)
 
 
 def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: datetime) -> Published:
@@ -106,7 +98,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
     places = products.addresses()
     if (products.class_map.path / READING).exists():  # patches were chosen in the segmentation
         places["attention"] = f"{products.class_map.uri}/{READING}"
-    files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if field.zones.plots is not None else []))
+    files = (RECEIPT, "quicklook.png", REPORT, *([PLOTS_FILE] if field.zones.plots is not None else []))
     scans = {
         "taken": plan.scans.chosen,
         "best_in_time": plan.scans.best_in_time(plan.passes.coarse_s + fine.seconds),
