@@ -190,14 +190,12 @@ def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]
     }
 
 
-def geobox_of(run: ExportedRun, stored: StoredImage) -> GeoBox:
+def geobox_of(stored: StoredImage) -> GeoBox:
     """Return the grid of a store's images; in angles without a CRS."""
     if stored.geobox is not None:
         return stored.geobox
-    transform = stored.about.get("spatial:transform")
-    if transform is None:
-        raise IncompleteStoreError(f"the {stored.name} of run {run.id} do not say where they lie; verify the archive")
-    return GeoBox((stored.shape[0], stored.shape[1]), Affine(*map(float, transform)), None)
+    y, x = stored.shape[:2]
+    return GeoBox((y, x), Affine(*map(float, stored.about["spatial:transform"])), None)
 
 
 def image_layer(
@@ -215,7 +213,7 @@ def image_layer(
 ) -> Layer:
     """Return an image of a store on the store's own grid."""
     stored = open_image(run.path(product), array)
-    geobox = geobox_of(run, stored)
+    geobox = geobox_of(stored)
     image = CogImage(geobox, stored.dtype.name, bands or (array,), nodata, legend, layer_tags(run, product, geobox))
     return Layer(name, title, roles, image, stored.rows, unit)
 
@@ -227,8 +225,7 @@ def _gain_layer(run: ExportedRun) -> Layer:
     assert class_map is not None
     patch = int(run.archive.manifest(class_map)["params"]["gains"]["frame"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
-    if scene is None:
-        raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
+    assert scene is not None
     shape = (stored.shape[0], stored.shape[1])
     fine = load_geobox(run.path("class_map"))
     geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
@@ -244,7 +241,7 @@ def _picture(run: ExportedRun) -> Layer:
     roles = ("visual", "overview")
     if run.map_product == "ground_map":
         return image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, bands=RGB, nodata=0)
-    geobox = geobox_of(run, open_image(run.path("mosaic"), "coverage"))
+    geobox = geobox_of(open_image(run.path("mosaic"), "coverage"))
     ref = run.store("mosaic")
     assert ref is not None
 

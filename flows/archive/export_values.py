@@ -88,7 +88,7 @@ class MosaicView:
         """Return the image's grid, in angles without a CRS."""
         if self.ground is not None:
             return self.ground.geobox
-        return geobox_of(self.run, open_image(self.run.path("mosaic"), "coverage"))
+        return geobox_of(open_image(self.run.path("mosaic"), "coverage"))
 
     @cached_property
     def ground(self) -> GroundGrid | None:

@@ -105,7 +105,6 @@ def render_report(receipt: Receipt, quicklook: bytes, *, field: FieldMap | None 
         title=receipt["survey"],
         lead=headline(receipt),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
-        receipt=receipt,
         links={  # without raw lines, which may be cleared, and the report itself
             name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
             for name, address in receipt["products"].items()
