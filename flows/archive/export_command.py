@@ -6,7 +6,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -35,7 +35,7 @@ from spectralzoom.flows.terminal.progress import print_json, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError
 from spectralzoom.pipeline.products.indices import find_index
 from spectralzoom.storage.export.image_files import write_cog
-from spectralzoom.storage.store import Archive, read_manifest
+from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import remove_leftovers, take_lock, to_json, write_whole
 
 COLLECTION = "collection.json"
@@ -95,17 +95,10 @@ def run_export(
             check_owner(export)
             for folder in (out, export.folder):
                 remove_leftovers(folder)
-            _export_images(export, layers, console)
-            areas = export.folder / "areas.csv"
-            write_areas(opened, areas)
-            export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
-            if products.polygons or doses:
-                with console.status("drawing polygons"):
-                    for key, path, kind in write_polygons(opened, export.folder, doses):
-                        export.add(key, path, "Classes as polygons", kind, ["data"])
+            _write_images(export, layers, console)
+            _write_tables(export, doses, console, polygons=products.polygons or bool(doses))
             for name, (title, kind) in RUN_FILES.items():
-                if name in read_manifest(opened.folder)["files"]:
-                    export.add(Path(name).stem, opened.folder / name, title, kind, ["metadata"])
+                export.add(Path(name).stem, opened.folder / name, title, kind, ["metadata"])
             item, collection = write_catalogue(export)
     except PipelineError:  # some are OSErrors
         raise
@@ -147,7 +140,7 @@ class Export:
             self.files[key] = path.resolve().relative_to(self.out).as_posix()
 
 
-def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
+def _write_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
     for layer in layers:
         path = export.folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
@@ -155,6 +148,16 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         unit = {} if layer.unit is None else {"unit": layer.unit}
         bands = [{"name": name, "data_type": layer.image.dtype, **unit} for name in layer.image.bands]
         export.add(layer.name, path, layer.title, COG, layer.roles, bands=bands)
+
+
+def _write_tables(export: Export, doses: Mapping[str, float], console: Console, *, polygons: bool) -> None:
+    areas = export.folder / "areas.csv"
+    write_areas(export.run, areas)
+    export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
+    if polygons:
+        with console.status("drawing polygons"):
+            for key, path, kind in write_polygons(export.run, export.folder, doses):
+                export.add(key, path, "Classes as polygons", kind, ["data"])
 
 
 def check_owner(export: Export) -> None:
@@ -184,9 +187,8 @@ def write_catalogue(export: Export) -> tuple[Path, Path]:
     for path in sorted(export.out.glob("*/*.json")):  # earlier exports, each in the folder of its own name
         if path.stem == path.parent.name and path.stem != export.run.id:
             try:
-                items.append(
-                    pystac.Item.from_dict(json.loads(path.read_bytes()), href=f"/{path.relative_to(export.out)}")
-                )
+                content = json.loads(path.read_bytes())
+                items.append(pystac.Item.from_dict(content, href=f"/{path.relative_to(export.out)}"))
             except (OSError, ValueError, KeyError, TypeError, pystac.STACError, pystac.STACTypeError) as error:
                 raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
     items.sort(key=lambda one: (str(one.datetime), one.id))

@@ -48,10 +48,10 @@ def part(name: str) -> str:
     return "\n".join(line for line in text.split("\n") if elsewhere not in line)
 
 
-def policy(names: tuple[str, ...]) -> str:
-    """Return the content security policy of a page: only these scripts run, and nothing is loaded."""
-    sources = [f"'sha256-{base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode()}'" for name in names]
-    allowed = " ".join(sources) or "'none'"
+def policy() -> str:
+    """Return the content security policy of a page: only the map's scripts run, and nothing is loaded."""
+    hashes = (base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode() for name in MAP_SCRIPTS)
+    allowed = " ".join(f"'sha256-{one}'" for one in hashes)
     return (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}; "
         "base-uri 'none'; form-action 'none'"
@@ -90,18 +90,14 @@ def _plain(value: object) -> object:
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
 
 
-def render_report(receipt: Receipt, quicklook: bytes, *, field: FieldMap | None = None) -> str:
-    """Return the report as HTML; the same receipt, picture and map give the same bytes.
-
-    ``field`` is the map with layers; without it the page has no script.
-    """
+def render_report(receipt: Receipt, quicklook: bytes, field: FieldMap) -> str:
+    """Return the report as HTML; the same receipt, picture and map give the same bytes."""
     scene = split_variable(receipt["settings"]["scene"])[0].name
     accuracy = shown_accuracy(receipt)
-    scripts = () if field is None else MAP_SCRIPTS
     page = _environment(markdown=False).get_template("report.html")
     text = page.render(
-        policy=policy(scripts),
-        scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in scripts),
+        policy=policy(),
+        scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in MAP_SCRIPTS),
         title=receipt["survey"],
         lead=headline(receipt),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",

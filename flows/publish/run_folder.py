@@ -62,7 +62,7 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         """Write the files of the run into a folder, and return facts for its manifest."""
         nonlocal receipt
         receipt = make_receipt(stores, plan, products, uri, started)
-        page = render_report(receipt, quicklook, field=field_map(shown, plan.field.prior))
+        page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
         (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
             (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]))

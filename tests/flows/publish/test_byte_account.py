@@ -10,17 +10,15 @@ import pytest
 
 from spectralzoom.flows.archive.commands import contents
 from spectralzoom.flows.publish.receipt_table import saving_rows
-from spectralzoom.flows.publish.report import render_report
 from spectralzoom.storage import store
 from spectralzoom.storage.store import Archive
 from tests.conftest import Survey
 from tests.flows.conftest import problems
-from tests.flows.publish.test_receipt import make_receipt, printed
+from tests.flows.publish.test_receipt import make_receipt, page_of, printed
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 ONE_SCAN: dict[str, Any] = {"budget": None, "scan_step": "2"}
-PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
 
 
 def walked(*folders: Path) -> int:
@@ -113,6 +111,6 @@ def test_terminal_and_page_show_bytes_against_the_reference() -> None:
         (make_receipt(), ("bytes kept", "1.5 MB", "38 %", "4 MB")),
         (tiny, ("656 kB", "384 B", "1 710 times")),  # a multiple, no percentage of six digits
     ):
-        page = render_report(receipt, PNG).replace("\u202f", " ")
+        page = page_of(receipt).replace("\u202f", " ")
         for text in (" ".join(printed(receipt, 80, verbose=True).replace("\u202f", " ").split()), page):
             assert [figure for figure in figures if figure not in text] == []
