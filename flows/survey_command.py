@@ -14,8 +14,9 @@ from rich.markup import escape
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.publish.publishing import RunRef
+from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.receipt_table import print_summary
-from spectralzoom.flows.publish.run_folder import Published, load_receipt
+from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.stage import inside_flow

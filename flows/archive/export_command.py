@@ -6,7 +6,7 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -21,21 +21,21 @@ from spectralzoom.flows.archive.export_layers import (
     NO_PRODUCTS,
     ExportedRun,
     Layer,
-    ProductChoice,
     ProductFlags,
-    choose_products,
     map_layers,
     open_exported,
+    parse_doses,
     prior_map_layers,
+    split_names,
 )
-from spectralzoom.flows.archive.export_polygons import check_doses, write_polygons
-from spectralzoom.flows.archive.export_values import spectral_layers, write_areas
+from spectralzoom.flows.archive.export_values import check_doses, spectral_layers, write_areas, write_polygons
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import print_json, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError
+from spectralzoom.pipeline.products.indices import find_index
 from spectralzoom.storage.export.image_files import write_cog
-from spectralzoom.storage.store import Archive, read_manifest
+from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import remove_leftovers, take_lock, to_json, write_whole
 
 COLLECTION = "collection.json"
@@ -64,30 +64,29 @@ def export(
     out
         Folder to export into; it may have other runs of the same archive.
     """
-    content = run_export(archive, run, out, stderr, choose_products(products))
+    content = run_export(archive, run, out, stderr, products)
     if as_json:
         print_json(content)
     return DONE
 
 
 def run_export(
-    archive: str | Path,
-    run: str | None,
-    out: Path,
-    console: Console,
-    choice: ProductChoice = choose_products(NO_PRODUCTS),  # noqa: B008 - a value
+    archive: str | Path, run: str | None, out: Path, console: Console, products: ProductFlags = NO_PRODUCTS
 ) -> dict[str, Any]:
     """Export a run (the latest if None) into ``out``, and print the files that were written.
 
     Returns run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path relative to
-    ``out``. Raises SettingsError: there is no such run, ``out`` lies in the archive, or the run lacks a product that
-    was asked for; WavelengthError: its cube lacks bands of an index; ArchiveError: ``out`` is another archive's or
-    cannot be written; IncompleteStoreError: a store is missing or damaged.
+    ``out``. Raises SettingsError: a flag is wrong, there is no such run, ``out`` lies in the archive, or the run lacks
+    a product that was asked for; WavelengthError: its cube lacks bands of an index; ArchiveError: ``out`` is another
+    archive's or cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
+    doses = parse_doses(products.dose)
+    indices = tuple(dict.fromkeys(map(find_index, split_names("indices", products.indices))))
     opened = open_exported(Archive.open(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)
-    check_doses(opened, choice)
-    layers = [*map_layers(opened), *prior_map_layers(opened), *spectral_layers(opened, choice)]
+    check_doses(opened, doses)
+    layers = [*map_layers(opened), *prior_map_layers(opened)]
+    layers += spectral_layers(opened, indices, reflectance=products.reflectance)
     export = Export(opened, out)
     try:
         with ExitStack() as stack:
@@ -96,24 +95,16 @@ def run_export(
             check_owner(export)
             for folder in (out, export.folder):
                 remove_leftovers(folder)
-            _export_images(export, layers, console)
-            areas = export.folder / "areas.csv"
-            write_areas(opened, areas)
-            export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
-            if choice.polygons:
-                with console.status("drawing polygons"):
-                    for key, path, kind in write_polygons(opened, export.folder, choice.doses):
-                        export.add(key, path, "Classes as polygons", kind, ["data"])
+            _write_images(export, layers, console)
+            _write_tables(export, doses, console, polygons=products.polygons or bool(doses))
             for name, (title, kind) in RUN_FILES.items():
-                if name in read_manifest(opened.folder)["files"]:
-                    export.add(Path(name).stem, opened.folder / name, title, kind, ["metadata"])
+                export.add(Path(name).stem, opened.folder / name, title, kind, ["metadata"])
             item, collection = write_catalogue(export)
     except PipelineError:  # some are OSErrors
         raise
-    except OSError as error:
-        raise ArchiveError(f"cannot export to {out}: {error.strerror}; choose another --out") from error
-    except UnicodeEncodeError as error:  # of GDAL
-        raise ArchiveError(f"cannot export to {out}: expected a name in UTF-8; choose another --out") from error
+    except (OSError, UnicodeEncodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "expected a name in UTF-8"  # by GDAL
+        raise ArchiveError(f"cannot export to {out}: {why}; choose another --out") from error
     placed = opened.geobox is not None
     if not placed:
         console.print("[dim]note: neither a rig pose nor the scene has a place on the earth; images have no CRS[/]")
@@ -149,7 +140,7 @@ class Export:
             self.files[key] = path.resolve().relative_to(self.out).as_posix()
 
 
-def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
+def _write_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
     for layer in layers:
         path = export.folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
@@ -157,6 +148,16 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         unit = {} if layer.unit is None else {"unit": layer.unit}
         bands = [{"name": name, "data_type": layer.image.dtype, **unit} for name in layer.image.bands]
         export.add(layer.name, path, layer.title, COG, layer.roles, bands=bands)
+
+
+def _write_tables(export: Export, doses: Mapping[str, float], console: Console, *, polygons: bool) -> None:
+    areas = export.folder / "areas.csv"
+    write_areas(export.run, areas)
+    export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
+    if polygons:
+        with console.status("drawing polygons"):
+            for key, path, kind in write_polygons(export.run, export.folder, doses):
+                export.add(key, path, "Classes as polygons", kind, ["data"])
 
 
 def check_owner(export: Export) -> None:
@@ -186,9 +187,8 @@ def write_catalogue(export: Export) -> tuple[Path, Path]:
     for path in sorted(export.out.glob("*/*.json")):  # earlier exports, each in the folder of its own name
         if path.stem == path.parent.name and path.stem != export.run.id:
             try:
-                items.append(
-                    pystac.Item.from_dict(json.loads(path.read_bytes()), href=f"/{path.relative_to(export.out)}")
-                )
+                content = json.loads(path.read_bytes())
+                items.append(pystac.Item.from_dict(content, href=f"/{path.relative_to(export.out)}"))
             except (OSError, ValueError, KeyError, TypeError, pystac.STACError, pystac.STACTypeError) as error:
                 raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
     items.sort(key=lambda one: (str(one.datetime), one.id))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.publish.receipt import Receipt, check_receipt
+from spectralzoom.flows.publish.receipt import Receipt, load_receipt
 from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import RIG
@@ -23,14 +23,13 @@ from spectralzoom.flows.stages.ground import colours_of
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out
-from spectralzoom.pipeline.products.indices import SpectralIndex, find_index
 from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
 from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import LATEST, Archive, Ref, damage, uri_of
+from spectralzoom.storage.store import LATEST, Archive, Ref, uri_of
 
 
 @Parameter(name="*")
@@ -56,23 +55,17 @@ class ProductFlags:
 NO_PRODUCTS = ProductFlags()
 
 
-@dataclass(frozen=True)
-class ProductChoice:
-    """The parsed flags. Doses are by class and empty without the flag; they make polygons."""
-
-    reflectance: bool
-    indices: tuple[SpectralIndex, ...]
-    polygons: bool
-    doses: Mapping[str, float]
+def split_names(flag: str, given: str | None) -> tuple[str, ...]:
+    """Return the parts of a flag's list (SettingsError: it has none)."""
+    if given is not None and not split_list(given):
+        raise SettingsError(f"--{flag} {given!r} names nothing; give names with commas, or leave it out")
+    return split_list(given)
 
 
-def choose_products(flags: ProductFlags) -> ProductChoice:
-    """Parse the flags (SettingsError: a number or an index is wrong)."""
-    for name in ("dose", "indices"):
-        if (given := getattr(flags, name)) is not None and not split_list(given):
-            raise SettingsError(f"--{name} {given!r} names nothing; give names with commas, or leave it out")
-    doses = {}
-    for part in split_list(flags.dose):
+def parse_doses(given: str | None) -> dict[str, float]:
+    """Return the doses of a flag by class (SettingsError: one is no number, or a class is named twice)."""
+    doses: dict[str, float] = {}
+    for part in split_names("dose", given):
         name, _, number = part.rpartition("=")
         if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
             raise SettingsError(
@@ -82,13 +75,11 @@ def choose_products(flags: ProductFlags) -> ProductChoice:
         if name.strip() in doses:
             raise SettingsError(f"--dose names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)
-    indices = tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices)))
-    return ProductChoice(flags.reflectance, indices, flags.polygons or bool(doses), doses)
+    return doses
 
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
-RGB = ("red", "green", "blue")
-PROBABILITIES = "class_probabilities"
+CLASS, RGB = ("class",), ("red", "green", "blue")  # names of bands
 
 
 @dataclass(frozen=True)
@@ -157,14 +148,10 @@ def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     Raises NoRunError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
     """
     folder = archive.run_folder(name or LATEST)
-    run = read_run(folder)
-    if run.problem is not None:
-        raise damage(folder, run.problem)
     try:
-        receipt = check_receipt(run.receipt)
+        return ExportedRun(archive, folder, load_receipt(folder))
     except ShapeError as error:
         raise IncompleteStoreError(f"{folder / RECEIPT} is no survey's: {error}; export another run") from error
-    return ExportedRun(archive, folder, receipt)
 
 
 @dataclass(frozen=True)
@@ -185,7 +172,7 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     legend = legend_of(open_group(run.path(product)))
     roles = ("data", "confidence")
     return [
-        image_layer(run, product, "classes", "class_map", "Class map", nodata=UNLABELLED, legend=legend, band="class"),
+        image_layer(run, product, "classes", "class_map", "Class map", bands=CLASS, nodata=UNLABELLED, legend=legend),
         image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),
         _gain_layer(run),
         _picture(run),
@@ -203,14 +190,12 @@ def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]
     }
 
 
-def geobox_of(run: ExportedRun, stored: StoredImage) -> GeoBox:
+def geobox_of(stored: StoredImage) -> GeoBox:
     """Return the grid of a store's images; in angles without a CRS."""
     if stored.geobox is not None:
         return stored.geobox
-    transform = stored.about.get("spatial:transform")
-    if transform is None:
-        raise IncompleteStoreError(f"the {stored.name} of run {run.id} do not say where they lie; verify the archive")
-    return GeoBox((stored.shape[0], stored.shape[1]), Affine(*map(float, transform)), None)
+    y, x = stored.shape[:2]
+    return GeoBox((y, x), Affine(*map(float, stored.about["spatial:transform"])), None)
 
 
 def image_layer(
@@ -221,15 +206,15 @@ def image_layer(
     title: str,
     *,
     roles: tuple[str, ...] = ("data",),
-    band: str | None = None,
+    bands: tuple[str, ...] | None = None,
     nodata: float = np.nan,
     unit: str | None = None,
     legend: ClassNames | None = None,
 ) -> Layer:
     """Return an image of a store on the store's own grid."""
     stored = open_image(run.path(product), array)
-    geobox = geobox_of(run, stored)
-    image = CogImage(geobox, stored.dtype.name, (band or array,), nodata, legend, layer_tags(run, product, geobox))
+    geobox = geobox_of(stored)
+    image = CogImage(geobox, stored.dtype.name, bands or (array,), nodata, legend, layer_tags(run, product, geobox))
     return Layer(name, title, roles, image, stored.rows, unit)
 
 
@@ -240,8 +225,7 @@ def _gain_layer(run: ExportedRun) -> Layer:
     assert class_map is not None
     patch = int(run.archive.manifest(class_map)["params"]["gains"]["frame"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
-    if scene is None:
-        raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
+    assert scene is not None
     shape = (stored.shape[0], stored.shape[1])
     fine = load_geobox(run.path("class_map"))
     geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
@@ -256,9 +240,8 @@ def _picture(run: ExportedRun) -> Layer:
     title = "Picture of the coarse pass"
     roles = ("visual", "overview")
     if run.map_product == "ground_map":
-        drawn = image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, nodata=0)
-        return replace(drawn, image=replace(drawn.image, bands=RGB))
-    geobox = geobox_of(run, open_image(run.path("mosaic"), "coverage"))
+        return image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, bands=RGB, nodata=0)
+    geobox = geobox_of(open_image(run.path("mosaic"), "coverage"))
     ref = run.store("mosaic")
     assert ref is not None
 
@@ -270,9 +253,9 @@ def _picture(run: ExportedRun) -> Layer:
 
 def prior_map_layers(run: ExportedRun) -> list[Layer]:
     """Return what a prior map adds: the previous classes of changed pixels."""
-    product = "ground_map" if run.map_product == "ground_map" else PROBABILITIES
+    product = "ground_map" if run.map_product == "ground_map" else "class_probabilities"
     if run.store(product) is None or OLD_CLASS not in (group := open_group(run.path(product))):
         return []
     title = "Class of the prior map, where the map is sure of another one"
     legend = legend_of(group)
-    return [image_layer(run, product, OLD_CLASS, OLD_CLASS, title, nodata=UNLABELLED, legend=legend, band="class")]
+    return [image_layer(run, product, OLD_CLASS, OLD_CLASS, title, bands=CLASS, nodata=UNLABELLED, legend=legend)]

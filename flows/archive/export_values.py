@@ -1,68 +1,75 @@
-"""Export values of a run: the table of its classes' areas, and layers of the mosaic's bands and indices."""
+"""Export products on request: the table of areas, polygons of the classes, and layers of bands and indices."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import shapely
+from affine import Affine
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.archive.export_layers import ExportedRun, Layer, ProductChoice, Rows, geobox_of, layer_tags
+from spectralzoom.flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, layer_tags
 from spectralzoom.models.evaluation.metrics import stratified_fractions
-from spectralzoom.pipeline.errors import SettingsError
-from spectralzoom.pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
+from spectralzoom.pipeline.errors import ArchiveError, SettingsError
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
+from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE
+from spectralzoom.pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at
 from spectralzoom.pipeline.ground.view import GroundView, RigPose
 from spectralzoom.pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
+from spectralzoom.storage.arrays.class_maps import legend_of
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import open_image
-from spectralzoom.storage.arrays.layout import open_group, read_bands
+from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
 from spectralzoom.storage.export.image_files import CogImage
-from spectralzoom.storage.whole_files import write_whole
+from spectralzoom.storage.whole_files import write_whole, written_aside
 
-COLUMNS = (
-    *("class", "pixels", "hectares", "fraction", "mean_confidence"),
-    *("estimated_fraction", "standard_error"),  # by the labels
-)
-DIGITS = 6
 BYTES_AT_ONCE = 1 << 27
 COLUMNS_AT_ONCE = 640
 SAMPLED = 4  # step in pixels for finding the white level
+GEOPACKAGE, SHAPEFILE = "application/geopackage+sqlite3", "application/vnd.shp"
+PARTS = (".shp", ".shx", ".dbf", ".cpg", ".prj")  # of a shapefile
+EQUAL_AREA = 6933  # EPSG code of a CRS in which areas are true all over the earth
 
 
 def write_areas(run: ExportedRun, path: Path) -> None:
-    """Write the table with a row for each class; unknown values are empty."""
-    path_of_map = run.path(run.map_product)
-    names = tuple(open_image(path_of_map, "classes").about["class_names"])
-    counts, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
-    for (_, classes), (_, sure) in zip(
-        open_image(path_of_map, "classes").rows(), open_image(path_of_map, "confidence").rows(), strict=True
-    ):
-        counts += np.bincount(classes.ravel(), minlength=256)
+    """Write the table with a row for each class; unknown values are empty.
+
+    ``estimated_fraction`` and ``standard_error`` follow from the labels.
+    """
+    import pandas as pd
+
+    classes, confidence = (open_image(run.path(run.map_product), name) for name in ("classes", "confidence"))
+    names = tuple(classes.about["class_names"])
+    counts, sure_pixels, sums = np.zeros((3, 256))
+    for (_, drawn), (_, sure) in zip(classes.rows(), confidence.rows(), strict=True):
         known = np.isfinite(sure)
-        sums += np.bincount(classes[known], sure[known], 256)
-        sure_pixels += np.bincount(classes[known], minlength=256)
-    confidence = np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)
-    pixels = counts[: len(names)]
-    areas = (run.receipt.get("areas") or {}).get("ha")
-    hectares = None if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
-    fraction = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
+        counts += np.bincount(drawn.ravel(), minlength=256)
+        sure_pixels += np.bincount(drawn[known], minlength=256)
+        sums += np.bincount(drawn[known], sure[known], 256)
+    pixels = counts[: len(names)].astype(int)
     unknown = np.full(len(names), np.nan)
-    own = unknown if hectares is None else hectares
+    areas = (run.receipt.get("areas") or {}).get("ha")
+    hectares = unknown if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
+    measured = pixels if areas is None else hectares
+    fraction = measured / (measured.sum() or 1)
     confusion = run.receipt.get("accuracy", {}).get("confusion")
-    estimate = (unknown, unknown) if confusion is None else stratified_fractions(fraction, confusion)
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(COLUMNS)
-    for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
-        figures = [column[number] for column in (own, fraction, confidence, *estimate)]
-        table.writerow([name, count, *(f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in figures)])
-    write_whole(path, text.getvalue())
+    estimate, error = (unknown, unknown) if confusion is None else stratified_fractions(fraction, confusion)
+    columns = {
+        "class": names,
+        "pixels": pixels,
+        "hectares": hectares,
+        "fraction": fraction,
+        "mean_confidence": np.divide(sums, sure_pixels, np.full(256, np.nan), where=sure_pixels > 0)[: len(names)],
+        "estimated_fraction": estimate,
+        "standard_error": error,
+    }
+    write_whole(path, pd.DataFrame(columns).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,7 @@ class MosaicView:
         """Return the image's grid, in angles without a CRS."""
         if self.ground is not None:
             return self.ground.geobox
-        return geobox_of(self.run, open_image(self.run.path("mosaic"), "coverage"))
+        return geobox_of(open_image(self.run.path("mosaic"), "coverage"))
 
     @cached_property
     def ground(self) -> GroundGrid | None:
@@ -99,79 +106,129 @@ class MosaicView:
     def rows(self, bands: Sequence[int]) -> Rows:
         """Yield the first row and the values (row, x, band) of some bands, from the top down."""
         if self.ground is None:
-            first = 0
-            for block in self.mosaic.row_blocks():
-                yield first, self.mosaic.spectra(block, bands)
-                first += len(block)
+            for rows in cuts(self.mosaic.shape[0], SHARD_ROWS):
+                yield rows.start, self.mosaic.spectra(self.mosaic.scores(rows), bands)
             return
         height, width = self.ground.shape
-        at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * width), 1, 256))
-        for first in range(0, height, at_once):
-            last = min(first + at_once, height)
-            out = np.full((last - first, width, len(bands)), np.nan, np.float32)
-            for _, columns in map_blocks((last - first, width), (last - first, COLUMNS_AT_ONCE)):
-                pixels = self.ground.scene_pixels(slice(first, last), columns)
+        for rows in cuts(height, int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * width), 1, 256))):
+            out = np.full((rows.stop - rows.start, width, len(bands)), np.nan, np.float32)
+            for columns in cuts(width, COLUMNS_AT_ONCE):
+                pixels = self.ground.scene_pixels(rows, columns)
                 known = pixels[np.isfinite(pixels).all(axis=-1)]
-                if not len(known):
-                    continue
-                low = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, self.mosaic.shape)
-                high = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, self.mosaic.shape)
-                window = self.mosaic.values(slice(low[0], high[0]), slice(low[1], high[1]), bands)  # around the pixels
-                out[:, columns] = image_at(np.ascontiguousarray(window), pixels - low)
-            yield first, out
+                if len(known):
+                    low = np.clip(np.floor(known.min(axis=0)).astype(int) - 2, 0, self.mosaic.shape)
+                    high = np.clip(np.ceil(known.max(axis=0)).astype(int) + 2, 0, self.mosaic.shape)
+                    around = slice(low[0], high[0]), slice(low[1], high[1])
+                    window = np.ascontiguousarray(self.mosaic.values(*around, bands))
+                    out[:, columns] = image_at(window, pixels - low)
+            yield rows.start, out
 
 
-def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
+def spectral_layers(run: ExportedRun, indices: Sequence[SpectralIndex], *, reflectance: bool) -> list[Layer]:
     """Return the reflectance and indices to export.
 
     Raises WavelengthError: the cube lacks bands of an index; SettingsError: an index needs reflectance, and the cube
     has other values.
     """
-    if not (choice.reflectance or choice.indices):
+    if not (reflectance or indices):
         return []
     view = MosaicView(run)
-    picked = [pick_bands(index, view.mosaic.wavelength_nm) for index in choice.indices]
+    picked = [pick_bands(index, view.mosaic.wavelength_nm) for index in indices]
     white = white_level(view.mosaic.thinned(SAMPLED, range(len(view.mosaic.wavelength_nm))).reshape(-1))
-    for index in choice.indices:
+    for index in indices:
         if index.wants_reflectance and white != 1.0:
             raise SettingsError(
                 f"{index.name} wants reflectance (0 to 1), and the values of run {run.id} reach {white:.3g}; choose "
                 "an index of ratios, such as NDVI or PRI, or write the factor to reflectance into the scene.toml "
                 "beside the scene (scale = 0.0001 if 10000 is white) and survey it again"
             )
-    layers = [_reflectance(view, white)] if choice.reflectance else []
-    return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
+    layers = [_reflectance(view, white)] if reflectance else []
+    return layers + [_index(view, index, bands, white) for index, bands in zip(indices, picked, strict=True)]
 
 
 def _reflectance(view: MosaicView, white: float) -> Layer:
-    wave, width = read_bands(open_group(view.run.path("mosaic")))
+    wave, width = view.mosaic.wavelength_nm.tolist(), view.mosaic.fwhm_nm
+    values = "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
     image = CogImage(
         view.geobox,
         "float32",
-        tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
+        tuple(f"{centre:.1f} nm" for centre in wave),
         np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": _format_value(white)},
-        wavelength_nm=wave.tolist(),
+        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": values},
+        wavelength_nm=wave,
         fwhm_nm=None if width is None else width.tolist(),
     )
-    title = f"{len(wave)} bands: {_format_value(white)}"
-    return Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(range(len(wave))), "1")
-
-
-def _format_value(white: float) -> str:
-    return "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
+    title, roles = f"{len(wave)} bands: {values}", ("data", "reflectance")
+    return Layer("reflectance", title, roles, image, lambda: view.rows(range(len(wave))), "1")
 
 
 def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
-    wave = read_bands(open_group(view.run.path("mosaic")))[0][list(bands)].tolist()
+    wave = view.mosaic.wavelength_nm[list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
-    tags = {"index": index.name, "bands": taken, "reference": index.reference}
-    image = CogImage(
-        view.geobox, "float32", (index.name,), np.nan, tags=layer_tags(view.run, "mosaic", view.geobox) | tags
-    )
+    tags = layer_tags(view.run, "mosaic", view.geobox)
+    tags |= {"index": index.name, "bands": taken, "reference": index.reference}
+    image = CogImage(view.geobox, "float32", (index.name,), np.nan, tags=tags)
 
     def rows() -> Rows:
         for first, values in view.rows(bands):
             yield first, index_values(index, values, wave, white=white)
 
     return Layer(index.name, f"{index.title} of {taken}", ("data",), image, rows, "1")
+
+
+def check_doses(run: ExportedRun, doses: Mapping[str, float]) -> None:
+    """Refuse doses of classes that the run lacks (SettingsError)."""
+    names = open_image(run.path(run.map_product), "classes").about["class_names"]
+    if unknown := sorted(set(doses) - set(names)):
+        raise SettingsError(f"--dose: the run has no class {unknown[0]!r}; its classes are {', '.join(names)}")
+
+
+def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -> list[tuple[str, Path, str]]:
+    """Write a polygon for each region of a class; return key, path and media type of both files.
+
+    Outlines follow the sides of pixels. Columns are class, name and colour, with a place on the earth also hectares,
+    and with ``doses`` also dose, 0 for other classes. Raises ArchiveError: GDAL or the disk refuses.
+    """
+    import geopandas
+    import pyogrio
+    import rasterio.features as rasterio_features
+
+    stored = open_image(run.path(run.map_product), "classes")
+    classes = np.concatenate([rows for _, rows in stored.rows()])
+    legend = legend_of(stored.group)
+    place = Affine(*stored.about["spatial:transform"])
+    found = list(rasterio_features.shapes(classes, mask=classes != UNLABELLED, transform=place))
+    numbers = [int(number) for _, number in found]
+    names = [legend.names[number] for number in numbers]
+    columns = {
+        "class": numbers,
+        "name": names,
+        "colour": [f"#{bytes(legend.colours[number].tolist()).hex()}" for number in numbers],
+    }
+    crs = None if run.geobox is None else str(run.geobox.crs)
+    outlines = [shapely.geometry.shape(outline) for outline, _ in found]
+    frame = geopandas.GeoDataFrame(columns, geometry=outlines, crs=crs)
+    if crs is not None:
+        frame["hectares"] = frame.to_crs(EQUAL_AREA).area / M2_PER_HECTARE
+    if doses:
+        frame["dose"] = [doses.get(name, 0.0) for name in names]
+    package, shapefile = folder / "classes.gpkg", folder / "classes.shp"
+    parts = [f"classes{ending}" for ending in (PARTS if crs is not None else PARTS[:-1])]
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": run.receipt["finished"]})  # the same polygons, the same bytes
+    try:
+        with written_aside(folder, [package.name, *parts]) as aside, warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
+            frame.to_file(aside / package.name, layer="classes", driver="GPKG", engine="pyogrio")
+            date = run.receipt["finished"][:10]
+            frame.to_file(
+                aside / shapefile.name,
+                driver="ESRI Shapefile",
+                engine="pyogrio",
+                encoding="utf-8",
+                DBF_DATE_LAST_UPDATE=date,
+            )
+    except pyogrio.errors.DataSourceError as error:
+        raise ArchiveError(f"{package} cannot be written: {error}; is there space on the disk?") from error
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
+    return [("polygons", package, GEOPACKAGE), ("polygons_shapefile", shapefile, SHAPEFILE)]

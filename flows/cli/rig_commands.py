@@ -6,7 +6,8 @@ nothing is set. The shipped drivers are asked for more: identity, status, files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from rich.table import Table
 from spectralzoom.flows.settings.flags import AsJson, Switch
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
-from spectralzoom.flows.terminal.progress import on_stdout, print_json, stderr
+from spectralzoom.flows.terminal.progress import put_out, stderr
 from spectralzoom.pipeline.errors import PipelineError, RigError
 from spectralzoom.pipeline.rig.camera.camera_files import log_in
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
@@ -67,41 +68,35 @@ def check_mirror(connect: Callable[[], MirrorDriver], *, move: bool = False) -> 
         mirror = connect()
     except RigError as error:
         return [failed("mirror", CONNECT, error)]
-    try:
+    with closing(mirror):
         if isinstance(mirror, MirrorController):
-            rows = [CheckRow("mirror", CONNECT, mirror.identity)]
-            _row(rows, "mirror", "status", lambda: _status(mirror))
+            rows = [CheckRow("mirror", CONNECT, mirror.identity), _ask("mirror", "status", partial(_status, mirror))]
         else:
             rows = [CheckRow("mirror", CONNECT, f"{type(mirror).__name__} is there")]
         if move and works(rows, "mirror"):
-            _move(mirror, rows)
+            rows += _move(mirror)
         elif move:
             rows.append(CheckRow("mirror", "move", "nothing was moved", "warn", "mend what is named above first"))
-    finally:
-        mirror.close()
     return rows
 
 
 def check_camera(connect: Callable[[], CameraDriver]) -> list[CheckRow]:
     """Ask a camera whether it captures, and the shipped one for its files. Errors become rows."""
-    rows: list[CheckRow] = []
+    row = CheckRow("camera", "whether it captures", "no capture runs")
     try:
         camera = connect()
     except RigError as error:
         return [failed("camera", CONNECT, error)]
-    try:
-        if camera.is_capturing():
-            mend = "is another program at work? Else stop it"
-            rows.append(CheckRow("camera", "whether it captures", "a capture runs", "warn", mend))
-        else:
-            rows.append(CheckRow("camera", "whether it captures", "no capture runs"))
-    except RigError as error:
-        rows.append(failed("camera", CONNECT, error))
-    finally:
-        camera.close()
-    if isinstance(camera, HeadwallCamera):
-        _row(rows, "camera", f"log in to its files, port {camera.server.port}", partial(log_in, camera.server))
-    return rows
+    with closing(camera):
+        try:
+            if camera.is_capturing():
+                mend = "is another program at work? Else stop it"
+                row = replace(row, came="a capture runs", verdict="warn", mend=mend)
+        except RigError as error:
+            row = failed("camera", CONNECT, error)
+    if not isinstance(camera, HeadwallCamera):
+        return [row]
+    return [row, _ask("camera", f"log in to its files, port {camera.server.port}", partial(log_in, camera.server))]
 
 
 def _status(mirror: MirrorController) -> str:
@@ -113,24 +108,26 @@ def _status(mirror: MirrorController) -> str:
     return status.sentence
 
 
-def _move(mirror: MirrorDriver, rows: list[CheckRow]) -> None:
+def _move(mirror: MirrorDriver) -> Iterator[CheckRow]:
     """Send the mirror to the corners of a square and back to the middle; stop at the first error."""
+
+    def go(x: float, y: float) -> str:
+        mirror.goto(x, y)
+        mirror.settle(SETTLE_S)
+        return "at rest"
+
     for x, y in (*SQUARE, (0.0, 0.0)):
-        asked = f"go to {x:g}; {y:g}"
-        try:
-            mirror.goto(x, y)
-            mirror.settle(SETTLE_S)
-        except RigError as error:
-            rows.append(failed("mirror", asked, error))
+        yield (row := _ask("mirror", f"go to {x:g}; {y:g}", partial(go, x, y)))
+        if row.verdict == "fail":
             return
-        rows.append(CheckRow("mirror", asked, "at rest"))
 
 
-def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str]) -> None:
+def _ask(device: Device, asked: str, question: Callable[[], str]) -> CheckRow:
+    """Return the row of a question to a device."""
     try:
-        rows.append(CheckRow(device, asked, ask()))
+        return CheckRow(device, asked, question())
     except RigError as error:
-        rows.append(failed(device, asked, error))
+        return failed(device, asked, error)
 
 
 def check(
@@ -168,34 +165,30 @@ def check(
     if camera_asked:
         with stderr.status(f"asking the camera at {escape(rig.host)}"):
             rows += check_camera(partial(open_camera_driver, rig))
-    asked: dict[Device, bool] = {"mirror": mirror_asked, "camera": camera_asked}
-    good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
+    good = [works(rows, device) for device in dict.fromkeys(row.device for row in rows)]
     code = DONE if all(good) else PARTLY if any(good) else FAILED
-    if not as_json:
-        _print(rows, on_stdout())
-        return code
-    print_json(
-        {
-            "port": rig.port if mirror_asked else None,
-            "camera": rig.host if camera_asked else None,
-            "move": move,
-            "rows": [asdict(row) for row in rows],
-            "failed": sum(row.verdict == "fail" for row in rows),
-            "warned": sum(row.verdict == "warn" for row in rows),
-            "exit_code": code,
-        }
-    )
+    verdicts = [row.verdict for row in rows]
+    content = {
+        "port": rig.port if mirror_asked else None,
+        "camera": rig.host if camera_asked else None,
+        "move": move,
+        "rows": [asdict(row) for row in rows],
+        "failed": verdicts.count("fail"),
+        "warned": verdicts.count("warn"),
+        "exit_code": code,
+    }
+    put_out(content, lambda _, console: _print(rows, console), as_json=as_json)
     return code
 
 
 def _print(rows: Sequence[CheckRow], console: Console) -> None:
     table = Table("device", "asked", "came", "", box=SIMPLE_HEAD)
+    shown = {verdict: f"[{colour}]{verdict}[/]" for verdict, colour in _COLOURS.items()}
     for row in rows:
-        table.add_row(row.device, escape(row.asked), escape(row.came), f"[{_COLOURS[row.verdict]}]{row.verdict}[/]")
+        table.add_row(row.device, escape(row.asked), escape(row.came), shown[row.verdict])
     console.print(table)
     mend = [row for row in rows if row.mend]
     for row in mend:
-        say = f"[{_COLOURS[row.verdict]}]{row.verdict}[/] {row.device}, {escape(row.asked)}: {escape(row.mend)}"
-        console.print(say, soft_wrap=True)
+        console.print(f"{shown[row.verdict]} {row.device}, {escape(row.asked)}: {escape(row.mend)}", soft_wrap=True)
     if not mend:
         console.print("nothing to mend")

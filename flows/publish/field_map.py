@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from spectralzoom.flows.publish.panels import UNLABELLED_COLOUR, data_address, thinned, webp
-from spectralzoom.flows.publish.quicklook import QuicklookData
+from spectralzoom.flows.publish.quicklook import QuicklookData, data_address, palette_of, thinned, webp
 from spectralzoom.flows.publish.receipt_table import format_days
 from spectralzoom.flows.tasks.prior_maps import Prior
 from spectralzoom.flows.terminal.figures import format_percent, spaced
+from spectralzoom.pipeline.errors import visible
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import class_counts
 from spectralzoom.storage.arrays.layout import open_group, read_array
@@ -24,8 +24,7 @@ QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent
 DIFFERS_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
 NO_CLASS = "no class, of the field:"  # other fractions of the legend are of the pixels that have one
-ERROR_COLOURS = {"right": "#c9d3c4", "wrong": "#c4262e"}  # of labelled pixels
-Bytes = NDArray[np.uint8]
+RIGHT_RGB, WRONG_RGB = (201, 211, 196), (196, 38, 46)  # of labelled pixels
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,13 @@ class FieldMap:
     @property
     def data(self) -> dict[str, Any]:
         """Return the data for the page's script."""
-        return {"size": list(self.size), "layers": [asdict(layer) for layer in self.layers]}
+        return {
+            "size": list(self.size),
+            "layers": [{**asdict(layer), "title": visible(layer.title)} for layer in self.layers],
+        }
 
 
-def prior_classes(prior: Prior) -> Bytes:
+def prior_classes(prior: Prior) -> NDArray[np.uint8]:
     """Return the (y, x) class map of an earlier run by the class numbers of this run; 255 for other classes."""
     earlier = np.array(prior.classes)
     names = np.full(256, UNLABELLED, np.uint8)
@@ -64,11 +66,10 @@ def prior_classes(prior: Prior) -> Bytes:
 def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
     """Return the map of a run from the data of its quicklook and the prior map."""
     thin = thinned(shown.class_map)
-    palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
-    palette[: len(shown.class_colours)] = shown.class_colours
+    palette = palette_of(shown.class_colours)
 
     def classes(image: NDArray[np.integer]) -> str:
-        return layer_address(image[thin].astype(np.uint8), palette)
+        return layer_address(image[thin], palette)
 
     picture = Image.fromarray(np.rint(255 * develop(shown.rectified, shown.caption)).astype(np.uint8))
     layers = [MapLayer(shown.caption.capitalize(), data_address(webp(picture, quality=QUALITY)), shown=True)]
@@ -81,12 +82,10 @@ def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
     if prior is not None:
         layers.append(MapLayer(f"Before: {format_days(prior.days)}", classes(prior_classes(prior))))
     if shown.was is not None:
-        differs = (shown.was[thin] != UNLABELLED).astype(np.uint8)
-        table = np.array([(0, 0, 0, 0), (*DIFFERS_RGB, 255)], np.uint8)
-        layers.append(MapLayer("Captured and differing", layer_address(differs, table), opacity=0.8))
+        differs = over_address(shown.was[thin] != UNLABELLED, DIFFERS_RGB)
+        layers.append(MapLayer("Captured and differing", differs, opacity=0.8))
     if shown.chosen is not None:
-        table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
-        layers.append(MapLayer(shown.choice, layer_address(shown.chosen.astype(np.uint8), table), opacity=0.6))
+        layers.append(MapLayer(shown.choice, over_address(shown.chosen, PATCH_RGB), opacity=0.6))
     counts = class_counts(shown.class_map, len(shown.class_names))
     covered = np.append(counts / max(counts.sum(), 1), 1 - counts.sum() / max(shown.class_map.size, 1))
     rows = [
@@ -98,23 +97,20 @@ def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
 
 
 def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -> str:
-    """Return the data address of a picture of where (y, x) classes differ from labels, by `ERROR_COLOURS`.
-
-    Pixels without class or label are transparent.
-    """
-    from matplotlib.colors import to_rgba
-
+    """Return a picture of where (y, x) classes differ from labels; pixels without class or label are transparent."""
     judged = (class_map != UNLABELLED) & (labels != UNLABELLED)
-    colours = [(0, 0, 0, 0), *(np.rint(255 * np.array(to_rgba(one))) for one in ERROR_COLOURS.values())]
-    return layer_address(np.where(judged, 1 + (class_map != labels), 0).astype(np.uint8), np.array(colours, np.uint8))
+    return over_address(np.where(judged, 1 + (class_map != labels), 0), RIGHT_RGB, WRONG_RGB)
 
 
-def layer_address(numbers: Bytes, colours: Bytes) -> str:
+def over_address(numbers: NDArray[np.generic], *colours: tuple[int, int, int]) -> str:
+    """Return a picture of (y, x) numbers to lay over another: 0 is transparent, the others have these colours."""
+    return layer_address(numbers.astype(np.uint8), [(0, 0, 0, 0), *((*colour, 255) for colour in colours)])
+
+
+def layer_address(numbers: NDArray[np.integer], colours: ArrayLike) -> str:
     """Return the data address of a picture of (y, x) numbers, each in its row of ``colours`` (number, 3 or 4)."""
-    table = np.zeros((256, 4), np.uint8)
-    table[:, 3] = 255
-    table[: len(colours), : colours.shape[1]] = colours
-    return data_address(webp(Image.fromarray(table[numbers]), lossless=True, quality=0))
+    table = np.asarray(colours, np.uint8)
+    return data_address(webp(Image.fromarray(table[numbers]).convert("RGBA"), lossless=True, quality=0))
 
 
 def _ramp_address(values: NDArray[np.floating]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -12,24 +10,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.products import Products
 from spectralzoom.flows.publish.receipt_table import FOREIGN
-from spectralzoom.flows.settings.values import EXTENT_WHOLE
+from spectralzoom.flows.stages.condense import SIGNAL_RECORD
+from spectralzoom.flows.stages.ground import STORE
+from spectralzoom.flows.stages.register import load_registration
+from spectralzoom.flows.stages.score import load_plan, read_in_full
 from spectralzoom.flows.stages.segment import SPECTRA
+from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
 from spectralzoom.flows.tasks.scores import MOST_ERROR
 from spectralzoom.flows.terminal.figures import format_points
 from spectralzoom.models.evaluation.expected_scores import expected_counts
-from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts, patch_pixels
 from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
 from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
 from spectralzoom.pipeline.ground.zones import figures_of_plot
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
-from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts
-from spectralzoom.storage.arrays.ground_maps import GroundMap
+from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts, load_class_map
+from spectralzoom.storage.arrays.ground_maps import GroundMap, load_ground_map
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
+from spectralzoom.storage.arrays.mosaics import open_mosaic
 from spectralzoom.storage.store import Ref, read_table
 
 PLOTS_FILE = "plots.csv"
 STRIP_PX = 2**20  # of class probabilities read at a time: 1 to 4 shards high
+
+
+def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
+    """Return the findings of a run by their names in the receipt; those that do not apply are empty."""
+    field, fine = plan.field, load_plan(products.attention)
+    drawn = load_class_map(products.class_map.path / "class_map.zarr")
+    posed = None if products.ground is None else load_ground_map(products.ground.path / STORE)
+    prior, kept = None, None
+    if field.prior is not None:
+        prior = {"run": field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
+    if plan.chooses and (plan.passes.plain or plan.least_gain is not None):
+        kept = plan.reading_figures(read_in_full(products.attention, products.class_map))
+    return {
+        "field": field_figures(plan, fine),
+        "plan": {"kind": fine.kind, "reason": fine.reason, "lines": fine.lines, "seconds": fine.seconds},
+        "recording": _recording(plan, fine),
+        "kept": kept,
+        "prior_map": prior,
+        "extent": _extent(plan, fine) if plan.part else None,
+        "pointing": _pointing(plan, products, fine),
+        "areas": _areas(plan, posed, drawn),
+        "ground": _ground(plan, products, posed, drawn, {} if prior is None else prior),
+        **_zones(plan, drawn),
+        **_map(plan, products.class_map, drawn),
+        **({} if field.raster is not None else _lines(products.mosaic)),
+    }
 
 
 def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
@@ -38,71 +68,114 @@ def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
     Without a planned fine pass, ``fine``, its seconds are those that the budget leaves. Hectares are those within the
     zones, and hectares per hour refer to all capture time. A raster has neither capture time nor lines.
     """
-    scale = plan.field.zones.place.scale(plan.field.camera.ifov_rad)
-    fine_s = plan.passes.fine_s if fine is None else fine.seconds
-    seconds = plan.passes.coarse_s + fine_s
-    kept = scale
-    if plan.field.zones.kept is not None and scale.area_m2 is not None:
-        kept = replace(scale, area_m2=_ground_m2(plan, plan.field.zones.kept))  # the area within the zones
+    zones, passes = plan.field.zones, plan.passes
+    scale = kept = zones.place.scale(plan.field.camera.ifov_rad)
+    if zones.kept is not None and scale.area_m2 is not None:
+        kept = replace(scale, area_m2=_ground_m2(plan, zones.kept))  # the area within the zones
     footprint = scale.footprint
     captured = plan.field.raster is None
-    camera_s = {"coarse": plan.passes.coarse_s, "fine": fine_s, "all": seconds, "full_scan": plan.passes.full_s}
-    lines = {
-        "coarse": sum(sweep.lines for sweep in plan.passes.coarse),
-        "fine": None if fine is None else fine.lines,
-        "full_scan": sum(sweep.lines for sweep in plan.passes.full),
-    }
+    fine_s = passes.fine_s if fine is None else fine.seconds
+    seconds = passes.coarse_s + fine_s
+    camera_s = {"coarse": passes.coarse_s, "fine": fine_s, "all": seconds, "full_scan": passes.full_s}
+    coarse, full = (sum(sweep.lines for sweep in sweeps) for sweeps in (passes.coarse, passes.full))
+    lines = {"coarse": coarse, "fine": None if fine is None else fine.lines, "full_scan": full}
+    ranges = None if footprint is None else zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)
     return {
         "size_px": [scale.shape[1], scale.shape[0]],
         "view_deg": [scale.view_deg[1], scale.view_deg[0]] if captured or footprint is not None else None,
         "ground_pixel_m": scale.pixel_m,
-        "range_m": None
-        if footprint is None
-        else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
+        "range_m": None if ranges is None else dict(ranges),
         "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
         "hectares": kept.hectares,
-        "kept_fraction": None if plan.field.zones.kept is None else float(plan.field.zones.kept.mean()),
+        "kept_fraction": None if zones.kept is None else float(zones.kept.mean()),
         "camera_s": camera_s if captured else None,
-        "fine_planned": fine is not None or plan.passes.plain,
+        "fine_planned": fine is not None or passes.plain,
         "lines": lines if captured else None,
         "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not plan.part else None,
     }
 
 
-def find_areas(plan: SurveyPlan, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
-    """Return ``areas``: pixels of each class, and hectares where the size of a pixel is known.
+def _recording(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any] | None:
+    """Return the lines read and recorded, and the seconds of a camera; None without a recording."""
+    if (recorded := plan.field.recorded) is None:
+        return None
+    return {
+        "sweeps": str(plan.settings.sweeps),
+        "lines_read": recorded.lines_served([*plan.passes.coarse, *fine.sweeps]),
+        "lines_recorded": sum(int(one.valid_line.sum()) for one in recorded.source.sweeps),
+        "passes_s": plan.passes.coarse_s + fine.seconds,
+        "full_scan_s": plan.settings.cost.seconds(plan.passes.full, plan.field.camera),
+    }
 
-    With a pose, hectares are those of the map on the ground.
-    """
+
+def _extent(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any]:
+    return {
+        "lines": plan.settings.extent,
+        "patches_touched": len(fine.patch_index) / max(len(plan.field.kept_patches), 1),
+        "uses_prior_map": plan.field.prior is not None,
+        **({} if plan.extent is None else asdict(plan.extent)),
+    }
+
+
+def _pointing(plan: SurveyPlan, products: Products, fine: FinePlan) -> dict[str, Any] | None:
+    """Return the pointing corrections of each pass; None where none was registered."""
+    passes = {"coarse": products.first, "fine": products.second}
+    found = {name: _corrections(one.seams) for name, one in passes.items() if one is not None and one.seams is not None}
+    if "fine" in found:
+        found["fine"]["partly_seen"] = _partly_seen(plan, products.mosaic, fine)
+    return {"prior_px": plan.settings.pointing_px, **found} if found else None
+
+
+def _partly_seen(plan: SurveyPlan, mosaic: Ref, fine: FinePlan) -> int:
+    """Count the chosen patches that the fine pass did not capture completely."""
+    kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
+    if kinds is None:
+        return 0
+    coarse = np.array([step >= plan.passes.coarse[0].step for _, step, _ in kinds[0]])[kinds[1]]
+    return int(np.count_nonzero(patch_pixels(plan.field.grid, coarse)[fine.patch_index].any(axis=(1, 2))))
+
+
+def _corrections(ref: Ref) -> dict[str, Any]:
+    """Return the pointing corrections of a pass; residuals only where there are more windows than unknowns."""
+    record = load_registration(ref)
+    left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
+    tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)
+    return {
+        "held": record["reference"],
+        "sweeps": {name: one["offset_px"] for name, one in record["sweeps"].items()},
+        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size and tells else None,
+        "not_found": record["untied"],
+        "too_narrow": record["narrow"],
+    }
+
+
+def _areas(plan: SurveyPlan, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
+    """Return pixels of each class, and hectares where a pixel's size is known: with a pose those on the ground."""
     pixels = class_counts(drawn.classes, len(drawn.names)).tolist()
     m2 = None if posed is not None else areas_by_number(plan.field.zones.place, drawn.classes, len(drawn.names))
     hectares = {} if m2 is None else dict(zip(drawn.names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
     if posed is not None:
         hectares = {name: area["ha"] for name, area in posed.areas.items()}
-    return {"areas": {"px": dict(zip(drawn.names, pixels, strict=True)), **({"ha": hectares} if hectares else {})}}
+    return {"px": dict(zip(drawn.names, pixels, strict=True)), **({"ha": hectares} if hectares else {})}
 
 
-def find_ground(
-    plan: SurveyPlan,
-    posed: GroundMap | None,
-    found: ClassMap,
-    probabilities: ProbabilityStore,
-    prior: Mapping[str, Any] | None,
-) -> dict[str, Any]:
-    """Return ``ground``: grid, and changes against the prior map. Empty without a georeference."""
+def _ground(
+    plan: SurveyPlan, products: Products, posed: GroundMap | None, drawn: ClassMap, prior: Mapping[str, Any]
+) -> dict[str, Any] | None:
+    """Return the grid, and changes against the prior map; None without a georeference."""
     geobox = plan.field.scene.geobox if posed is None else posed.geobox
     if geobox is None:
-        return {}
+        return None
     figures: dict[str, Any] = {
         "crs": crs_name(geobox),
         "resolution_m": pixel_side_m(geobox) if posed is None else abs(float(geobox.resolution.x)),
         "shape": [int(size) for size in geobox.shape],
     }
-    if (old_class := probabilities.old_class()) is not None:
-        changes = [] if prior is None else prior["changes"]
-        beyond = {(old, new): changed / differing for changed, differing, old, new in changes}
-        figures |= {"changes_ha": changed_hectares(plan.field.zones.place, old_class, found, beyond)}
-    return {"ground": figures}
+    old_class = ProbabilityStore(products.class_map.path / "class_probabilities.zarr").old_class()
+    if old_class is not None:
+        beyond = {(old, new): changed / differing for changed, differing, old, new in prior.get("changes", ())}
+        figures["changes_ha"] = changed_hectares(plan.field.zones.place, old_class, drawn, beyond)
+    return figures
 
 
 def changed_hectares(
@@ -119,26 +192,22 @@ def changed_hectares(
     pairs = np.where(differing, old_class.astype(np.int64) * count + found.classes, -1)
     areas = areas_by_number(place, pairs, count**2)
     assert areas is not None
-    for pair in range(count**2):
-        areas[pair] *= beyond.get((names[pair // count], names[pair % count]), 0.0)
+    areas *= [beyond.get((old, new), 0.0) for old in names for new in names]
     largest = [pair for pair in np.argsort(-areas, kind="stable").tolist() if areas[pair] > 0]
     return [[float(areas[pair]) / M2_PER_HECTARE, names[pair // count], names[pair % count]] for pair in largest]
 
 
-def find_zones(plan: SurveyPlan, drawn: ClassMap) -> dict[str, Any]:
-    """Return ``zones``, the size of the mapped part, and ``plots``, a row each; empty without either."""
+def _zones(plan: SurveyPlan, drawn: ClassMap) -> dict[str, Any]:
+    """Return ``zones``, the size of the mapped part, and ``plots``, a row each."""
     found: dict[str, Any] = {}
-    if plan.field.zones.kept is not None:
-        kept = plan.field.zones.kept
-        found["zones"] = {
-            "kept_px": int(np.count_nonzero(kept)),
-            "field_px": kept.size,
-            "kept_m2": _ground_m2(plan, kept),
-        }
-    if plan.field.zones.plots is not None:
+    zones = plan.field.zones
+    if (kept := zones.kept) is not None:
+        pixels = int(np.count_nonzero(kept))
+        found["zones"] = {"kept_px": pixels, "field_px": kept.size, "kept_m2": _ground_m2(plan, kept)}
+    if zones.plots is not None:
         found["plots"] = [
-            asdict(figures_of_plot(name, shape, plan.field.zones.place, drawn.classes, drawn.confidence, drawn.names))
-            for name, shape in plan.field.zones.plots.items()
+            asdict(figures_of_plot(name, shape, zones.place, drawn.classes, drawn.confidence, drawn.names))
+            for name, shape in zones.plots.items()
         ]
     return found
 
@@ -151,24 +220,20 @@ def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
+    import pandas as pd
+
     names = list(plots[0]["fractions"]) if plots else []
     head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*head, *(f"fraction_{name}" for name in names)])
-    for plot in plots:
-        cells = [*(plot[name] for name in head), *(plot["fractions"][name] for name in names)]
-        table.writerow(["" if cell is None else cell for cell in cells])
-    return text.getvalue()
+    cells = [[*(plot[name] for name in head), *(plot["fractions"][name] for name in names)] for plot in plots]
+    table = pd.DataFrame(cells, columns=[*head, *(f"fraction_{name}" for name in names)])
+    return str(table.to_csv(index=False, lineterminator="\n"))
 
 
-def find_map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
-    """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``, each only if it applies."""
-    found: dict[str, Any] = {}
-    unclassed = drawn.classes == UNLABELLED
+def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
+    """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``."""
     spectra = read_table(ref.path / SPECTRA)
-    if fraction := spectra["unlike_patches"] / max(spectra["captured_patches"], 1):
-        found["unlike"] = {"fraction": fraction}
+    unlike = spectra["unlike_patches"] / max(spectra["captured_patches"], 1)
+    unclassed = drawn.classes == UNLABELLED
     if plan.field.zones.left_out is not None:
         unclassed &= ~plan.field.zones.left_out
     pixels = {
@@ -176,10 +241,11 @@ def find_map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
         "px_no_reading": spectra["out_of_range_px"],
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
-    if any(pixels.values()):
-        found["pixels"] = pixels
-    expected = None if fraction > FOREIGN else _expected(plan, ref)
-    return found if expected is None else found | {"expected": expected}
+    return {
+        "unlike": {"fraction": unlike} if unlike else None,
+        "pixels": pixels if any(pixels.values()) else None,
+        "expected": None if unlike > FOREIGN else _expected(plan, ref),
+    }
 
 
 def _expected(plan: SurveyPlan, ref: Ref) -> dict[str, Any] | None:
@@ -192,7 +258,7 @@ def _expected(plan: SurveyPlan, ref: Ref) -> dict[str, Any] | None:
         plan.field.map_scores is None
         or plan.field.raster is not None
         or not plan.passes.plain
-        or plan.settings.extent != EXTENT_WHOLE
+        or plan.part
         or plan.settings.macs is not None
         or plan.field.prior is not None
     ):
@@ -210,3 +276,13 @@ def _expected(plan: SurveyPlan, ref: Ref) -> dict[str, Any] | None:
         return {"not_predicted": f"{text}; judge the map by labels"}
     of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
     return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}
+
+
+def _lines(mosaic: Ref) -> dict[str, Any]:
+    """Return ``signal``, the fraction of spectra with saturated bands, and ``lines``, the sweeps that lost some."""
+    saturated = read_table(mosaic.path / SIGNAL_RECORD)["saturated"]
+    sweeps = read_table(mosaic.path / "lines.json")
+    return {
+        "signal": {"saturated": saturated} if saturated else None,
+        "lines": {name: facts for name, facts in sweeps.items() if any(facts.values())},
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -34,11 +35,6 @@ class RunRef:
     uri: str  # relative to the archive
     folder: Path
     stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
-
-    @property
-    def name(self) -> str:
-        """Return the name of the run's folder."""
-        return self.folder.name
 
 
 def publish(stores: Stores, plan: SurveyPlan, products: Products, *, started: datetime, note: Note) -> RunRef:
@@ -89,8 +85,7 @@ def _show_artifact(name: str, archive: str, published: Published) -> None:
     """Create the artifact of a run in the present flow: score, picture, findings, and where its files are."""
     if not inside_flow():
         return
-    letters = (letter if letter.isalnum() and letter.isascii() else "-" for letter in name.lower())
-    key = "".join(letters).strip("-")
+    key = re.sub("[^a-z0-9]", "-", name.lower()).strip("-")
     where = f"{archive}/runs/{published.folder.name}"
     with suppress(Exception):  # without a server the archive has everything
         text = render_markdown(

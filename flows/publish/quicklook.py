@@ -1,16 +1,19 @@
-"""Draw the quicklook of a survey as one PNG: field, chosen patches, class map, labels."""
+"""Draw the quicklook of a survey as one PNG (field, chosen patches, class map, labels), and parts of pictures."""
 
 from __future__ import annotations
 
+import base64
+import io
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
-from spectralzoom.flows.publish.panels import STYLE, UNLABELLED_COLOUR, class_rgb, png
 from spectralzoom.flows.terminal.figures import format_percent, spaced
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import class_counts
@@ -19,6 +22,21 @@ from spectralzoom.storage.arrays.mosaics import develop
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+COLOURS = 256  # of a PNG
+MOST_PX = 2048  # of a picture's longer side; larger fields are subsampled
+INK = "#22241f"
+STYLE: Any = {
+    "font.size": 12,
+    "text.parse_math": False,  # names of surveys and classes may hold dollar signs
+    "font.family": "DejaVu Sans",
+    "axes.edgecolor": "#b8b8b0",
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "figure.facecolor": "#fbfaf7",
+    "savefig.facecolor": "#fbfaf7",
+}
+UNLABELLED_RGB = (219, 219, 214)
 TITLE_LETTERS, CAPTION_LETTERS = 7.5, 9.0  # to an inch of a line
 LETTER_IN, MARK_IN = 0.15, 0.7  # of the legend
 MOST_LETTERS = 60  # of a class in the legend
@@ -49,8 +67,7 @@ def draw_quicklook(data: QuicklookData) -> bytes:
     import matplotlib as mpl  # after its cache folder is placed
 
     with mpl.rc_context(STYLE):
-        grey = np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8)
-        return png(_compose(data), np.vstack([data.class_colours, grey]))
+        return png(_compose(data), np.vstack([data.class_colours, UNLABELLED_RGB]))
 
 
 _DPI = 100
@@ -79,9 +96,10 @@ def _compose(data: QuicklookData) -> Figure:
     return figure
 
 
-def _panels(data: QuicklookData) -> Iterator[tuple[str, NDArray[np.floating]]]:
+def _panels(data: QuicklookData) -> Iterator[tuple[str, NDArray[np.generic]]]:
     """Yield title and image (y, x) or (y, x, 3) of the four panels."""
     rectified = develop(data.rectified, data.caption)
+    palette, thin = palette_of(data.class_colours), thinned(data.class_map)
     confidence = "Confidence of the model, dark 0 to bright 1", data.confidence
     yield f"1  Field: {data.caption}", rectified
     if data.chosen is None:
@@ -90,14 +108,14 @@ def _panels(data: QuicklookData) -> Iterator[tuple[str, NDArray[np.floating]]]:
         grey = np.repeat(rectified.mean(axis=-1, keepdims=True), 3, axis=-1)
         shown = np.where(data.chosen[..., None], (grey + np.array(CHOSEN_RGB)) / 2, grey)
         yield f"2  {data.choice} (cyan)", shown
-    yield "3  Class map by the model", class_rgb(data.class_map, data.class_colours)
+    yield "3  Class map by the model", palette[data.class_map[thin]]
     if data.truth is None:
         yield f"4  {confidence[0]} (no labels given)", confidence[1]
         return
     labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
     right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(int(np.count_nonzero(labelled)), 1)
     words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
-    yield f"4  Labels: {words}", class_rgb(data.truth, data.class_colours)
+    yield f"4  Labels: {words}", palette[data.truth[thin]]
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, page: float) -> None:
@@ -106,11 +124,60 @@ def _draw_legend(figure: Figure, data: QuicklookData, page: float) -> None:
     counts = class_counts(data.class_map, len(data.class_names))
     words = zip(data.class_names, map(format_percent, counts / max(int(counts.sum()), 1)), strict=True)
     names = [f"{spaced(name)[:MOST_LETTERS]}  {fraction}" for name, fraction in words]
-    colours: list[Any] = [*np.asarray(data.class_colours) / 255]
+    colours = [*np.asarray(data.class_colours)]
     others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
     if any((image == UNLABELLED).any() for image in others):
         names.append("unlabelled")
-        colours.append(UNLABELLED_COLOUR)
-    marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in colours]
+        colours.append(np.array(UNLABELLED_RGB))
+    marks = [Patch(facecolor=tuple(colour / 255), edgecolor="#555555", linewidth=0.6) for colour in colours]
     columns = max(1, int(page / (LETTER_IN * max(map(len, names)) + MARK_IN)))
     figure.legend(marks, names, loc="outside lower center", ncol=min(columns, len(names)), frameon=False, fontsize=13)
+
+
+def thinned(image: NDArray[np.generic]) -> tuple[slice, slice]:
+    """Return the rows and columns of a (y, x) field that pictures show."""
+    return (slice(None, None, -(-max(image.shape) // MOST_PX)),) * 2
+
+
+def png(figure: Figure, exact: ArrayLike = ()) -> bytes:
+    """Return a figure as PNG of 256 colours, with these ``exact`` ones (n, 3) among them, at most half of all."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)  # a letter that the font lacks is a box
+        canvas.draw()  # type: ignore[no-untyped-call]
+    drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    kept = np.reshape(exact, (-1, 3))[: COLOURS // 2].astype(np.uint8)
+    others = COLOURS - len(kept)
+    rough = Image.fromarray(drawn).convert("RGB").quantize(others, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    numbers = np.array(rough)
+    packed = drawn.view(np.uint32)[..., 0]
+    for number, colour in enumerate(kept, others):
+        numbers[packed == np.array([*colour, 255], np.uint8).view(np.uint32)] = number
+    picture = Image.fromarray(numbers)
+    palette = rough.getpalette() or []
+    picture.putpalette([*palette, *[0] * (3 * others - len(palette)), *kept.ravel().tolist()])
+    file = io.BytesIO()
+    picture.save(file, "PNG")
+    return file.getvalue()
+
+
+def webp(picture: Image.Image, **choices: Any) -> bytes:
+    """Return a picture as WebP; ``choices`` are those of Pillow."""
+    file = io.BytesIO()
+    picture.save(file, "WEBP", **choices)
+    return file.getvalue()
+
+
+def data_address(content: bytes) -> str:
+    """Return a PNG or WebP as a data address for a page."""
+    kind = "webp" if content.startswith(b"RIFF") else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def palette_of(colours: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """Return the colour of each class number (256, 3); numbers without one are light grey."""
+    palette = np.tile(np.array(UNLABELLED_RGB, np.uint8), (256, 1))
+    palette[: len(colours)] = colours
+    return palette

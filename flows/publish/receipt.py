@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from spectralzoom.flows.settings.survey_settings import RASTER
 from spectralzoom.pipeline.errors import ShapeError
+from spectralzoom.storage.runs import read_run
+from spectralzoom.storage.store import damage
 from spectralzoom.storage.whole_files import to_json
 
 Receipt = dict[str, Any]
@@ -165,6 +168,14 @@ def build_receipt(**fields: object) -> Receipt:
         name: fields[name] for name in ReceiptFields.model_fields if fields.get(name) or name in needed & {*fields}
     }
     return check_receipt(json.loads(to_json(known)))
+
+
+def load_receipt(folder: Path) -> Receipt:
+    """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
+    found = read_run(folder)
+    if found.problem is not None:
+        raise damage(folder, found.problem)
+    return check_receipt(found.receipt)
 
 
 def check_receipt(receipt: Mapping[str, Any]) -> Receipt:

@@ -28,32 +28,33 @@ from spectralzoom.flows.terminal.progress import table
 from spectralzoom.pipeline.planning.uniform_scans import format_scan
 from spectralzoom.pipeline.simulator.selection.choice import UNIT_NAMES
 
+BYTES = ("kept", "captured", "written")
 COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "capture_s": ("capture time", format_seconds),
     "multiply_adds": ("multiply-adds", format_count),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
     "patches": ("patches read in full", format_count),
+    **{name: (f"bytes {name}", format_bytes) for name in BYTES},
 }
-BYTE_LABELS = {"kept": "bytes kept", "captured": "bytes captured", "written": "bytes written"}
 LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
 MOST_NAMED = 4  # changes of class in a row
+SATURATED = "of the spectra have saturated bands; a shorter exposure avoids them"
 FOREIGN = 0.2  # fraction of patches unlike the training data above which the weights do not fit the field
 FOREIGN_WORDS = "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET)"
 
 
 def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return costs and bytes of a run against the reference, one row each, with formatted figures."""
+    data = receipt["data_bytes"]
+    full = data["reference"]
+    of_data = {name: {"done": data[name], "full": full, "ratio": data[name] / full if full else None} for name in BYTES}
+    costs = {**receipt["savings"], **of_data}
     rows = [
         {"label": label, "done": show(one["done"]), "full": show(one["full"]), "ratio": one["ratio"]}
         for name, (label, show) in COST_LABELS.items()
-        if (one := receipt["savings"].get(name)) is not None
+        if (one := costs.get(name)) is not None
     ]
-    full = receipt["data_bytes"]["reference"]
-    for name, label in BYTE_LABELS.items():
-        done = receipt["data_bytes"][name]
-        ratio = done / full if full else None
-        rows.append({"label": label, "done": format_bytes(done), "full": format_bytes(full), "ratio": ratio})
     return sorted(rows, key=lambda row: LEADING.index(row["label"]) if row["label"] in LEADING else len(LEADING))
 
 
@@ -207,6 +208,10 @@ def _fractions(words: str) -> Callable[[float], str]:
     return lambda fraction: f"{format_percent(fraction)} {words}"
 
 
+def _areas(hectares: Mapping[str, float]) -> str:
+    return ", ".join(f"{spaced(name)} {format_area(area)}" for name, area in hectares.items() if area)
+
+
 def _changes(pairs: Sequence[Sequence[Any]], show: Callable[[Any], str]) -> str:
     return ", ".join(f"{spaced(old)} to {spaced(new)} {show(size)}" for size, *_, old, new in pairs[:MOST_NAMED])
 
@@ -219,12 +224,7 @@ _SHOWN: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     ("field", "field", "ground_pixel_m", lambda side: f"ground pixel {format_metres(side)}"),
     ("field", "field", "hectares_per_hour", lambda pace: f"hectares per hour {three_digits(pace)}"),
     ("plan", "plan", "reason", str),
-    (
-        "signal",
-        "signal",
-        "saturated",
-        _fractions("of the spectra have saturated bands; a shorter exposure avoids them"),
-    ),
+    ("signal", "signal", "saturated", _fractions(SATURATED)),
     ("pixels", "pixels", "px_no_reading", _counts("px no reading")),
     ("pixels", "pixels", "map_without_a_class", _counts("px without a class")),
     ("captured", "extent", "patches_touched", _fractions("of the patches")),
@@ -238,12 +238,7 @@ _SHOWN: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     ("uniform scans", "scans", "taken", lambda scan: f"this one: {_scan(scan)}"),
     ("uniform scans", "scans", "best_in_time", lambda scan: f"best in the same time: {_scan(scan)}"),
     ("uniform scans", "scans", "reference", lambda scan: f"cheapest near the best: {_scan(scan)}"),
-    (
-        "classes",
-        "areas",
-        "ha",
-        lambda ha: ", ".join(f"{spaced(name)} {format_area(ha[name])}" for name in ha if ha[name]),
-    ),
+    ("classes", "areas", "ha", _areas),
     ("changed", "ground", "changes_ha", lambda changes: _changes(changes, format_area)),
 )
 _OF_POINTING: Mapping[str, Callable[[Any], str]] = {

@@ -20,7 +20,7 @@ from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
 from spectralzoom.flows.publish.field_map import FieldMap
-from spectralzoom.flows.publish.panels import data_address
+from spectralzoom.flows.publish.quicklook import data_address
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.publish.receipt_table import (
     finding_rows,
@@ -48,10 +48,10 @@ def part(name: str) -> str:
     return "\n".join(line for line in text.split("\n") if elsewhere not in line)
 
 
-def policy(names: tuple[str, ...]) -> str:
-    """Return the content security policy of a page: only these scripts run, and nothing is loaded."""
-    sources = [f"'sha256-{base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode()}'" for name in names]
-    allowed = " ".join(sources) or "'none'"
+def policy() -> str:
+    """Return the content security policy of a page: only the map's scripts run, and nothing is loaded."""
+    hashes = (base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode() for name in MAP_SCRIPTS)
+    allowed = " ".join(f"'sha256-{one}'" for one in hashes)
     return (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}; "
         "base-uri 'none'; form-action 'none'"
@@ -77,19 +77,10 @@ def _environment(*, markdown: bool) -> Environment:
     found.filters |= {
         "percent": format_percent,
         "points": format_points,
-        # data for scripts, which cannot end their tag
-        "data": lambda content: htmlsafe_json_dumps(_format_visible(content), separators=(",", ":")),
+        "data": lambda content: htmlsafe_json_dumps(content, separators=(",", ":")),  # which cannot end its tag
     }
     found.globals["part"] = lambda name: Markup(part(name))
     return found
-
-
-def _format_visible(content: Any) -> Any:
-    if isinstance(content, str):
-        return visible(content)
-    if isinstance(content, Mapping):
-        return {visible(name): _format_visible(item) for name, item in content.items()}
-    return [_format_visible(item) for item in content] if isinstance(content, list | tuple) else content
 
 
 def _plain(value: object) -> object:
@@ -99,22 +90,17 @@ def _plain(value: object) -> object:
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
 
 
-def render_report(receipt: Receipt, quicklook: bytes, *, field: FieldMap | None = None) -> str:
-    """Return the report as HTML; the same receipt, picture and map give the same bytes.
-
-    ``field`` is the map with layers; without it the page has no script.
-    """
+def render_report(receipt: Receipt, quicklook: bytes, field: FieldMap) -> str:
+    """Return the report as HTML; the same receipt, picture and map give the same bytes."""
     scene = split_variable(receipt["settings"]["scene"])[0].name
     accuracy = shown_accuracy(receipt)
-    scripts = () if field is None else MAP_SCRIPTS
     page = _environment(markdown=False).get_template("report.html")
     text = page.render(
-        policy=policy(scripts),
-        scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in scripts),
+        policy=policy(),
+        scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in MAP_SCRIPTS),
         title=receipt["survey"],
         lead=headline(receipt),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
-        receipt=receipt,
         links={  # without raw lines, which may be cleared, and the report itself
             name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
             for name, address in receipt["products"].items()

@@ -19,39 +19,24 @@ from numpy.typing import NDArray
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Products
 from spectralzoom.flows.publish.field_map import field_map
-from spectralzoom.flows.publish.findings import (
-    PLOTS_FILE,
-    field_figures,
-    find_areas,
-    find_ground,
-    find_map,
-    find_zones,
-    plots_csv,
-)
-from spectralzoom.flows.publish.panels import thinned
-from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook
-from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt, check_receipt
+from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, plots_csv
+from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
+from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
-from spectralzoom.flows.settings.values import EXTENT_WHOLE, KEEP_SIGNAL
+from spectralzoom.flows.settings.values import KEEP_SIGNAL
 from spectralzoom.flows.stage import Row, Stores
-from spectralzoom.flows.stages.condense import SIGNAL_RECORD
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
-from spectralzoom.flows.stages.ground import STORE
-from spectralzoom.flows.stages.register import load_registration
 from spectralzoom.flows.stages.score import READING, load_plan, read_in_full
 from spectralzoom.flows.tasks.capture_plan import as_figures
-from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
 from spectralzoom.flows.tasks.scene import seen_in_training
-from spectralzoom.pipeline.geometry.grid import SceneGrid, patch_pixels
+from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
-from spectralzoom.storage.arrays.ground_maps import load_ground_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
-from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import Ref, damage, read_table
+from spectralzoom.storage.runs import RECEIPT
 from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
@@ -67,14 +52,6 @@ class Published:
     folder: Path
 
 
-def load_receipt(folder: Path) -> Receipt:
-    """Return the receipt of a published run (IncompleteStoreError: it has changed; ShapeError: it is not valid)."""
-    found = read_run(folder)
-    if found.problem is not None:
-        raise damage(folder, found.problem)
-    return check_receipt(found.receipt)
-
-
 def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: datetime) -> Published:
     """Publish the products of a survey as a run folder with receipt.json, quicklook.png and report.html."""
     shown = quicklook_data(plan, products)
@@ -85,7 +62,7 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         """Write the files of the run into a folder, and return facts for its manifest."""
         nonlocal receipt
         receipt = make_receipt(stores, plan, products, uri, started)
-        page = render_report(receipt, quicklook, field=field_map(shown, plan.field.prior))
+        page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
         (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
             (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]))
@@ -107,7 +84,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
     places = products.addresses()
     if (products.class_map.path / READING).exists():  # patches were chosen in the segmentation
         places["attention"] = f"{products.class_map.uri}/{READING}"
-    files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if field.zones.plots is not None else []))
+    files = (RECEIPT, "quicklook.png", REPORT, *([PLOTS_FILE] if field.zones.plots is not None else []))
     scans = {
         "taken": plan.scans.chosen,
         "best_in_time": plan.scans.best_in_time(plan.passes.coarse_s + fine.seconds),
@@ -121,7 +98,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
         started=in_seconds(started),
         finished=in_seconds(datetime.now(UTC)),
         versions=versions(),
-        settings=asked_settings(plan),
+        settings={**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)},
         stages=[_stage_row(row) for row in stores.rows.values()],
         savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)),
         data_bytes=count_bytes(stores, plan, products, fine),
@@ -150,25 +127,15 @@ def in_seconds(moment: datetime) -> str:
 
 
 def _stage_row(row: Row) -> dict[str, Any]:
-    costs = (row.wall_s, row.cpu_s, row.peak_rss_bytes, row.bytes_in, row.bytes_out)
-    return {"name": row.name, "key": row.ref.key, "state": row.state, **dict(zip(COSTS_OF_STAGE, costs, strict=True))}
-
-
-def asked_settings(plan: SurveyPlan) -> dict[str, object]:
-    """Return the settings with absolute paths, and the notes on assumptions."""
-    return {**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)}
+    costs = {name: getattr(row, name) for name in COSTS_OF_STAGE}
+    return {"name": row.name, "key": row.ref.key, "state": row.state, **costs}
 
 
 def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
-    did = plan.work_done(read)
-    of_model = {
-        "patches": SavingEntry(len(read), len(plan.field.kept_patches)).as_dict(),
-        "multiply_adds": {
-            **SavingEntry(did.total, plan.costs.of_map(plan.field.kept_patches).total).as_dict(),
-            **asdict(did),
-        },
-    }
+    did, patches = plan.work_done(read), plan.field.kept_patches
+    work = SavingEntry(did.total, plan.costs.of_map(patches).total).as_dict()
+    of_model = {"patches": SavingEntry(len(read), len(patches)).as_dict(), "multiply_adds": {**work, **asdict(did)}}
     if plan.field.raster is not None:
         return of_model
     entries = capture_savings([*plan.passes.coarse, *fine.sweeps], plan.passes.full, plan.field.camera, plan.field.grid)
@@ -212,79 +179,6 @@ def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.intp]) -> NDArray
     patches = np.zeros(grid.patch_shape, bool)
     patches.ravel()[patch_index] = True
     return patches.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)[: grid.height, : grid.width]
-
-
-def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
-    """Return the findings of a run by their names in the receipt."""
-    fine = load_plan(products.attention)
-    figures: dict[str, Any] = {"kind": fine.kind, "reason": fine.reason, "lines": fine.lines, "seconds": fine.seconds}
-    found: dict[str, Any] = {"field": field_figures(plan, fine), "plan": figures}
-    prior = None
-    if plan.field.prior is not None:
-        prior = {"run": plan.field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
-    if plan.field.recorded is not None:
-        found["recording"] = {
-            "sweeps": str(plan.settings.sweeps),
-            "lines_read": plan.field.recorded.lines_served([*plan.passes.coarse, *fine.sweeps]),
-            "lines_recorded": sum(int(one.valid_line.sum()) for one in plan.field.recorded.source.sweeps),
-            "passes_s": plan.passes.coarse_s + fine.seconds,
-            "full_scan_s": plan.settings.cost.seconds(plan.passes.full, plan.field.camera),
-        }
-    if plan.chooses and (plan.passes.plain or plan.least_gain is not None):
-        found["kept"] = plan.reading_figures(read_in_full(products.attention, products.class_map))
-    if prior is not None:
-        found["prior_map"] = prior
-    if plan.settings.extent != EXTENT_WHOLE:
-        found["extent"] = {
-            "lines": plan.settings.extent,
-            "patches_touched": len(fine.patch_index) / max(len(plan.field.kept_patches), 1),
-            "uses_prior_map": prior is not None,
-            **({} if plan.extent is None else asdict(plan.extent)),
-        }
-    passes = {"coarse": products.first, "fine": products.second}
-    pointing = {name: _pointing(one.seams) for name, one in passes.items() if one is not None and one.seams is not None}
-    if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = _partly_seen(plan, products.mosaic, fine)
-    if pointing:
-        found["pointing"] = {"prior_px": plan.settings.pointing_px, **pointing}
-    drawn = load_class_map(products.class_map.path / "class_map.zarr")
-    posed = None if products.ground is None else load_ground_map(products.ground.path / STORE)
-    probabilities = ProbabilityStore(products.class_map.path / "class_probabilities.zarr")
-    found |= find_areas(plan, posed, drawn) | find_ground(plan, posed, drawn, probabilities, prior)
-    found |= find_zones(plan, drawn) | find_map(plan, products.class_map, drawn)
-    if plan.field.raster is not None:
-        return found
-    record = products.mosaic.path / SIGNAL_RECORD
-    saturated = read_table(record).get("saturated") if record.is_file() else None  # archives of before 2026-11-27
-    if saturated:
-        found["signal"] = {"saturated": saturated}
-    lines = read_table(products.mosaic.path / "lines.json")
-    if troubled := {name: facts for name, facts in lines.items() if any(facts.values())}:
-        found["lines"] = troubled
-    return found
-
-
-def _partly_seen(plan: SurveyPlan, mosaic: Ref, fine: FinePlan) -> int:
-    """Count the chosen patches that the fine pass did not capture completely."""
-    kinds = open_mosaic(mosaic.path / "mosaic.zarr").captures()
-    if kinds is None:
-        return 0
-    coarse = np.array([step >= plan.passes.coarse[0].step for _, step, _ in kinds[0]])[kinds[1]]
-    return int(np.count_nonzero(patch_pixels(plan.field.grid, coarse)[fine.patch_index].any(axis=(1, 2))))
-
-
-def _pointing(ref: Ref) -> dict[str, Any]:
-    """Return the pointing corrections of a pass; residuals only where there are more windows than unknowns."""
-    record = load_registration(ref)
-    left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
-    tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)
-    return {
-        "held": record["reference"],
-        "sweeps": {name: one["offset_px"] for name, one in record["sweeps"].items()},
-        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size and tells else None,
-        "not_found": record["untied"],
-        "too_narrow": record["narrow"],
-    }
 
 
 def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: FinePlan) -> Facts:

@@ -14,12 +14,9 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from contextvars import copy_context
-from http.client import HTTPException
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -153,7 +150,7 @@ def create_database(path: Path) -> None:
     each archive gets a copy. A user without such a folder waits for them in each new archive.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    cache = cache_folder(os.environ)
+    cache = cache_folder()
     if path.exists() or cache is None:
         return
     import prefect
@@ -184,10 +181,11 @@ def _migrate(folder: Path) -> Path:
 
 def check_answers(url: str) -> None:
     """Check that a server answers. Raises ServerUnavailable."""
+    import httpx
+
     try:
-        with suppress(urllib.error.HTTPError):  # it requires a password
-            urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S).close()
-    except (OSError, ValueError, HTTPException) as error:
+        httpx.get(f"{url.rstrip('/')}/health", timeout=PATIENCE_S)  # any answer, also that it requires a password
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
         raise ServerUnavailable(
             f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error}): start it, or unset that"
         ) from error

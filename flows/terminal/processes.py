@@ -12,7 +12,7 @@ import signal
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -96,27 +96,22 @@ def writing(out: Path, flag: str = "--out") -> Iterator[None]:
 
 
 NO_HOME = "/nonexistent"  # Debian's name for the home of users without one
-OF_LIBRARIES = {  # which need more than XDG_CACHE_HOME
-    "NUMBA_CACHE_DIR": "numba",
-    "MPLCONFIGDIR": "matplotlib",
-    "PREFECT_HOME": "prefect",
-}
+OF_LIBRARIES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "PREFECT_HOME": "prefect"}
 
 
-def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | None:
+def place_caches() -> Path | None:
     """Set environment variables to a temporary cache folder where the usual one cannot be written; return it or None.
 
-    The usual one is XDG_CACHE_HOME or ~/.cache; the temporary one ends with the process. ``environment`` is this
-    process's own by default. Raises SettingsError: no temporary folder can be written either.
+    The usual one is XDG_CACHE_HOME or ~/.cache; the temporary one ends with the process. Raises SettingsError: no
+    temporary folder can be written either.
     """
-    environment = os.environ if environment is None else environment
     try:
-        home = environment.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir
+        home = os.environ.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir
     except KeyError:
         home = None
     if not home:
-        environment["HOME"] = NO_HOME  # Prefect needs one at its import
-    usual = cache_folder(environment)
+        os.environ["HOME"] = NO_HOME  # Prefect needs one at its import
+    usual = cache_folder()
     with suppress(OSError):
         if usual is not None:
             usual.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -130,25 +125,25 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
             f"({error}); set XDG_CACHE_HOME to a folder that this user can write"
         ) from None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    environment["XDG_CACHE_HOME"] = str(folder)
+    os.environ["XDG_CACHE_HOME"] = str(folder)
     for name, part in OF_LIBRARIES.items():
-        environment.setdefault(name, str(folder / part))
+        os.environ.setdefault(name, str(folder / part))
     return folder
 
 
-def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
+def place_pages() -> dict[str, str]:
     """Return variables that let Prefect's server unpack its pages in the cache folder, if its own is read-only."""
     found = importlib.util.find_spec("prefect")
-    folder = cache_folder(os.environ if environment is None else environment)
+    folder = cache_folder()
     if folder is None or os.access(Path(str(found and found.origin)).parent / "server", os.W_OK | os.X_OK):
         return {}
     return {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(folder / "spectralzoom" / "prefect-pages")}
 
 
-def cache_folder(environment: Mapping[str, str]) -> Path | None:
+def cache_folder() -> Path | None:
     """Return the usual cache folder; None without a home."""
-    named = Path(environment.get("XDG_CACHE_HOME", ""))
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
     if named.is_absolute():
         return named
-    home = Path(environment.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir)
+    home = Path(os.environ.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir)
     return home / ".cache" if home.is_absolute() and home.is_dir() else None

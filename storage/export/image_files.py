@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,9 +9,12 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import rasterio
+import rasterio.shutil
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
+from rasterio.errors import RasterioError
 
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.arrays.class_maps import ClassNames
@@ -53,18 +55,17 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     Classes get a colour table, and their names as tags of the band and as GDAL's category names in ``NAME.aux.xml``.
     Raises ArchiveError: the disk refuses or changes the numbers.
     """
-    rasterio = importlib.import_module("rasterio")  # not in the block: Ctrl-C would leave it without `errors`
     try:
-        _write_cog(rasterio, path, image, blocks)
-    except rasterio.errors.RasterioError as error:
+        _write_cog(path, image, blocks)
+    except RasterioError as error:
         raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
 
 
-def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
+def _write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     sidecar = f"{path.name}.aux.xml"
     with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
         plain, made = aside / "plain.tif", aside / path.name
-        _write_plain(rasterio, plain, image, blocks)
+        _write_plain(plain, image, blocks)
         options = {
             "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
             "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
@@ -72,13 +73,12 @@ def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> No
             "BLOCKSIZE": str(TILE),
             "NUM_THREADS": "1",
         }
-        importlib.import_module("rasterio.shutil").copy(str(plain), str(made), driver="COG", **options)
+        rasterio.shutil.copy(str(plain), str(made), driver="COG", **options)
         with rasterio.open(plain) as wanted, rasterio.open(made) as found:
-            same = all(  # tile by tile: a tile holds every band
-                np.array_equal(
-                    wanted.read(window=part), found.read(window=part), equal_nan=np.dtype(image.dtype).kind == "f"
-                )
-                for _, part in found.block_windows(1)
+            with_nan = np.dtype(image.dtype).kind == "f"
+            same = all(  # a tile holds every band
+                np.array_equal(wanted.read(window=tile), found.read(window=tile), equal_nan=with_nan)
+                for _, tile in found.block_windows(1)
             )
         if not same:
             raise ArchiveError(f"{path} does not read back as written; is the disk full? Run again")
@@ -90,22 +90,13 @@ def _write_cog(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> No
             ElementTree.ElementTree(root).write(aside / sidecar, encoding="utf-8")
 
 
-def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
+def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
     """Write an uncompressed TIFF in strips, block by block; GDAL makes the cloud-optimised file from it."""
     y, x = image.geobox.shape
-    crs = image.geobox.crs
-    profile = {
-        "driver": "GTiff",
-        "height": y,
-        "width": x,
-        "count": len(image.bands),
-        "dtype": image.dtype,
-        "nodata": image.nodata,
-        "transform": image.geobox.affine,
-        "crs": None if crs is None else crs.to_wkt(),
-        "BIGTIFF": "IF_SAFER",
-    }
-    with rasterio.open(path, "w", **profile) as file:
+    crs = None if image.geobox.crs is None else image.geobox.crs.to_wkt()
+    size = {"height": y, "width": x, "count": len(image.bands), "dtype": image.dtype}
+    place = {"transform": image.geobox.affine, "crs": crs}
+    with rasterio.open(path, "w", "GTiff", **size, **place, nodata=image.nodata, BIGTIFF="IF_SAFER") as file:
         file.descriptions = image.bands
         file.update_tags(**image.tags)
         _tag_wavelengths(file, image)

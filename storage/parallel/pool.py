@@ -97,20 +97,13 @@ class WorkerPool:
         try:
             yield self
         finally:
-            _dismiss(self)
-            del _clusters[self]
+            if (cluster := _clusters.pop(self)) is not None:
+                cluster.close()
 
 
 THREADS = WorkerPool()
 
 _clusters: dict[WorkerPool, Cluster | None] = {}  # of open pools, None until they are started
-
-
-def _dismiss(pool: WorkerPool) -> None:
-    """Abandon the workers of an open pool; the next use starts others."""
-    if (cluster := _clusters[pool]) is not None:
-        _clusters[pool] = None
-        cluster.close()
 
 
 def run_blocks(
@@ -137,24 +130,22 @@ def run_blocks(
         return make(item) if take is None else take(item, make(item))
 
     results: list[Any] = []
-
-    def ended(result: Any) -> None:
-        results.append(result)
-        report(len(results) / len(items))
-
-    workers = min(pool.count, len(items))
-    if not pool.shares_memory and items:
-        with pool.open(), closing(_run_away(pool, make, items)) as made:
-            for item, one in zip(items, made, strict=True):
-                ended(one if take is None else take(item, one))
-    elif workers < 2:
-        for item in items:
-            ended(whole(item))
-    else:
-        with ThreadPoolExecutor(workers) as team:
-            for one in _in_order(lambda item: team.submit(whole, item), items, workers):
-                ended(one)
+    away = bool(items) and not pool.shares_memory
+    made = _run_away(pool, make, items) if away else _on_threads(whole, items, min(pool.count, len(items)))
+    with pool.open(), closing(made):
+        for item, one in zip(items, made, strict=True):
+            results.append(take(item, one) if away and take is not None else one)
+            report(len(results) / len(items))
     return results
+
+
+def _on_threads(make: Callable[[Any], Any], items: Sequence[Any], workers: int) -> Generator[Any, None, None]:
+    """Yield the results of blocks in this process."""
+    if workers < 2:
+        yield from map(make, items)
+        return
+    with ThreadPoolExecutor(workers) as team:
+        yield from _in_order(lambda item: team.submit(make, item), items, workers)
 
 
 def _in_order(
@@ -204,16 +195,16 @@ def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]
         team: Any = cluster.client.get_executor(pure=False)
         yield from _in_order(lambda item: team.submit(call, shared, item), items, AHEAD * count, cluster.count, lost)
     except lost as error:
-        _dismiss(pool)
+        _clusters[pool] = None  # the next use starts others
+        cluster.close()
         if isinstance(error, WorkerError):
             raise
-        if isinstance(error, CancelledError) and pool.elsewhere:
-            advice = "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
-        else:
-            advice = (
-                "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
-                "--scheduler threads"
-            )
+        advice = (
+            "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
+            if isinstance(error, CancelledError) and pool.elsewhere
+            else "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
+            "--scheduler threads"
+        )
         raise WorkerError(f"{cluster.name}: {advice}") from None
     except ImportError as error:
         raise SettingsError(

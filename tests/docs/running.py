@@ -25,8 +25,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from spectralzoom.flows.cli.app import build_app
-from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.cli.main import build_app, main
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.storage.readers.scene_toml import load_scene_settings
 from tests.docs.pages import ROOT, Block

@@ -73,7 +73,6 @@ def _containers(here: Path, cube: np.ndarray) -> None:
     (here / "cut.nc").write_bytes((here / "bare.h5").read_bytes()[:900])
     scipy.io.savemat(here / "one_cube.mat", {"cube": cube, "wl": np.arange(5.0), "day": 130})
     scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
-    scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})
     scipy.io.savemat(here / "two_cubes.mat", {"north": cube, "south": cube})
     (here / "cut.mat").write_bytes((here / "one_cube.mat").read_bytes()[:600])
     (here / "alone.hdr").write_text(
@@ -94,7 +93,6 @@ def _texts(here: Path) -> None:
     (here / "unknown.toml").write_text('scene = "field.png"\nbuget = 0.8\n')
     (here / "broken.toml").write_text("scene = field.png\n")
     (here / "latin.toml").write_bytes('scene = "Rüben.png"\n'.encode("latin-1"))
-    (here / "a_file").write_text("no archive")
     (here / "empty").mkdir()
 
 

@@ -19,8 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from spectralzoom.flows.cli.app import VERBS, build_app
-from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.cli.main import VERBS, build_app, main
 from tests.conftest import WeightsMaker
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -84,8 +84,6 @@ CASES = {
     "broken settings": (2, "survey broken.toml", "broken.toml.*line 1"),
     "settings not in UTF-8": (2, "survey latin.toml", "latin.toml.*utf-8"),
     "budget 0": (2, SURVEY + "field.png --budget 0", "above 0 and at most 1, got '0'"),
-    "unknown flag": (2, SURVEY + "field.png --budgets 1", "Unknown option"),
-    "unknown verb": (2, "surveys field.png", "surveys"),
     "scene as settings": (2, "survey field.png", "a scene is given as --scene field.png"),
     # training
     "empty folder to train on": (1, TRAIN + "empty", "holds no scene"),

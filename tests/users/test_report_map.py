@@ -52,7 +52,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Image.new("L", (1800, 1400), 128).save(file, "PNG")
     picture = file.getvalue()
     path = tmp_path_factory.mktemp("report") / "report.html"
-    path.write_text(render_report(receipt, picture, field=field), "utf-8")
+    path.write_text(render_report(receipt, picture, field), "utf-8")
     return path
 
 

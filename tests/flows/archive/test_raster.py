@@ -16,7 +16,7 @@ from affine import Affine
 from numpy.typing import NDArray
 
 from spectralzoom.flows.archive.export_command import run_export
-from spectralzoom.flows.archive.export_layers import ProductFlags, choose_products
+from spectralzoom.flows.archive.export_layers import ProductFlags
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.patch_budget import ReadingCosts
@@ -157,8 +157,8 @@ def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: We
     values = (patchy_scene((50, 70), 3, seed=7)[0] / 255).astype(np.float32)
     source = write_tif(tmp_path / "field.tif", values)
     published = surveyed(source, wavelengths="670,550,800", weights=str(make_weights((550.0, 670.0, 800.0))))
-    choice = choose_products(ProductFlags(reflectance=True, indices="NDVI"))
-    run_export(tmp_path / "archive", None, tmp_path / "out", QUIET, choice)
+    products = ProductFlags(reflectance=True, indices="NDVI")
+    run_export(tmp_path / "archive", None, tmp_path / "out", QUIET, products)
     folder = tmp_path / "out" / published.folder.name
     with rasterio.open(folder / "reflectance.tif") as exported, rasterio.open(source) as own:
         assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)

@@ -12,9 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from spectralzoom.flows.publish import panels, quicklook
-from spectralzoom.flows.publish.panels import class_rgb
-from spectralzoom.flows.publish.quicklook import QuicklookData, _panels, draw_quicklook
+from spectralzoom.flows.publish import quicklook
+from spectralzoom.flows.publish.quicklook import QuicklookData, _panels, draw_quicklook, palette_of
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.mosaics import choose_bands
 
@@ -80,7 +79,7 @@ def test_colours_of_bands_and_of_pixels_without_a_class():
         (np.array([800.0]), ((0, 0, 0), "grey, 800 nm")),
     ):
         assert choose_bands(waves) == told
-    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), np.array([[230, 159, 0], [0, 158, 115]]))
+    picture = palette_of(np.array([[230, 159, 0], [0, 158, 115]]))[np.array([[0, 9, 255]])]
     np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
     assert (picture[0, 0] != picture[0, 1]).any()
 
@@ -114,7 +113,7 @@ def test_class_colours_are_exact(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("height", "width"), [(96, 128), (480, 300), (256, 64)])
 def test_long_titles_stay_within_the_picture(height: int, width: int) -> None:
     """Titles and captions are wrapped, so none is cut off or overlaps the next panel."""
-    with mpl.rc_context(panels.STYLE):
+    with mpl.rc_context(quicklook.STYLE):
         data = replace(make_data(height, width), about="every line, 25 ms; " * 8)
         FigureCanvasAgg(figure := quicklook._compose(data)).draw()
     assert figure._suptitle.get_window_extent().x1 <= figure.bbox.width
@@ -134,10 +133,10 @@ def test_a_legend_of_long_names_stays_within_the_picture():
 
 def test_a_large_field_is_drawn_from_every_nth_pixel(monkeypatch: pytest.MonkeyPatch):
     """The map is thinned for the picture; the axes are those of the whole field."""
-    monkeypatch.setattr(panels, "MOST_PX", 64)
+    monkeypatch.setattr(quicklook, "MOST_PX", 64)
     data = make_data(96, 128)
     given = {name: getattr(data, name)[::2, ::2] for name in ("rectified", "confidence", "chosen")}
-    with mpl.rc_context(panels.STYLE):
+    with mpl.rc_context(quicklook.STYLE):
         drawn = quicklook._compose(replace(data, **given)).axes
     for axes in drawn:
         assert axes.images[0].get_array().shape[:2] == (48, 64)

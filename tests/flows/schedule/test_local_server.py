@@ -52,7 +52,7 @@ def test_a_user_without_a_cache_folder_waits_for_the_migrations(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server creates its own tables then."""
-    monkeypatch.setattr("spectralzoom.flows.tasks.local_server.cache_folder", lambda _: None)
+    monkeypatch.setattr("spectralzoom.flows.tasks.local_server.cache_folder", lambda: None)
     create_database(tmp_path / "home" / "prefect.db")
     assert [*tmp_path.rglob("*")] == [tmp_path / "home"]
 

@@ -31,49 +31,52 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_writable_home_or_cache_folder_is_kept(tmp_path: Path, temporary: Path) -> None:
+def test_writable_home_or_cache_folder_is_kept(
+    tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A writable ~/.cache or XDG_CACHE_HOME leaves the environment unchanged and makes no other folder."""
     for environment in ({"HOME": str(tmp_path)}, {"HOME": NOWHERE, "XDG_CACHE_HOME": str(tmp_path / "a" / "b")}):
-        before = dict(environment)
-        assert place_caches(environment) is None
-        assert environment == before
+        monkeypatch.setattr(os, "environ", dict(environment))
+        assert place_caches() is None
+        assert os.environ == environment
     assert list(temporary.iterdir()) == []
 
 
 @pytest.mark.parametrize(
     "environment", [{"HOME": NOWHERE}, {"HOME": NOWHERE, "XDG_CACHE_HOME": NOWHERE}, {"HOME": "here"}]
 )
-def test_caches_without_a_home_are_in_a_temporary_folder(environment: dict[str, str], temporary: Path) -> None:
+def test_caches_without_a_home_are_in_a_temporary_folder(
+    environment: dict[str, str], temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Only this user may enter the folder; caches that have a folder of their own keep it."""
-    environment = environment | {"MPLCONFIGDIR": "/elsewhere"}
-    folder = place_caches(environment)
+    monkeypatch.setattr(os, "environ", environment | {"MPLCONFIGDIR": "/elsewhere"})
+    folder = place_caches()
     assert folder.parent == temporary
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert environment["XDG_CACHE_HOME"] == str(folder)
-    assert environment["NUMBA_CACHE_DIR"] == str(folder / "numba")
-    assert environment["MPLCONFIGDIR"] == "/elsewhere"
+    assert os.environ["XDG_CACHE_HOME"] == str(folder)
+    assert os.environ["NUMBA_CACHE_DIR"] == str(folder / "numba")
+    assert os.environ["MPLCONFIGDIR"] == "/elsewhere"
 
 
 def test_missing_home_is_replaced_or_reported(temporary: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without a passwd entry HOME becomes /nonexistent; without a writable folder the error names XDG_CACHE_HOME."""
     monkeypatch.setattr(pwd, "getpwuid", lambda number: {}[number])
-    environment: dict[str, str] = {}
-    assert place_caches(environment) is not None
-    assert environment["HOME"] == "/nonexistent"
+    monkeypatch.setattr(os, "environ", {})
+    assert place_caches() is not None
+    assert os.environ["HOME"] == "/nonexistent"
+    monkeypatch.setattr(os, "environ", {"HOME": NOWHERE})
     monkeypatch.setattr(tempfile, "tempdir", NOWHERE)
     with pytest.raises(SettingsError, match=r"neither a home nor a temporary folder .* set XDG_CACHE_HOME to a folder"):
-        place_caches({"HOME": NOWHERE})
+        place_caches()
 
 
 def test_prefect_pages_are_unpacked_into_a_writable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They stay beside Prefect's code if that folder is writable, else go into the cache folder."""
-    environment = {"XDG_CACHE_HOME": str(tmp_path)}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(os, "access", lambda *_: True)
-    assert place_pages(environment) == {}
+    assert place_pages() == {}
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert place_pages(environment) == {
-        "PREFECT_SERVER_UI_STATIC_DIRECTORY": str(tmp_path / "spectralzoom" / "prefect-pages")
-    }
+    assert place_pages() == {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(tmp_path / "spectralzoom" / "prefect-pages")}
 
 
 ROOT = Path(__file__).parents[3]

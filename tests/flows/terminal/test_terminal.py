@@ -15,12 +15,12 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from spectralzoom.flows.publish.report import render_markdown, render_report
+from spectralzoom.flows.publish.report import render_markdown
 from spectralzoom.flows.terminal.figures import three_digits
 from spectralzoom.flows.terminal.progress import StageProgress, Terminal
 from spectralzoom.pipeline.errors import is_visible
 from spectralzoom.storage.whole_files import to_json
-from tests.flows.publish.test_receipt import make_receipt
+from tests.flows.publish.test_receipt import make_receipt, page_of
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
 SHOWN = "field\\x1b]0;owned\\x07\\x1b[2J\\u202egnp.map\\x9b31m\\u2028\\udcff"
@@ -55,7 +55,7 @@ def test_pages_show_names_as_escapes() -> None:
     """A name cannot reverse the text beside it; HTML in it is no markup, nor is Markdown on Prefect's page."""
     receipt = make_receipt()
     receipt["survey"] = HOSTILE + '<b title="x">'
-    page = render_report(receipt, b"")
+    page = page_of(receipt)
     assert page.count(SHOWN) >= 2
     assert '<b title="' not in page
     words = HOSTILE + "<b>[x](y)`|"
