@@ -112,6 +112,7 @@ class Mosaic:
     components: Components
     step: float
     wavelength_nm: NDArray[np.float64]  # (band,)
+    fwhm_nm: NDArray[np.float64] | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -190,7 +191,7 @@ class Mosaic:
 def open_mosaic(path: Path) -> Mosaic:
     """Open a mosaic. Raises IncompleteStoreError where it is missing or damaged."""
     group = layout.open_group(path)
-    return Mosaic(group, layout.read_components(group), layout.step_of(group), layout.read_bands(group)[0])
+    return Mosaic(group, layout.read_components(group), layout.step_of(group), *layout.read_bands(group))
 
 
 @dataclass(frozen=True)
