@@ -73,8 +73,9 @@ def parse_visit(value: object) -> str:
 
 def parse_budget(value: object) -> float:
     """Return a fraction of the full scan's time, from 0.5 or text such as 50%; raises BudgetError."""
-    number = _amount(value, {"%": 1.0, "": 100.0})  # in percent, so that 70% is 0.7
-    number = None if number is None else number / 100
+    number = _amount(value, {"%": 1.0, "": 1.0})
+    if number is not None and str(value).strip().endswith("%"):
+        number /= 100  # not times 0.01: 70% is 0.7
     if number is None or not 0 < number <= 1:
         raise BudgetError(f"must be a fraction of the full scan's seconds, above 0 and at most 1, got {value!r}")
     return number
