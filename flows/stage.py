@@ -211,7 +211,7 @@ class Stores:
 
     def _make(self, request: Request, ref: Ref) -> Ref:
         """Make a store, after those of its inputs that were cleared away; in a dry run record that it would be made."""
-        for one in request.inputs if ref.key else ():
+        for one in request.inputs:
             self.restore(one)
         if self.dry:
             return self._record(replace(self._row(request, ref), state="to run"))

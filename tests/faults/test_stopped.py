@@ -57,8 +57,8 @@ def asked(out: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def whole(subject: Subject) -> Any:
     """Return the receipt of the same survey without a fault."""
-    assert subject.nursery.run(asked(subject.folder / "whole")).code == 0
-    (receipt,) = receipts(subject.folder / "whole")
+    assert subject.nursery.run(asked(subject.folder / "judged")).code == 0
+    (receipt,) = receipts(subject.folder / "judged")
     return receipt
 
 

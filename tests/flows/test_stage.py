@@ -52,6 +52,9 @@ def spell(stores: Stores, text: str = "a", between: str = "-") -> Ref:
     return join(stores, join(stores, one, one, between=between), one)
 
 
+STAGES = ("letter", "join", "join-2")  # rows of `spell`
+
+
 def states(stores: Stores) -> dict[str, str]:
     """Return the state of each stage."""
     return {name: row.state for name, row in stores.rows.items()}
@@ -94,23 +97,28 @@ def test_a_store_is_made_once(archive: Archive) -> None:
     """A second survey finds it, and has no seconds of its making."""
     stores = [Stores(archive), Stores(archive)]
     assert spell(stores[0]) == spell(stores[1])
-    assert [states(one) for one in stores] == [dict.fromkeys(("letter", "join"), state) for state in ("ran", "cached")]
+    assert [states(one) for one in stores] == [dict.fromkeys(STAGES, state) for state in ("ran", "cached")]
     made, found = (one.rows["letter"] for one in stores)
     assert made.wall_s is not None
     assert (found.wall_s, found.bytes_out) == (None, made.bytes_out)
 
 
 def test_a_dry_run_makes_nothing_and_answers_addresses(tmp_path: Path, archive: Archive) -> None:
-    """A store whose input is missing has no key yet; after one argument changed, what follows from it would run."""
+    """Its keys are those of the stores; after one argument changed, what follows from it would run."""
     nowhere = Stores(Archive(tmp_path / "none"), dry=True)
-    assert spell(nowhere).key == ""
-    assert states(nowhere) == {"letter": "to run", "join": "to run"}
+    planned = spell(nowhere)
+    assert states(nowhere) == dict.fromkeys(STAGES, "to run")
     assert not (tmp_path / "none").exists()
     made = spell(Stores(archive))
+    assert planned == made
     dry = [Stores(archive, dry=True) for _ in range(3)]
     before = sorted(archive.root.rglob("*"))
-    assert [spell(dry[0]), spell(dry[1], between="+").key, spell(dry[2], text="b").key] == [made, "", ""]
-    assert [list(states(one).values()) for one in dry] == [["cached"] * 2, ["cached", "to run"], ["to run"] * 2]
+    assert [one == made for one in (spell(dry[0]), spell(dry[1], between="+"), spell(dry[2], text="b"))] == [
+        True,
+        False,
+        False,
+    ]
+    assert [list(states(one).values()) for one in dry] == [["cached"] * 3, ["cached", *["to run"] * 2], ["to run"] * 3]
     assert sorted(archive.root.rglob("*")) == before
 
 
@@ -121,12 +129,27 @@ def test_a_cleared_store_is_made_again_for_a_later_one_alone(archive: Archive, d
     archive.clear(letter(Stores(archive, dry=True), text="a"))
     stores = Stores(archive, dry=dry)
     assert spell(stores) == made
-    assert states(stores) == {"letter": "cached", "join": "cached"}
+    assert states(stores) == dict.fromkeys(STAGES, "cached")
     one = letter(stores, text="a")
     assert not stores.has(one)
     join(stores, one, between="+")
-    assert states(stores) == dict.fromkeys(("letter", "join"), "to run" if dry else "ran")
+    made_now = "to run" if dry else "ran"
+    assert states(stores) == {"letter": made_now, "join": "cached", "join-2": "cached", "join-3": made_now}
     assert stores.has(one) != dry
+
+
+def test_content_that_is_open_leaves_keys_open(archive: Archive) -> None:
+    """A stage whose arguments follow from a missing store has no key in a dry run, nor has what is made of it."""
+    dry = Stores(archive, dry=True)
+    one = letter(dry, text="a")
+    assert join(dry, join(dry, replace(one, key="")), one).key == ""
+
+
+def test_arguments_that_are_no_stores_are_keywords(archive: Archive) -> None:
+    """A positional number would be in no key."""
+    numbered = stage("number", version=1)(lambda out, number: None)
+    with pytest.raises(TypeError, match="must be keywords, to be part of the key"):
+        numbered(Stores(archive), 1)
 
 
 def test_a_store_whose_input_was_cleared_meanwhile_is_not_published(archive: Archive) -> None:

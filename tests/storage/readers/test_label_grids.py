@@ -115,7 +115,7 @@ def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:
     path = image(tmp_path)
     labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), SOUTH_UP)
     mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), SOUTH_UP)
-    train = load_data_set(path, labels=labels, train_mask=mask).load("field", "train").labels
+    train = load_data_set(path, labels=labels, train_mask=mask).load("field", training=True).labels
     assert train is not None
     np.testing.assert_array_equal(train != 255, CLASSES == 1)
 
