@@ -74,6 +74,12 @@ def test_a_plan_makes_no_archive(settings: Settings, tmp_path: Path) -> None:
     assert {"capture_coarse", "capture_fine", "rectify_fine", "segment", "evaluate"} <= set(planned)
 
 
+def test_a_plan_stops_where_the_survey_would(settings: Settings, tmp_path: Path) -> None:
+    """Stages after the last one are no part of it."""
+    planned = _plan(settings, tmp_path / "none", until="capture")
+    assert list(planned)[-1] == "condense_fine"
+
+
 def test_a_plan_changes_no_file(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The spool of an interrupted capture stays too, and no line is captured."""
     key = _plan(settings, archive)["capture_coarse"].key

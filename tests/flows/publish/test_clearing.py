@@ -78,6 +78,17 @@ def test_the_next_survey_clears_raw_lines(archive: Archive, survey_png: Survey) 
     assert problems(archive.root) == []
 
 
+def test_what_another_process_cleared_is_cleared_or_made_again(archive: Archive, survey_png: Survey) -> None:
+    """The raw lines of one pass go alone too; the mosaic, which a run shows, comes back though the map is stored."""
+    (mosaic,) = archive.refs("rectify_fine")
+    for ref in (archive.refs("capture")[0], mosaic):
+        archive.clear(ref)
+    survey_png(archive.root, accuracy=False)
+    assert raw_uris(archive) == set()
+    assert archive.find(mosaic.stage, mosaic.key) == mosaic
+    assert problems(archive.root) == []
+
+
 def test_a_flipped_bit_keeps_raw_lines(archive: Archive, survey_png: Survey, found: list[str | None]) -> None:
     """The signal is read to its last byte before."""
     there = raw_uris(archive)
