@@ -139,8 +139,11 @@ def _settings_of(
     if shown and run.problem is None and all(row.state == "cached" for row in rows.values()):
         return None
     captures = [row for name, row in rows.items() if name in (capture_coarse.name, capture_fine.name)]
-    again = settings.source in (RIG, RECORDED) and any(row.ref.key and row.ref.uri not in run.names for row in captures)
-    return replace(from_raw_cubes(catalogue, run, settings), **here) if again or not shown else settings
+    gone = settings.source == RIG and any(row.state != "cached" for row in captures)  # that light is over
+    otherwise = settings.source == RECORDED and any(row.ref.key and row.ref.uri not in run.names for row in captures)
+    if gone or otherwise or not shown:
+        return replace(from_raw_cubes(catalogue, run, settings), **here)
+    return settings
 
 
 def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:

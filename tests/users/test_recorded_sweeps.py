@@ -374,10 +374,12 @@ def test_a_rig_survey_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytes
 def test_a_recording_is_reprocessed_after_its_files_moved(
     tmp_path: Path, pushbroom: Pushbroom, weights: Path, make_weights: WeightsMaker
 ) -> None:
-    """New weights read the archive's raw cubes, and give the same map as the moved files."""
+    """New weights read the archive's raw cubes, and give the same map as the moved files; else they read the files."""
     folder, _ = pushbroom
     archive = tmp_path / "a"
     survey_sweeps(archive, folder / "scan.hdr", weights=str(weights), keep="raw")
+    assert run_reprocess(archive, QUIET, weights=make_weights(dim=16)) == 0
+    assert load_receipt(Archive.open(archive).runs()[-1])["settings"]["sweeps"] == str(folder / "scan.hdr")
     folder.rename(tmp_path / "elsewhere")
     other = make_weights(dim=24)
     assert run_reprocess(archive, QUIET, weights=other) == 0
