@@ -59,6 +59,7 @@ LATEST = "latest"
 KEY_LENGTH = 20
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
 REPLACED_S = 0.02  # in which a store is given another store's place
+MOST_LOOKS = 5
 CLOCK_S = 2.0  # clocks of two machines differ by less
 CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -254,13 +255,25 @@ def file_problem(path: Path, size: int, digest: str | None, about: os.stat_resul
 def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
     """Return the differences of a published folder from its manifest, file by file.
 
-    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only. What differs is looked at
-    twice, as another process may have cleared or replaced it meanwhile.
+    Chunks of arrays, which have checksums of their own, are read for ``every_byte`` only. A folder that another process
+    has cleared or replaced meanwhile is looked at again.
     """
-    if _differences(folder, every_byte):
+    found: list[str] = []
+    for _ in range(MOST_LOOKS):
+        before = _identity(folder)
+        found = _differences(folder, every_byte)
+        if not found or (before is not None and before == _identity(folder) and not is_cleared(folder)):
+            break
         time.sleep(REPLACED_S)
-        return _differences(folder, every_byte)
-    return []
+    return found
+
+
+def _identity(folder: Path) -> tuple[int, int] | None:
+    """Return the number of a folder, which that in its place does not share; None where there is none."""
+    with suppress(OSError):
+        about = folder.lstat()
+        return about.st_dev, about.st_ino
+    return None
 
 
 def _differences(folder: Path, every_byte: bool) -> list[str]:
