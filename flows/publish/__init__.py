@@ -1,1 +1,1 @@
-"""Publication of a survey: receipt, report, pictures, judged once the run is published."""
+"""Publication of a survey, once: receipt, report, pictures."""

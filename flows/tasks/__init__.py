@@ -1,1 +1,1 @@
-"""The survey: its context, its stages from a coarse pass to a class map, and the engines that run them."""
+"""What a survey is opened from and computed by: scenes, sources, zones, prior maps, lines, patches, the model's work."""

@@ -7,7 +7,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.compiled import FLOATS, compiled, rows_of
-from spectralzoom.pipeline.signal.subspace import BLOCK
+from spectralzoom.pipeline.signal.components import BLOCK
 
 Values = NDArray[np.float32]
 _LINES, _FRAME, _BANDS = (rows_of(FLOATS, axes, read_only=True) for axes in (3, 2, 1))

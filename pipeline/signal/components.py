@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 BROAD_BANDS = 16
+BLOCK = 4  # spectra a side of a mean
 
 Floats = NDArray[np.float64]
 Scores = NDArray[np.float32]

@@ -17,9 +17,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
-from spectralzoom.pipeline.signal.components import Components, Floats
+from spectralzoom.pipeline.signal.components import BLOCK, Components, Floats
 
-BLOCK = 4  # spectra a side of a mean
 SPECTRA_A_BAND = 200  # single spectra for the covariance, for each band; more add time and little accuracy
 FEW_BANDS = 8  # fewer cannot predict each other: their noise comes from neighbouring pixels, and all are stored
 KEPT_SPECTRA = 8192  # from which the law of residuals is learned
