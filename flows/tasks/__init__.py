@@ -1,1 +1,1 @@
-"""What a survey is opened from and computed by: scenes, sources, zones, prior maps, lines, patches, the model's work."""
+"""What a survey is opened from and computed by: scenes, sources, zones, prior maps, lines, patches, the model."""
