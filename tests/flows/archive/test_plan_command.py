@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -72,6 +73,17 @@ def test_a_plan_makes_no_archive(settings: Settings, tmp_path: Path) -> None:
         *("capture_fine", "condense_fine", "rectify_fine", "segment", "evaluate")
     ]
     assert {"capture_coarse", "capture_fine", "rectify_fine", "segment", "evaluate"} <= set(planned)
+
+
+def test_half_of_the_stores_are_made_again_as_planned(settings: Settings, archive: Path, survey_png: Any) -> None:
+    """Only missing stores are to run: what was made of them is found by its key."""
+    for product in ("effects", "condense", "locate", "condense_fine", "segment"):
+        shutil.rmtree(archive / "stages" / product)
+    planned = _plan(settings, archive)
+    done = {stage["name"]: stage["state"] for stage in survey_png(archive).receipt["stages"]}
+    assert {name: row.state.replace("to run", "ran") for name, row in planned.items()} == done
+    found = {name for name, state in done.items() if state == "cached"}
+    assert found >= {"score", "rectify_fine", "evaluate"}
 
 
 def test_a_plan_stops_where_the_survey_would(settings: Settings, tmp_path: Path) -> None:
