@@ -294,12 +294,15 @@ def check_store(folder: Path, *, every_byte: bool = False) -> None:
 
     Raises IncompleteStoreError: it is missing, or a file differs; ArchiveError: it is no folder of the archive.
     """
-    if folder.is_file() or (
-        not folder.is_symlink() and not folder.resolve().is_relative_to(_root_of(folder).resolve())
-    ):
+    if folder.is_file() or (not folder.is_symlink() and not _real(folder).is_relative_to(_real(_root_of(folder)))):
         raise ArchiveError(f"{folder} is a file, or a link leads out of the archive to it; expected a folder there")
     for problem in problems_of(folder, every_byte=every_byte):
         raise damage(folder, problem)
+
+
+def _real(path: Path) -> Path:
+    """Return a path without links; a link that leads to itself stays."""
+    return Path(os.path.realpath(path))
 
 
 def damage(folder: Path, problem: str) -> IncompleteStoreError:
