@@ -1,4 +1,4 @@
-"""What all images of a survey share: pixels, bands, georeference, nodata; and the labels that judge its map."""
+"""Frame of all images of a survey, view of its camera, and labels that judge its map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from spectralzoom.storage.store import array_digest
 
 @dataclass(frozen=True)
 class FieldView:
-    """What a camera sees of a field: its bands, and what the light depends on besides sweeps and effects."""
+    """View of a camera on a field: camera, bands, and the parameters of the light but sweeps and effects."""
 
     camera: LineCamera
     wavelength_nm: NDArray[np.float64]  # (band,)

@@ -36,7 +36,7 @@ RETRY_DELAY_S = 2.0
 
 @dataclass(frozen=True)
 class Output:
-    """What a stage writes: the folder of its store, and its progress."""
+    """Folder of a store that a stage writes, and the progress of the stage."""
 
     path: Path  # a folder to write into
     report: Report
@@ -136,7 +136,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one stage; figures of a store that was found are None."""
+    """Outcome of one stage; figures of a store that was found are None."""
 
     name: str
     title: str
@@ -207,7 +207,7 @@ class Stores:
         """Make a store again if its files were cleared away."""
         if ref in self._cleared:
             self._cleared[ref]()
-            self._cleared.pop(ref, None)
+            del self._cleared[ref]
 
     def _make(self, request: Request, ref: Ref) -> Ref:
         """Make a store, after those of its inputs that were cleared away; in a dry run record that it would be made."""

@@ -40,6 +40,7 @@ from spectralzoom.flows.tasks.observer import current_observer, tidy_up
 from spectralzoom.flows.tasks.visit import settings_of_visit
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
+from spectralzoom.storage.readers.scene_files import RasterPixels
 from spectralzoom.storage.store import Archive, Ref
 
 
@@ -85,29 +86,12 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
 
     In a dry run, a store that is missing leaves open whether there is a second pass: then both are run.
     """
-    field, settings = plan.field, plan.settings
-    effects, first, second = None, None, None
-    if field.raster is not None:  # no capture
-        mosaic = condense_raster(
-            stores,
-            scene=field.scene,
-            frame=field.frame,
-            signal=settings.signal,
-            raster=field.raster,
-            memory=settings.memory,
-        )
-        _stop_after(stores, plan, mosaic, "capture", "mosaic")
+    field = plan.field
+    effects = _effects(stores, plan) if field.source.simulates else None
+    first = None
+    if field.raster is not None:
+        mosaic = _raster_mosaic(stores, plan, field.raster)
     else:
-        if field.source.simulates:
-            effects = choose_effects(
-                stores,
-                scene=field.scene,
-                rig=settings.simulated_rig,
-                sweeps=plan.typical,
-                cost=settings.cost,
-                asked=settings.effects,
-                tol=settings.tol,
-            )
         first = _first_pass(stores, plan, effects)
         mosaic = first.mosaic
     attention = score(
@@ -120,6 +104,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         budget=plan.budget,
         least_gain=plan.least_gain,
     )
+    second = None
     if first is not None and not plan.passes.plain:
         request = load_plan(attention) if stores.has(attention) else None
         if request is None or request.sweeps:
@@ -138,25 +123,55 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         part=plan.part,
         least_gain=plan.least_gain,
     )
-    products = Products(
-        mosaic=mosaic, attention=attention, class_map=class_map, effects=effects, first=first, second=second
+    return Products(
+        mosaic=mosaic,
+        attention=attention,
+        class_map=class_map,
+        effects=effects,
+        first=first,
+        second=second,
+        ground=None if field.ground_grid is None else ground(stores, class_map, mosaic, ground_grid=field.ground_grid),
+        accuracy=_accuracy(stores, plan, mosaic, class_map, first) if plan.is_judged else None,
     )
-    if field.ground_grid is not None:
-        products = replace(products, ground=ground(stores, class_map, mosaic, ground_grid=field.ground_grid))
-    if plan.is_judged:
-        accuracy = evaluate(
-            stores,
-            mosaic,
-            class_map,
-            None if first is None else first.seams,
-            gains=plan.gains,
-            labels=field.labels,
-            along=plan.passes.along,
-            pointing=field.simulated.pointing,
-            controls=plan.controls,
-        )
-        products = replace(products, accuracy=accuracy)
-    return products
+
+
+def _raster_mosaic(stores: Stores, plan: SurveyPlan, raster: RasterPixels) -> Ref:
+    """Return the mosaic of a raster, which needs no capture."""
+    field, settings = plan.field, plan.settings
+    mosaic = condense_raster(
+        stores, scene=field.scene, frame=field.frame, signal=settings.signal, raster=raster, memory=settings.memory
+    )
+    _stop_after(stores, plan, mosaic, "capture", "mosaic")
+    return mosaic
+
+
+def _effects(stores: Stores, plan: SurveyPlan) -> Ref:
+    """Return the choice of effects of a simulated source."""
+    settings = plan.settings
+    return choose_effects(
+        stores,
+        scene=plan.field.scene,
+        rig=settings.simulated_rig,
+        sweeps=plan.typical,
+        cost=settings.cost,
+        asked=settings.effects,
+        tol=settings.tol,
+    )
+
+
+def _accuracy(stores: Stores, plan: SurveyPlan, mosaic: Ref, class_map: Ref, first: Pass | None) -> Ref:
+    """Return the figures of a map by the labels."""
+    return evaluate(
+        stores,
+        mosaic,
+        class_map,
+        None if first is None else first.seams,
+        gains=plan.gains,
+        labels=plan.field.labels,
+        along=plan.passes.along,
+        pointing=plan.field.simulated.pointing,
+        controls=plan.controls,
+    )
 
 
 def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:

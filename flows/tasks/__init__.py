@@ -1,1 +1,1 @@
-"""What a survey is opened from and computed by: scenes, sources, zones, prior maps, lines, patches, the model."""
+"""Parts of a survey below its stages: scenes, sources, zones, prior maps, choice of lines and patches, network."""
