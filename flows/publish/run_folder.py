@@ -156,7 +156,7 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
         patches = fine.patch_index if not plan.passes.plain else read_in_full(products.attention, products.class_map)
         what = "Read by the full network" if plan.passes.plain else "Captured again"
         chosen = pixels_of_patches(plan.field.grid, patches)[thin]
-        choice = f"{what}: {len(patches)} patches by {plan.settings.policy}"
+        choice = f"{what}: {len(patches)} {'patch' if len(patches) == 1 else 'patches'} by {plan.settings.policy}"
     return QuicklookData(
         survey=plan.field.name,
         seed=plan.settings.seed,

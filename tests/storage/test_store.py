@@ -492,6 +492,26 @@ def test_a_cleared_store_keeps_its_manifest_and_is_made_again(archive: Archive) 
     assert problems(archive) == []
 
 
+def test_a_store_made_anew_during_each_look_is_not_damaged(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process clears it and makes it again, twice, while its files are compared."""
+    ref = produce(archive, two_files, scene="a")
+    problem, renewals = store.file_problem, iter([True, True])
+    first = Path(next(iter(archive.manifest(ref)["files"]))).name
+
+    def renewed(*given: Any) -> str | None:
+        if given[0].name != first or not next(renewals, False):
+            return problem(*given)
+        with monkeypatch.context() as patch:
+            patch.setattr(store, "file_problem", problem)
+            archive.clear(ref)
+            produce(archive, two_files, scene="a")
+        return "is missing"
+
+    monkeypatch.setattr(store, "file_problem", renewed)
+    assert archive.find(ref.stage, ref.key) == ref
+    assert next(renewals, None) is None
+
+
 def test_a_store_cleared_during_a_check_is_not_damaged(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another survey may clear it while a reader or verify checks its files."""
     small = small_survey(archive)

@@ -374,12 +374,10 @@ def test_a_rig_survey_is_reprocessed_from_raw(tmp_path: Path, monkeypatch: pytes
 def test_a_recording_is_reprocessed_after_its_files_moved(
     tmp_path: Path, pushbroom: Pushbroom, weights: Path, make_weights: WeightsMaker
 ) -> None:
-    """New weights read the archive's raw cubes, and give the same map as the moved files; else they read the files."""
+    """New weights read the archive's raw cubes, and give the same map as the moved files."""
     folder, _ = pushbroom
     archive = tmp_path / "a"
     survey_sweeps(archive, folder / "scan.hdr", weights=str(weights), keep="raw")
-    assert run_reprocess(archive, QUIET, weights=make_weights(dim=16)) == 0
-    assert load_receipt(Archive.open(archive).runs()[-1])["settings"]["sweeps"] == str(folder / "scan.hdr")
     folder.rename(tmp_path / "elsewhere")
     other = make_weights(dim=24)
     assert run_reprocess(archive, QUIET, weights=other) == 0
@@ -387,6 +385,18 @@ def test_a_recording_is_reprocessed_after_its_files_moved(
     assert again["settings"]["keep"] == "raw"
     fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
+
+
+def test_a_recording_that_is_there_is_reprocessed_from_its_files(
+    tmp_path: Path, pushbroom: Pushbroom, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Raw lines that were cleared, and that a new version of a later stage needs, are read from it again."""
+    folder, _ = pushbroom
+    survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
+    be_version(monkeypatch, "condense", 99)
+    assert run_reprocess(tmp_path / "a", QUIET) == 0
+    runs = Archive.open(tmp_path / "a").runs()
+    assert [load_receipt(run)["settings"]["sweeps"] for run in runs] == [str(folder / "scan.hdr")] * 2
 
 
 def test_a_damaged_signal_of_a_recording_goes_on_request(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:

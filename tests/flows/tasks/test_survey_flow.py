@@ -133,6 +133,7 @@ def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> 
     """The error comes before a run begins."""
     with pytest.raises(ValidationError, match="fraction of the full scan's seconds, above 0 and at most 1, got 3"):
         SurveySettings(budget=3)
+    assert SurveySettings(budget="70%").settings().budget == 0.7
     with pytest.raises(ValidationError, match=r"unknown setting .*did you mean 'budget'"):
         SurveySettings(bugdet=0.5)
 
