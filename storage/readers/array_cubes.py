@@ -24,13 +24,14 @@ from spectralzoom.storage.arrays.georeference import find_geobox
 from spectralzoom.storage.readers.array_files import Arrays, FileArray
 from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, Guard, read_by_chunks
 
-ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
-_ACROSS = ("crosstrack", "across_track")
+_ALONG = ("downtrack", "along_track", "number_of_lines")
+_ACROSS = ("crosstrack", "across_track", "pixels_per_line")
+ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", *_ALONG)
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
-BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
+BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel", "channels", "spectral")
 WAVELENGTHS = (
     *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
-    *("wl", "lambda", "nm"),
+    *("wl", "lambda", "nm", "wavelength_3d"),
 )
 METRES = {"m", "meter", "meters", "metre", "metres"}
 

@@ -142,7 +142,11 @@ class CubeSource:
         }
         known = {name: fact for name, fact in facts.items() if fact[1] is not None}
         places = {} if self.geobox is None else odc_xr.xr_coords(self.geobox, dims=("y", "x"))
-        about: dict[str, Any] = {"notes": self.notes, "files": tuple(map(str, self.files)), "wavelengths_from": self.bands.origin}
+        about: dict[str, Any] = {
+            "notes": self.notes,
+            "files": tuple(map(str, self.files)),
+            "wavelengths_from": self.bands.origin,
+        }
         about |= {} if self.nodata is None else {"_FillValue": self.nodata}
         lines = indexing.LazilyIndexedArray(_Lines(self))
         return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=self.name, attrs=about)
