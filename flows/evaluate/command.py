@@ -80,7 +80,7 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
         "settings": {**asked, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
         **summarise(runs, candidates[0].described.class_names, request),
-        "data_notes": [*data.notes, *jobs.notes],
+        "data_notes": [*data.notes, *jobs.notes, *(note for one in candidates for note in one.notes)],
         "files": [] if request.out is None else [str(request.out / "evaluation.json")],
     }
     if request.out is not None:

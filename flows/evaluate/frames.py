@@ -24,6 +24,7 @@ from spectralzoom.flows.training.data import (
     only_class,
     open_training_data,
     scene_notes,
+    untaught_note,
 )
 from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.spectral import patches_of
@@ -99,6 +100,12 @@ class Candidate:
         """Return the training, validation and held-out scenes of the record."""
         return cast(dict[str, Any], self.described.record.get("split", {}))
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return the note on classes that the weights never draw, if any."""
+        names = self.described.untaught
+        return (f"{self.path.name}: {untaught_note(names)}",) if names else ()
+
     def validated_on(self, scene: RasterScene) -> bool:
         """Return whether the scene was one for validation."""
         return scene.clear_key in self.split.get("validation", {}).values()
@@ -125,7 +132,8 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
-        alike = one.described.config == first.described.config and one.camera == first.camera
+        configs = [replace(of.described.config, untaught=()) for of in (one, first)]  # a fold may lack a class
+        alike = configs[0] == configs[1] and one.camera == first.camera
         if not alike or one.described.class_names != first.described.class_names:
             raise SettingsError(
                 f"{one.path} differs from {first.path} in camera, sizes or classes; several --weights are seeds of one"

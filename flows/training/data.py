@@ -322,6 +322,13 @@ def only_class(scene: RasterScene) -> str | None:
     return scene.class_names[there[0]] if len(there) == 1 else None
 
 
+def untaught_note(names: Sequence[str]) -> str:
+    """Return the note on classes without a training pixel."""
+    if len(names) == 1:
+        return f"class {names[0]} has no pixel in the training frames; it will never be drawn"
+    return f"classes {', '.join(names)} have no pixel in the training frames; they will never be drawn"
+
+
 def alike_note(kind: str, names: Sequence[str]) -> str:
     """Return the note on scenes with a single class, which may stand for unlabelled."""
     return (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,22 @@ from rich.console import Console
 from spectralzoom.flows.tasks.scene import masks_contain
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
 from spectralzoom.flows.training import figures
-from spectralzoom.flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
+from spectralzoom.flows.training.data import (
+    Report,
+    TrainingData,
+    alike_note,
+    check_out,
+    open_training_data,
+    read_farm_name,
+    untaught_note,
+)
 from spectralzoom.flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
-from spectralzoom.models.training.train import PIXELS, LabelledPixels, linear_classifier, train
+from spectralzoom.models.training.train import PIXELS, LabelledPixels, continued, linear_classifier, train
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
@@ -36,7 +44,7 @@ from spectralzoom.models.weights.files import (
     save_weights,
     with_record,
 )
-from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
@@ -64,6 +72,7 @@ def train_weights(
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
+    check_classes(request, scenes, tell)
     if begun is None:
         normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
     else:
@@ -115,12 +124,29 @@ def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> T
     )
 
 
+def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], None]) -> None:
+    """Tell the classes without a training pixel. Raises SceneError: fewer than two classes have one."""
+    names, frames = scenes.common.names, [*scenes.train.keys]
+    taught = [name for number, name in enumerate(names) if number not in scenes.untaught]
+    if len(taught) < 2:
+        note = alike_note(taught[0], frames) if taught else f"no pixel of {list_some(frames)} has a label"
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
+    if scenes.untaught:
+        tell(untaught_note([names[number] for number in scenes.untaught]))
+
+
 def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     """Raise SettingsError unless a training can start from these weights.
 
     Bands, classes and sizes must be theirs, and the training must contain the pixels that they know, by the content of
     the scenes. So none of these pixels judges the result, and the record names them all.
     """
+    if begun.class_names != scenes.common.names:
+        both = [", ".join(names) for names in (begun.class_names, scenes.common.names)]
+        raise SettingsError(
+            f"--start {request.start}: its classes are {both[0]}, those of {request.dataset} are {both[1]};"
+            " give the same classes in the same order, in scene.toml"
+        )
     split = begun.record.get("split", {})
     known = set(split.get("train", {}).values())
     masks = split.get("pixels", {})
@@ -129,8 +155,7 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
         "training scenes": known <= set(now.keys.values()),
         "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
         "bands": begun.basis == scenes.common.basis,
-        "classes": begun.class_names == scenes.common.names,
-        "sizes of the network": begun.config == network_config(request, scenes.common),
+        "sizes of the network": replace(begun.config, untaught=()) == network_config(request, scenes.common),
     }.items():
         if not kept:
             raise SettingsError(
@@ -152,10 +177,12 @@ def _learned(
     common = scenes.common
     settings = request.settings
     examples = scenes.train.examples
-    config = network_config(request, common)
+    config = replace(network_config(request, common), untaught=scenes.untaught)
     rng = np.random.default_rng([0x1DA])
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
     start = linear_classifier(pixels, config.classes) | (load_encoder() if config.deep else {})
+    if begun is not None:
+        begun = replace(begun, segmenter=continued(begun.segmenter, config, start))
     model, summary = train(
         config,
         examples,

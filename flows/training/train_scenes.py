@@ -16,7 +16,7 @@ from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import Example, normalised, observe_scene
+from spectralzoom.models.training.examples import Example, labelled_classes, normalised, observe_scene
 from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -86,6 +86,11 @@ class Scenes:
     common: Common
     train: Imaged
     validation: Imaged
+
+    @property
+    def untaught(self) -> tuple[int, ...]:
+        """Return the classes without a training pixel, ascending."""
+        return tuple(sorted({*range(len(self.common.names))} - labelled_classes(self.train.examples)))
 
     @property
     def split(self) -> dict[str, Any]:
@@ -159,10 +164,7 @@ def _imaged(
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.settings.seed, stream, number])
         found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
-    notes = [alike_note(*one) for one in alike.items()]
-    if trained is None and [*alike.values()] == [[*found.keys]]:
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *scene_notes(*lists)):
+    for note in (*(alike_note(*one) for one in alike.items()), *scene_notes(*lists)):
         tell(note)
     return common, found
 
