@@ -23,17 +23,18 @@ from spectralzoom.models.weights.files import Weights, load_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 
-NAMES = ("soil", "crop", "weed")
+NAMES = ("weed", "soil", "crop")  # values 3, 1, 2 of the labels
+VALUES = {"soil": 1, "crop": 2, "weed": 3, "maize": 4}
 SHAPE = (16, 16)
 NOTE = "class weed has no pixel in the training frames; it will never be drawn"
 TRAINED = ("002", "003", "004")  # 001 is kept for validation
 
 
-def _folder(root: Path, weeds: dict[str, np.ndarray] | None = None, names: tuple[str, ...] = NAMES) -> Path:
+def _folder(root: Path, weeds: dict[str, np.ndarray] | None = None) -> Path:
     """Write four cubes of soil and crop, with weed where ``weeds`` says so by frame, and return their folder."""
     (root / "masks").mkdir(parents=True)
     rng = np.random.default_rng(0)
-    classes = "".join(f"{name} = {1 + NAMES.index(name)}\n" for name in names)
+    classes = "".join(f"{name} = {VALUES[name]}\n" for name in NAMES)
     about = "unlabelled = 0\nwavelengths_nm = [500, 600, 700, 800]\nlabels = 'masks/{number}.npy'\n"
     (root / "scene.toml").write_text(f"{about}[classes]\n{classes}")
     for number in ("001", *TRAINED):
@@ -56,9 +57,9 @@ def _expect_without_weed(weights: Weights) -> None:
     for scale in (1.0, 100.0):
         columns = rng.normal(0, scale, (*SHAPE, weights.config.columns)).astype(np.float32)
         drawn, every_class = map_of_columns(weights, columns, SceneGrid(*SHAPE, 8), LineSpec())
-        assert (drawn.classes < 2).all()
-        np.testing.assert_allclose(np.exp(every_class[..., :2]).sum(axis=-1), 1, atol=1e-5)
-        assert np.isneginf(every_class[..., 2]).all()
+        assert drawn.classes.min() > 0
+        np.testing.assert_allclose(np.exp(every_class[..., 1:]).sum(axis=-1), 1, atol=1e-5)
+        assert np.isneginf(every_class[..., 0]).all()
 
 
 PIXELS = np.zeros(SHAPE, bool)
@@ -70,7 +71,8 @@ def test_classes_without_a_training_pixel_are_named_and_never_drawn(case: str, t
     """No label has the class, or validation alone, or its pixels have no value, or a mask leaves them out."""
     where = {"named alone": (), "of validation": ("001",), "without values": TRAINED, "outside of the mask": TRAINED}
     folder = _folder(tmp_path / "field", dict.fromkeys(where[case], PIXELS))
-    asked = _request(folder, tmp_path / "w.safetensors")
+    settings = TrainingSettings(2, 1, 16, darkest_ms=10.0 if case == "of validation" else 100.0)
+    asked = _request(folder, tmp_path / "w.safetensors", settings=settings)
     if case == "without values":
         for number in TRAINED:
             values = np.load(folder / f"{number}.npy")
@@ -85,7 +87,7 @@ def test_classes_without_a_training_pixel_are_named_and_never_drawn(case: str, t
     assert notes.count(NOTE) == 1
     assert np.isfinite([*record["readings"]["miou"].values()]).all()
     weights = load_weights(asked.out)
-    assert weights.config.untaught == (2,)
+    assert weights.config.untaught == (0,)
     _expect_without_weed(weights)
 
 
@@ -117,19 +119,18 @@ def test_a_continued_training_may_add_the_class(tmp_path: Path) -> None:
     assert weights.config.untaught == ()
     weed = weights.columns(np.load(folder / "001.npy"), np.array([500.0, 600.0, 700.0, 800.0]))
     drawn, _ = map_of_columns(weights, weed, SceneGrid(*SHAPE, 8))
-    assert (drawn.classes[1, 1], drawn.classes[8:].max()) == (2, 1)
+    assert (drawn.classes[1, 1], drawn.classes[8:].min()) == (0, 1)
 
 
-@pytest.mark.parametrize("names", [("crop", "soil", "weed"), ("soil", "crop"), ("soil", "crop", "weed", "maize")])
+@pytest.mark.parametrize("names", [("crop", "soil", "weed"), ("soil", "crop"), (*NAMES, "maize")])
 def test_continued_training_refuses_other_classes_by_name(names: tuple[str, ...], tmp_path: Path) -> None:
     """Another order or list of classes in scene.toml."""
     folder = _folder(tmp_path / "field")
     first = _request(folder, tmp_path / "a.safetensors")
     train_weights(first)
     text = (folder / "scene.toml").read_text().partition("[classes]\n")[0]
-    values = {"soil": 1, "crop": 2, "weed": 3, "maize": 4}
-    (folder / "scene.toml").write_text(text + "[classes]\n" + "".join(f"{one} = {values[one]}\n" for one in names))
-    known = f"its classes are soil, crop, weed, those of .* are {', '.join(names)}; give the same classes"
+    (folder / "scene.toml").write_text(text + "[classes]\n" + "".join(f"{one} = {VALUES[one]}\n" for one in names))
+    known = f"its classes are weed, soil, crop, those of .* are {', '.join(names)}; give the same classes"
     with pytest.raises(SettingsError, match=known):
         train_weights(replace(first, out=tmp_path / "b.safetensors", start=first.out))
 
