@@ -16,7 +16,7 @@ from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import Example, labelled_classes, normalised, observe_scene
+from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
 from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -90,7 +90,7 @@ class Scenes:
     @property
     def untaught(self) -> tuple[int, ...]:
         """Return the classes without a training pixel, ascending."""
-        return tuple(sorted({*range(len(self.common.names))} - labelled_classes(self.train.examples)))
+        return untaught_classes(self.train.examples, len(self.common.names))
 
     @property
     def split(self) -> dict[str, Any]:

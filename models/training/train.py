@@ -9,7 +9,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memor
 from spectralzoom.models.network.segmenter import Segmenter
 from spectralzoom.models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example, labelled_classes
+from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example, labelled_classes, untaught_classes
 from spectralzoom.models.training.objective import PHASES, batch_loss, class_weights
 from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from spectralzoom.pipeline.errors import PipelineError, SceneError
@@ -312,10 +312,13 @@ def train(
 
     ``start`` are named initial tensors; others are random. ``checkpoint`` is a file of the state, from which a killed
     run of the same settings and examples continues. ``device`` is one of `models.network.machine.choose_device`.
+    Classes of ``config`` without a labelled pixel are `SegmenterConfig.untaught` in the segmenter.
 
     Raises TrainingError: the loss or its gradient was not finite three steps in a row.
     """
     keep_freed_memory()
+    untaught = untaught_classes(examples, config.classes)
+    config = replace(config, untaught=untaught if len(untaught) < config.classes else ())
     trainer = Trainer(config, examples, gain_shift, settings, start, augmentation, device)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:

@@ -174,7 +174,7 @@ def test_untaught_classes_learn_nothing_and_disturb_nothing() -> None:
     """Training keeps finite weights, and draws the taught classes of two separable ones."""
     scene = block_example()
     scene = replace(scene, labels=2 * scene.labels)  # classes 0 and 2 of 4
-    config = SegmenterConfig(CLASSES, 2, patch=8, width=4, dim=16, layers=1, heads=2, untaught=(1, 3))
+    config = SegmenterConfig(CLASSES, 2, patch=8, width=4, dim=16, layers=1, heads=2)
     model, summary = train(config, [scene], np.zeros(2, np.float32), TrainingSettings(steps=3, batch=2, crop=16))
     assert (summary["skipped_steps"], model.config.untaught) == (0, (1, 3))
     assert all(torch.isfinite(one).all() for one in model.parameters())
