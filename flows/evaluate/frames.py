@@ -26,9 +26,7 @@ from spectralzoom.flows.training.data import (
     scene_notes,
     untaught_note,
 )
-from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.spectral import patches_of
-from spectralzoom.models.policies.policies import POLICIES
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
@@ -38,46 +36,6 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-
-FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
-JUDGED = tuple(name for name in POLICIES if name != "mask")  # needs a file
-USUAL = ("gain", "random")
-
-
-@dataclass(frozen=True)
-class EvaluateRequest:
-    """Request to judge weights."""
-
-    dataset: str
-    weights: tuple[Path, ...]
-    out: Path | None = None
-    fractions: tuple[float, ...] = FRACTIONS
-    policies: tuple[str, ...] = USUAL
-    frames: tuple[str, ...] = ()  # empty: all
-    scenes: int | None = None  # of the built-in farm
-    seed: int = 0
-    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
-    device: str = PROCESSOR  # or auto
-
-
-def checked_request(request: EvaluateRequest) -> EvaluateRequest:
-    """Sort fractions and drop those that are always judged. Raises SettingsError for invalid values."""
-    for fraction in request.fractions:
-        if not 0 <= fraction <= 1:
-            raise SettingsError(f"--fractions are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
-    for policy in request.policies:
-        if policy not in JUDGED:
-            raise SettingsError(
-                f"--policies: {policy!r} cannot be judged on a data set; choose from {', '.join(JUDGED)}"
-            )
-    if request.seed < 0:
-        raise SettingsError(f"--seed must be at least 0, got {request.seed}")
-    return replace(
-        request,
-        fractions=tuple(sorted({fraction for fraction in request.fractions if 0 < fraction < 1})),
-        policies=tuple(dict.fromkeys(request.policies)),
-    )
-
 
 FARM_TEST_SCENES = 4
 
@@ -201,8 +159,8 @@ def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]
     return fit
 
 
-def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
-    """Assign to each frame the weights that were not trained on it.
+def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, *, named: bool = False) -> Jobs:
+    """Assign to each frame the weights that were not trained on it; every ``named`` one needs some.
 
     Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
     SettingsError: weights were trained on different pixels of a frame.
@@ -238,14 +196,14 @@ def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[
         labels = judged_labels(scene, weights[fit[0]].described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
-    if jobs.left_out and (request.frames or not jobs.frames):
+    if jobs.left_out and (named or not jobs.frames):
         raise SceneError(
             f"no weights are left for {', '.join(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
             "trained on it, and frames trained on are refused: judge by others, or train with some held out: "
             "spectralzoom train ... --hold-out NAMES"
         )
     if not labelled:
-        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
+        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {data.law} to judge by")
     notes = [*(alike_note(*one) for one in alike.items()), *scene_notes(empty, regridded)]
     if validated:
         notes.append(

@@ -1,4 +1,4 @@
-"""Define the request of a training, and image its scenes."""
+"""Image the scenes of a training."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.flows.settings.model_flags import NO_TRAIN_FLAGS, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import Report, TrainingData, alike_note, only_class, scene_notes, trained_pixels
-from spectralzoom.models.network.machine import PROCESSOR
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
-from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -26,27 +25,17 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
 COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files
+CAMERA = LineCamera()
 
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """Request of a training; a ``patch`` of None follows from the data."""
+    """Request of a training."""
 
     dataset: str
     out: Path
-    hold_out: tuple[str, ...] = ()
-    validation: int | None = None
-    scenes: int | None = None  # of a built-in farm; None: its default
-    patch: int | None = None
-    columns: int | None = None  # of spectral features; None: 24 of built-in scenes, 48 of files
-    width: int = SegmenterConfig.width
-    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads
-    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
-    settings: TrainingSettings = field(default_factory=TrainingSettings)
-    camera: LineCamera = field(default_factory=LineCamera)
+    flags: TrainFlags = NO_TRAIN_FLAGS
     command: str = ""
-    device: str = PROCESSOR  # or auto
-    start: Path | None = None  # weights from which the training starts
 
 
 @dataclass(frozen=True)
@@ -153,7 +142,7 @@ def _imaged(
             continue
         found.keys[name] = scene.key
         found.content.extend(scene.content)
-        if request.choices.get("train_mask") is not None:
+        if request.flags.train_mask is not None:
             found.pixels[scene.key] = pack_mask(mask)
         if (alone := only_class(scene)) is not None:
             alike.setdefault(alone, []).append(name)
@@ -162,8 +151,8 @@ def _imaged(
         if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
             negative.append(name)
         grid = SceneGrid(*scene.shape, common.patch)
-        rng = np.random.default_rng([request.settings.seed, stream, number])
-        found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
+        rng = np.random.default_rng([request.flags.seed, stream, number])
+        found.examples.append(observe_scene(scene, CAMERA, grid, common.basis, rng))
     for note in (*(alike_note(*one) for one in alike.items()), *scene_notes(*lists)):
         tell(note)
     return common, found
@@ -176,10 +165,10 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
         note = alike_note(scene.class_names[0], [scene.name])
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     built_in = bool(built_in_laws(request.dataset))
-    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns or COLUMNS[built_in])
-    patch = request.patch or suggested_patch(scene.shape, built_in=built_in)
+    basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[built_in])
+    patch = request.flags.patch or suggested_patch(scene.shape, built_in=built_in)
     common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
-    network_config(request, common)  # raises for invalid sizes before the first scene is imaged
+    network_config(request.flags, common)  # raises for invalid sizes before the first scene is imaged
     return common
 
 
@@ -188,7 +177,7 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
     return 16 if built_in or 256 <= min(shape) < 512 else 32 if min(shape) >= 512 else 8
 
 
-def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
+def network_config(flags: TrainFlags, common: Common) -> SegmenterConfig:
     """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
     deep = common.patch >= DEEP_PATCH_PX
     try:
@@ -196,9 +185,10 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             classes=len(common.names),
             columns=common.basis.columns,
             patch=common.patch,
-            width=request.width,
             deep=deep,
-            **{"layers": 1 if deep else SegmenterConfig.layers, **request.tokens},
+            dim=flags.dim,
+            heads=flags.heads,
+            layers=flags.layers or (1 if deep else SegmenterConfig.layers),
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error

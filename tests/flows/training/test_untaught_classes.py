@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +9,14 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
-from spectralzoom.flows.evaluate.frames import EvaluateRequest
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.training import figures
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.reading.inference import map_of_columns
-from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.models.weights.files import Weights, load_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -47,8 +45,8 @@ def _folder(root: Path, weeds: dict[str, np.ndarray] | None = None) -> Path:
 
 
 def _request(folder: Path, out: Path, **more: Any) -> TrainRequest:
-    settings = TrainingSettings(steps=2, batch=1, crop=16)
-    return TrainRequest(str(folder), out, **{"validation": 1, "patch": 8, "width": 4, "settings": settings, **more})
+    quick: dict[str, Any] = {"steps": 2, "batch": 1, "crop": 16, "validation": 1, "patch": 8, "dim": 16}
+    return TrainRequest(str(folder), out, TrainFlags(**quick | more))
 
 
 def _expect_without_weed(weights: Weights) -> None:
@@ -71,8 +69,8 @@ def test_classes_without_a_training_pixel_are_named_and_never_drawn(case: str, t
     """No label has the class, or validation alone, or its pixels have no value, or a mask leaves them out."""
     where = {"named alone": (), "of validation": ("001",), "without values": TRAINED, "outside of the mask": TRAINED}
     folder = _folder(tmp_path / "field", dict.fromkeys(where[case], PIXELS))
-    settings = TrainingSettings(2, 1, 16, darkest_ms=10.0 if case == "of validation" else 100.0)
-    asked = _request(folder, tmp_path / "w.safetensors", settings=settings)
+    more: dict[str, Any] = {"min_exposure_ms": 10.0} if case == "of validation" else {}
+    scenes = folder
     if case == "without values":
         for number in TRAINED:
             values = np.load(folder / f"{number}.npy")
@@ -80,8 +78,8 @@ def test_classes_without_a_training_pixel_are_named_and_never_drawn(case: str, t
             np.save(folder / f"{number}.npy", values)
     if case == "outside of the mask":
         np.save(tmp_path / "mask.npy", (~PIXELS).astype(np.uint8))
-        asked = replace(asked, dataset=str(folder / "002.npy"), choices={"train_mask": str(tmp_path / "mask.npy")})
-        asked = replace(asked, validation=0)
+        scenes, more = folder / "002.npy", {"train_mask": str(tmp_path / "mask.npy"), "validation": 0}
+    asked = _request(scenes, tmp_path / "w.safetensors", **more)
     notes: list[str] = []
     record = train_weights(asked, tell=notes.append)
     assert notes.count(NOTE) == 1
@@ -97,11 +95,11 @@ def test_every_reading_of_a_continued_training_leaves_the_class_out(
 ) -> None:
     """Network, linear classifier, their mean and the mean of both networks: the best by validation is kept."""
     folder = _folder(tmp_path / "field")
-    first = _request(folder, tmp_path / "a.safetensors", settings=TrainingSettings(2, 1, 16, darkest_ms=10.0))
+    first = _request(folder, tmp_path / "a.safetensors", min_exposure_ms=10.0)
     train_weights(first)
     best = iter([float(name == reading) for name in (*figures.READINGS, figures.WITH_START)])
     monkeypatch.setattr(figures, "_miou", lambda *judged: next(best))
-    second = replace(first, out=tmp_path / "b.safetensors", start=first.out)
+    second = _request(folder, tmp_path / "b.safetensors", min_exposure_ms=10.0, start=first.out)
     assert train_weights(second)["readings"]["kept"] == reading
     _expect_without_weed(load_weights(second.out))
 
@@ -109,9 +107,9 @@ def test_every_reading_of_a_continued_training_leaves_the_class_out(
 def test_a_continued_training_may_add_the_class(tmp_path: Path) -> None:
     """One more frame has it, so that the note is gone and the map has it."""
     folder = _folder(tmp_path / "field", {"001": PIXELS})
-    first = _request(folder, tmp_path / "a.safetensors", validation=0, hold_out=("001",))
+    first = _request(folder, tmp_path / "a.safetensors", validation=0, hold_out="001")
     train_weights(first)
-    second = replace(first, out=tmp_path / "b.safetensors", start=first.out, hold_out=())
+    second = _request(folder, tmp_path / "b.safetensors", validation=0, start=first.out)
     notes: list[str] = []
     train_weights(second, tell=notes.append)
     assert notes == []
@@ -132,7 +130,7 @@ def test_continued_training_refuses_other_classes_by_name(names: tuple[str, ...]
     (folder / "scene.toml").write_text(text + "[classes]\n" + "".join(f"{one} = {VALUES[one]}\n" for one in names))
     known = f"its classes are weed, soil, crop, those of .* are {', '.join(names)}; give the same classes"
     with pytest.raises(SettingsError, match=known):
-        train_weights(replace(first, out=tmp_path / "b.safetensors", start=first.out))
+        train_weights(_request(folder, tmp_path / "b.safetensors", start=first.out))
 
 
 def test_one_class_alone_is_refused(tmp_path: Path) -> None:
@@ -159,11 +157,11 @@ def test_a_class_of_one_pixel_is_taught(tmp_path: Path) -> None:
 def test_evaluation_and_surveys_name_classes_that_weights_never_draw(tmp_path: Path) -> None:
     """The class of held-out labels has IoU 0; folds that lack different classes are judged together."""
     folder = _folder(tmp_path / "field", {"001": PIXELS})
-    fold = _request(folder, tmp_path / "a.safetensors", validation=0, hold_out=("001",))
+    fold = _request(folder, tmp_path / "a.safetensors", validation=0, hold_out="001")
     train_weights(fold)
-    other = replace(fold, out=tmp_path / "b.safetensors", hold_out=("002",))
+    other = _request(folder, tmp_path / "b.safetensors", validation=0, hold_out="002")
     train_weights(other)
-    content = evaluate_weights(EvaluateRequest(str(folder), (fold.out, other.out), fractions=(0.5,)))
+    content = evaluate_weights(str(folder), EvaluateFlags(weights=(fold.out, other.out), fractions="0.5"))
     assert content["frames"] == ["001", "002"]
     assert f"a.safetensors: {NOTE}" in content["data_notes"]
     assert not any(note.startswith("b.safetensors") for note in content["data_notes"])
