@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,7 @@ from rich.console import Console
 
 from spectralzoom.flows.evaluate.command import run_evaluate
 from spectralzoom.flows.settings.flags import AsJson, OutFile
-from spectralzoom.flows.settings.model_flags import (
-    NO_EVALUATE_FLAGS,
-    NO_TRAIN_FLAGS,
-    EvaluateFlags,
-    SceneFlags,
-    TrainFlags,
-)
+from spectralzoom.flows.settings.model_flags import NO_EVALUATE_FLAGS, NO_TRAIN_FLAGS, EvaluateFlags, TrainFlags
 from spectralzoom.flows.terminal.progress import print_json, stderr
 from spectralzoom.flows.training.train import check_counts, run_train
 from spectralzoom.flows.training.train_scenes import TrainRequest
@@ -61,18 +54,13 @@ def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, conso
     if flags.train_temporal is None:
         return run_train(request, console)
     check_counts(flags)
-    check_default(flags, OF_TEMPORAL, "not for --train-temporal")
+    for one in fields(flags):
+        if one.name not in OF_TEMPORAL and getattr(flags, one.name) != one.default:
+            raise SettingsError(f"--{one.name.replace('_', '-')} is not for --train-temporal; leave it out")
     how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
     lands = LANDS if flags.scenes is None else flags.scenes
     reader = TemporalRequest(dataset, flags.train_temporal, out, lands, settings=how, command=command)
     return run_remember(reader, console)
-
-
-def check_default(flags: SceneFlags, but: Sequence[str], why: str) -> None:
-    """Raise SettingsError where a flag other than ``but`` differs from its default."""
-    for one in fields(flags):
-        if one.name not in but and getattr(flags, one.name) != one.default:
-            raise SettingsError(f"--{one.name.replace('_', '-')} is {why}; leave it out")
 
 
 def evaluate(dataset: str, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json: AsJson = False) -> int:

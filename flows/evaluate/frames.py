@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 from spectralzoom.flows.tasks.scene import check_labels, judged_labels, seen_in_training
 from spectralzoom.flows.training.data import (
     Report,
+    SceneNotes,
     TrainingData,
-    alike_note,
     farm_test_data,
-    only_class,
     open_training_data,
-    scene_notes,
     untaught_note,
 )
 from spectralzoom.models.network.spectral import patches_of
@@ -31,13 +29,17 @@ from spectralzoom.models.reading.inference import CoarsePrediction, coarse_predi
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
 from spectralzoom.models.weights.files import Description, Weights, describe_weights
-from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 FARM_TEST_SCENES = 4
+VALIDATED = (
+    "the training chose reading, calibration and thresholds by {names}: scores of these validation frames may be too"
+    " good; --frames names others"
+)
 
 
 @dataclass(frozen=True)
@@ -166,33 +168,21 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
     SettingsError: weights were trained on different pixels of a frame.
     """
     jobs = Jobs()
-    alike: dict[str, list[str]] = {}  # by their class
-    empty: list[str] = []
-    regridded: list[str] = []
-    validated: list[str] = []
+    notes = SceneNotes()
     labelled = False
-    for number, name in enumerate(data.train):
-        show("looking for frames", number / len(data.train), name)
-        try:
-            scene = data.scene(name)
-        except EmptySceneError:
-            empty.append(name)
-            continue
+    for _, name, scene in notes.scenes(data, data.train, "looking for frames", show):
         if scene.labels is None:
             raise SceneError(
                 f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
-        if (alone := only_class(scene)) is not None:
-            alike.setdefault(alone, []).append(name)
         fit = _judges(scene, weights)
         if not fit:
             jobs.left_out.append(name)
             continue
         jobs.frames[name] = fit
         if any(weights[at].validated_on(scene) for at in fit):
-            validated.append(name)
-        if scene.regridded:
-            regridded.append(name)
+            notes[VALIDATED].append(name)
+        notes.add(name, scene)
         labels = judged_labels(scene, weights[fit[0]].described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
@@ -204,10 +194,4 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
         )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {data.law} to judge by")
-    notes = [*(alike_note(*one) for one in alike.items()), *scene_notes(empty, regridded)]
-    if validated:
-        notes.append(
-            f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"
-            " validation frames may be too good; --frames names others"
-        )
-    return replace(jobs, notes=tuple(notes))
+    return replace(jobs, notes=tuple(notes.texts))

@@ -21,18 +21,12 @@ from spectralzoom.flows.training.data import (
     TrainingData,
     alike_note,
     check_out,
+    filled,
     open_training_data,
     read_farm_name,
     untaught_note,
 )
-from spectralzoom.flows.training.train_scenes import (
-    CAMERA,
-    Scenes,
-    TrainRequest,
-    network_config,
-    observe_all,
-    training_capture,
-)
+from spectralzoom.flows.training.train_scenes import CAMERA, Scenes, TrainRequest, network_config, observe_all
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.policies.placement import CascadeTable
@@ -87,7 +81,8 @@ def train_weights(
         check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    augmentation = training_capture(normalisation, settings.darkest_ms)
+    simulated = settings.darkest_ms < REFERENCE_MS
+    augmentation = CaptureAugmentation(normalisation, min_exposure_ms=settings.darkest_ms) if simulated else None
     weights, training = _learned(request, scenes, normalisation, augmentation, begun, checkpoint, device, report)
     record = {
         "command": request.command,
@@ -137,7 +132,7 @@ def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], N
     names, frames = scenes.common.names, [*scenes.train.keys]
     taught = [name for number, name in enumerate(names) if number not in scenes.untaught]
     if len(taught) < 2:
-        note = alike_note(taught[0], frames) if taught else f"no pixel of {list_some(frames)} has a label"
+        note = filled(alike_note(taught[0]), frames) if taught else f"no pixel of {list_some(frames)} has a label"
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     if scenes.untaught:
         tell(untaught_note([names[number] for number in scenes.untaught]))

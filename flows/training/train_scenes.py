@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.settings.model_flags import NO_TRAIN_FLAGS, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
-from spectralzoom.flows.training.data import Report, TrainingData, alike_note, only_class, scene_notes, trained_pixels
+from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, alike_note, filled, trained_pixels
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
-from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
-from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
@@ -26,6 +25,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
 COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files
 CAMERA = LineCamera()
+UNFIT = "{validation scenes} left out, without a labelled pixel or with the image of a training scene: {names}"
 
 
 @dataclass(frozen=True)
@@ -123,37 +123,24 @@ def _imaged(
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
     found = Imaged()
-    alike: dict[str, list[str]] = {}  # by their class
-    lists: list[list[str]] = [[], [], [], []]
-    empty, regridded, negative, unfit = lists
+    notes = SceneNotes()
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
-    for number, name in enumerate(names):
-        report(what, number / len(names), name)
-        try:
-            scene = data.scene(name)
-        except EmptySceneError:
-            empty.append(name)
-            continue
+    for number, name, scene in notes.scenes(data, names, what, report):
         mask = trained_pixels(scene)  # raises for a scene without labels
         common = common or _common(request, scene)
         common.check(scene)
         if trained is not None and (scene.key in trained.keys.values() or not mask.any()):
-            unfit.append(name)
+            notes[UNFIT].append(name)
             continue
         found.keys[name] = scene.key
         found.content.extend(scene.content)
         if request.flags.train_mask is not None:
             found.pixels[scene.key] = pack_mask(mask)
-        if (alone := only_class(scene)) is not None:
-            alike.setdefault(alone, []).append(name)
-        if scene.regridded:
-            regridded.append(name)
-        if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
-            negative.append(name)
+        notes.add(name, scene)
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.flags.seed, stream, number])
         found.examples.append(observe_scene(scene, CAMERA, grid, common.basis, rng))
-    for note in (*(alike_note(*one) for one in alike.items()), *scene_notes(*lists)):
+    for note in notes.texts:
         tell(note)
     return common, found
 
@@ -162,7 +149,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if not scene.class_names:
         raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
     if len(scene.class_names) < 2:
-        note = alike_note(scene.class_names[0], [scene.name])
+        note = filled(alike_note(scene.class_names[0]), [scene.name])
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     built_in = bool(built_in_laws(request.dataset))
     basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[built_in])
@@ -192,10 +179,3 @@ def network_config(flags: TrainFlags, common: Common) -> SegmenterConfig:
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
-
-
-def training_capture(normalisation: Normalisation, min_exposure_ms: float) -> CaptureAugmentation | None:
-    """Return the simulation of shorter exposures and wider spacings; None for the reference exposure alone."""
-    return (
-        CaptureAugmentation(normalisation, min_exposure_ms=min_exposure_ms) if min_exposure_ms < REFERENCE_MS else None
-    )
