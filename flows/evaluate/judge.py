@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.evaluate.frames import EvaluateRequest, ObservedFrame
+from spectralzoom.flows.evaluate.frames import ObservedFrame
 from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.network.sizes import multiply_adds
 from spectralzoom.models.policies.placement import mixed
@@ -22,6 +22,7 @@ from spectralzoom.models.reading.inference import segment
 from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.planning.coverage import frame_patches
 
+POLICIES = ("gain", "random")
 RANDOM_DRAWS = 5
 NONE, ALL = ("none", 0.0), ("all", 1.0)  # no patch, every patch
 ENDS = (NONE[0], ALL[0])
@@ -41,16 +42,16 @@ class Row:
 Run = Mapping[str, Mapping[Choice, Row]]  # rows of each frame, by some weights or by a seed
 
 
-def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> dict[Choice, Row]:
+def judge_frame(frame: ObservedFrame, weights: Weights, fractions: Sequence[float], seed: int) -> dict[Choice, Row]:
     """Return the confusion counts and multiply-adds of every policy and fraction."""
     grid, config = frame.seen.grid, weights.config
     every = grid.every_patch()
     overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (every[:0], every))
     chosen = {NONE: [every[:0]], ALL: [every]}  # patches of each draw
-    for policy in request.policies:
+    for policy in POLICIES:
         seeds = range(1000, 1000 * (RANDOM_DRAWS if policy == "random" else 1) + 1, 1000)
-        scores = [score_patches(policy, frame.seen, seed=request.seed + seed) for seed in seeds]
-        chosen |= {(policy, part): [frame_patches(one, part) for one in scores] for part in request.fractions}
+        scores = [score_patches(policy, frame.seen, seed=seed + one) for one in seeds]
+        chosen |= {(policy, part): [frame_patches(one, part) for one in scores] for part in fractions}
     rows = {}
     for (policy, fraction), draws in chosen.items():
         maps = [mixed(overview, full, np.isin(every, some), grid) for some in draws]
@@ -93,10 +94,10 @@ def counts_of(seeds: Sequence[Run], choice: Choice) -> Counts:
     return counts
 
 
-def summarise(runs: Sequence[Run], class_names: Sequence[str], request: EvaluateRequest) -> dict[str, Any]:
+def summarise(runs: Sequence[Run], class_names: Sequence[str], fractions: Sequence[float]) -> dict[str, Any]:
     """Return the figures of every row. ``runs`` are the rows of `judge_frame` by each of the weights."""
     seeds = [{name: rows for number in members for name, rows in runs[number].items()} for members in seeds_of(runs)]
-    shared = [(policy, fraction) for policy in request.policies for fraction in request.fractions]
+    shared = [(policy, fraction) for policy in POLICIES for fraction in fractions]
     whole = counts_of(seeds, ALL)
     support = whole.sum(axis=4).max(axis=(0, 1)).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []

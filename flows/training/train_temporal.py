@@ -27,7 +27,7 @@ from spectralzoom.models.training.temporal import PastPass, TemporalTraining, Vi
 from spectralzoom.models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
@@ -130,7 +130,8 @@ def _visit(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Ge
         observation = _scan(weights, land, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
         drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))
-    return Visit(day + hour / 24, land.labels, drawn)
+    labels = np.where(np.isin(land.labels, weights.config.untaught), np.uint8(UNLABELLED), land.labels)
+    return Visit(day + hour / 24, labels, drawn)
 
 
 def _observed(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> Example:
