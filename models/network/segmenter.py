@@ -21,6 +21,7 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
 from spectralzoom.models.network.layers import mean_around, pointwise
+from spectralzoom.models.network.mixture import Mixture
 from spectralzoom.models.network.photo_stem import PhotoStem
 from spectralzoom.models.network.sizes import BOTTOM, PLANES, TOKEN_PX, SegmenterConfig, level_widths
 from spectralzoom.pipeline.errors import ShapeError
@@ -177,6 +178,17 @@ class Segmenter(nn.Module):
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
         self.config = config
+        if config.parts:
+            self.mixture = Mixture(config)
+        else:
+            self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier of mean spectra
+            nn.init.zeros_(self.spectral.weight)
+            nn.init.zeros_(self.spectral.bias)  # type: ignore[arg-type]
+        if config.corrected:
+            self._add_networks(config)
+
+    def _add_networks(self, config: SegmenterConfig) -> None:
+        """Add the overview and the full network."""
         inputs = config.columns + PLANES
         widths = level_widths(config.overview_width, TOKEN_PX, config.deep)
         self.overview_stem = PhotoStem(inputs, widths) if config.deep else Stem(inputs, widths)
@@ -185,7 +197,6 @@ class Segmenter(nn.Module):
         self.from_token = nn.Conv2d(config.dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths, config.deep)
         self.overview_classes = pointwise(config.overview_width, config.classes)
-        self.spectral = nn.Conv2d(config.columns, config.classes, 1)  # linear classifier that the U-Net corrects
         widths = level_widths(config.width, config.patch)
         self.full_stem = Stem(inputs + config.overview_width, widths)
         self.full_head = Head(widths)
@@ -193,14 +204,26 @@ class Segmenter(nn.Module):
         with torch.no_grad():
             for stem in (self.overview_stem, self.full_stem):  # planes of the capture have no effect unless trained
                 stem.enter.weight[:, config.columns : inputs] = 0
-            for last in (self.spectral, self.overview_classes, self.full_classes):
+            for last in (self.overview_classes, self.full_classes):
                 last.weight.zero_()
                 last.bias.zero_()  # type: ignore[union-attr]
 
     @property
     def device(self) -> torch.device:
         """Return the device of the parameters."""
-        return self.full_classes.weight.device
+        return next(self.parameters()).device
+
+    def base(self, image: Tensor) -> Tensor:
+        """Return logits (B, class, H, W) of an image (B, J + PLANES, H, W) by the classifiers of pixels."""
+        if self.config.parts:
+            logits: Tensor = self.mixture(image[:, : self.config.columns])
+        else:
+            spectral = F.pad(self.spectral.weight, (0, 0, 0, 0, 0, PLANES))
+            # the mean of the logits is that of the mean spectrum
+            logits = mean_around(F.conv2d(image, spectral, self.spectral.bias, dilation=2))
+        if self.config.untaught:  # networks add finite numbers to these logits, which stay minus infinity
+            logits = logits.index_fill(1, torch.tensor(self.config.untaught, device=logits.device), -torch.inf)
+        return logits
 
     def read_overview(self, image: Tensor, origin: Tensor | None = None, valid: Tensor | None = None) -> Overview:
         """Compute the overview of an image (B, J + PLANES, H, W).
@@ -208,6 +231,9 @@ class Segmenter(nn.Module):
         ``origin`` (B, 2) are the tokens above and left of a crop. Tokens that are not ``valid``, (tokens,) bool of a
         single scene, take no part in the attention.
         """
+        if not self.config.corrected:
+            alone = self.base(image)
+            return Overview(alone[:, :0], alone)
         height, width = image.shape[2:]
         gap = -width % TOKEN_PX, -height % TOKEN_PX
         if any(gap):
@@ -226,13 +252,8 @@ class Segmenter(nn.Module):
             read[:, valid] = self.encoder(tokens[:, valid])
         features[-1] = features[-1] + F.pixel_shuffle(self.from_token(read.transpose(1, 2).reshape(grid.shape)), BOTTOM)
         drawn = self.overview_head(features)[:, :, :height, :width]
-        spectral = F.pad(self.spectral.weight, (0, 0, 0, 0, 0, PLANES))
-        # the mean of the logits is that of the mean spectrum
-        alone = mean_around(F.conv2d(image, spectral, self.spectral.bias, dilation=2))
-        logits = self.overview_classes(F.gelu(drawn)).add_(alone[:, :, :height, :width])
-        if self.config.untaught:  # patches add finite numbers to these logits, which stay minus infinity
-            logits = logits.index_fill(1, torch.tensor(self.config.untaught, device=logits.device), -torch.inf)
-        return Overview(drawn, logits)
+        alone = self.base(image)[:, :, :height, :width]
+        return Overview(drawn, self.overview_classes(F.gelu(drawn)).add_(alone))
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
         """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""
@@ -250,6 +271,8 @@ class Segmenter(nn.Module):
             """Return the part of an image under the patches, (B * K, c, p, p)."""
             return image.permute(0, 2, 3, 1)[scene, y[..., :, None], x[..., None, :]].flatten(0, 1).permute(0, 3, 1, 2)
 
+        if not self.config.corrected:
+            return under(overview.logits).view(b, k, -1, p, p)
         features = self.full_head(self.full_stem(torch.cat([patches.flatten(0, 1), under(overview.features)], dim=1)))
         logits: Tensor = under(overview.logits) + self.full_classes(F.gelu(features))
         return logits.view(b, k, *logits.shape[1:])

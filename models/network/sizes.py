@@ -28,6 +28,9 @@ MOST = {
 BOTTOM = 4  # pixels a side at the lowest level of a patch
 PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memory and back at every layer
 CELL_PX = 2  # pixels a side of the spectral features of the temporal reader
+VALUES, RELATIVE, AROUND = "values", "relative", "around"  # features of a mixture's parts
+MEAN_WINDOWS = (1, 3, 5, 9, 15, 31, 61)  # pixels a side around a pixel whose means are features
+SPREAD_WINDOWS = (5, 15, 31, 61)  # the same of standard deviations
 AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
@@ -61,9 +64,19 @@ class SegmenterConfig:
     mlp_ratio: int = 3
     deep: bool = False  # an overview for large frames, with an encoder that was trained on ImageNet
     untaught: tuple[int, ...] = ()  # classes without a training pixel: their probability is 0
+    parts: tuple[tuple[str, int], ...] = ()  # of a mixture: features, hidden channels (0: linear); none: linear alone
+    components: tuple[int, int] = (0, 0)  # of spectra and of relative spectra, around a pixel
+    corrected: bool = True  # an overview and a full network correct the classifiers of pixels
+
+    @property
+    def features(self) -> int:
+        """Return the channels of the overview's features."""
+        return self.overview_width if self.corrected else 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "untaught", tuple(self.untaught))  # a list in files
+        object.__setattr__(self, "components", tuple(self.components))
+        object.__setattr__(self, "parts", tuple((str(kind), int(hidden)) for kind, hidden in self.parts))
         for name in ("classes", *MOST):
             if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
                 raise ShapeError(f"{name} of a segmenter must be a whole number, got {getattr(self, name)!r}")
@@ -73,6 +86,12 @@ class SegmenterConfig:
             if not 1 <= getattr(self, name) <= most:
                 least = f"{name} of a segmenter must be at least 1"
                 raise ShapeError(f"{least} and at most {most}, got {getattr(self, name)}")
+        kinds = {kind for kind, _ in self.parts}
+        sizes = [hidden for _, hidden in self.parts]
+        if not kinds <= {VALUES, RELATIVE, AROUND} or not all(0 <= size <= MOST["width"] for size in sizes):
+            raise ShapeError(f"parts of a mixture have features and hidden channels, got {self.parts}")
+        if not all(0 <= size <= self.columns + 1 for size in self.components):
+            raise ShapeError(f"components {self.components} of {self.columns} columns do not exist")
         if not {*self.untaught} < {*range(self.classes)}:
             raise ShapeError(f"untaught must be some of the {self.classes} classes, got {self.untaught}")
         level_widths(self.width, self.patch)  # refuses a patch that cannot be halved down to the lowest level
@@ -116,17 +135,40 @@ def multiply_adds(
     """Count a field of ``bands`` bands or components, ``patches`` patches read in full; their policy took ``score``."""
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
     tokens = rows * columns
+    pixels = math.prod(grid.padded_shape)
+    base = pixels * (bands * config.columns + base_multiply_adds(config))
+    if not config.corrected:
+        return MultiplyAdds(base, score, 0)
     inputs = config.columns + PLANES
     lowest = level_widths(config.overview_width, TOKEN_PX, config.deep)[-1] * BOTTOM**2
-    overview = TOKEN_PX**2 * config.columns * config.classes  # spectral classifier
-    overview += (_photo_pyramid if config.deep else _pyramid)(inputs, config.overview_width, TOKEN_PX)
+    overview = (_photo_pyramid if config.deep else _pyramid)(inputs, config.overview_width, TOKEN_PX)
     overview += 2 * lowest * config.dim  # to a token and back
-    drawn = math.prod(grid.padded_shape) * (bands * config.columns + config.overview_width * config.classes)
+    drawn = pixels * config.overview_width * config.classes
     patch = config.patch**2 * config.width * config.classes
     patch += _pyramid(inputs + config.overview_width, config.width, config.patch)
     dim = config.dim  # tokens read each other: L ((4 + 2 r) d^2 N + 2 N^2 d)
     read = config.layers * ((4 + 2 * config.mlp_ratio) * dim * dim * tokens + 2 * tokens * tokens * dim)
-    return MultiplyAdds(tokens * overview + drawn + read, score, patches * patch)
+    return MultiplyAdds(base + tokens * overview + drawn + read, score, patches * patch)
+
+
+def base_multiply_adds(config: SegmenterConfig) -> int:
+    """Count the classifiers of one pixel; means and standard deviations of windows count as 0."""
+    if not config.parts:
+        return config.columns * config.classes
+    widths = feature_widths(config)
+    found = config.columns**2  # scene values
+    if any(kind == AROUND for kind, _ in config.parts):
+        found += sum(config.components) * config.columns
+    return found + sum(
+        (widths[kind] + config.classes) * hidden if hidden else widths[kind] * config.classes
+        for kind, hidden in config.parts
+    )
+
+
+def feature_widths(config: SegmenterConfig) -> dict[str, int]:
+    """Return the number of features of each kind."""
+    around = sum(config.components) * (len(MEAN_WINDOWS) + len(SPREAD_WINDOWS))
+    return {VALUES: config.columns, RELATIVE: config.columns + 1, AROUND: around}
 
 
 def _levels(width: int, size: int, deep: bool) -> list[tuple[int, int]]:

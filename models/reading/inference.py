@@ -187,7 +187,7 @@ def load_overview(path: Path, weights: Weights) -> Overview | None:
     if not path.exists():
         return None
     stored = torch.from_numpy(np.load(path)).to(weights.segmenter.device)
-    width = weights.config.overview_width
+    width = weights.config.features
     from spectralzoom.models.network.segmenter import Overview
 
     return Overview(stored[:, :width], stored[:, width:])

@@ -1,32 +1,46 @@
-"""Fit a mixture of classifiers to labelled pixels: candidates, folds, a greedy choice by cross-validation, and a prior."""
+"""Fit a mixture of classifiers to few labels: candidates by cross-validation, a greedy choice among them, and a prior.
+
+Folds are whole scenes, or blocks as large as the labelled patches: never single pixels, whose neighbours are alike.
+"""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import LogisticRegression
 from sklearn.neural_network import MLPClassifier
+from torch import Tensor
 
 from spectralzoom.models.evaluation import metrics
-from spectralzoom.models.network.mixture import CTX, PX, PXN, Mixture, MixtureConfig
+from spectralzoom.models.network.mixture import Mixture, Part
+from spectralzoom.models.network.segmenter import Segmenter
+from spectralzoom.models.network.sizes import AROUND, RELATIVE, VALUES, SegmenterConfig
+from spectralzoom.models.network.spectral import Normalisation
+from spectralzoom.models.training.examples import Example
+from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
-OWN, SHAPE = 20, 10  # components of ctx at most
+COMPONENTS = 20, 10  # of spectra and of relative spectra, at most
 FOLDS = 4
-MOST_PIXELS = 40_000  # to fit a candidate to
-FIRST, ADDED = 3, 12
-PRIORS = (0.0, 0.25, 0.5, 0.75, 1.0)
-PRIOR_SCENES = 6  # with fewer labelled scenes the classes' fractions are not known
+MOST_PIXELS = 40_000  # to fit to, of all scenes together
+LEAST_PIXELS = 200  # of a class, where it has them: classes are drawn in proportion to their pixels above that
+FIRST, ADDED = 3, 12  # candidates that the mixture begins with, and that it may add
+POWERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the prior
+PRIOR_SCENES = 6  # fewer labelled scenes do not tell how frequent a class is
+BLOCK_PX = 4, 64  # least and greatest side of the blocks of a fold
+NEVER = -1e4  # logit of a class that a part was not taught
 Floats = NDArray[np.floating]
 Labels = NDArray[np.uint8]
+Report = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -39,220 +53,258 @@ class Candidate:
     hidden: int = 0
 
 
-def _lda() -> Any:
+def _discriminants() -> Any:
     return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
 
 
-def candidates(*, around: bool) -> list[Candidate]:
-    found = []
-    for kind in (PX, PXN):
-        found += [Candidate(f"{kind} LDA", kind, _lda)]
-        found += [Candidate(f"{kind} LR {c:g}", kind, lambda c=c: LogisticRegression(C=c, max_iter=300)) for c in (0.3, 10.0)]
-    if around:
-        found += [
-            Candidate("ctx LDA", CTX, _lda),
-            Candidate("ctx LR", CTX, lambda: LogisticRegression(C=0.1, max_iter=200)),
-            Candidate("ctx MLP", CTX, lambda: MLPClassifier(48, alpha=3e-2, max_iter=40, early_stopping=False, batch_size=128, random_state=0), 48),
-        ]
-    return found
+CANDIDATES = (
+    *(Candidate(f"{kind}, LDA", kind, _discriminants) for kind in (VALUES, RELATIVE, AROUND)),
+    *(
+        Candidate(f"{kind}, LR {weight:g}", kind, lambda weight=weight: LogisticRegression(C=weight, max_iter=300))
+        for kind, weights in {VALUES: (0.3, 10.0), RELATIVE: (0.3, 10.0), AROUND: (0.1,)}.items()
+        for weight in weights
+    ),
+    Candidate(f"{AROUND}, MLP", AROUND, lambda: MLPClassifier(48, alpha=0.03, batch_size=128, max_iter=40, random_state=0), 48),
+)
 
 
 @dataclass(frozen=True)
 class Taught:
-    """Labelled pixels: features by kind (pixel, feature), classes, and the fold of each."""
+    """Labelled pixels: their features of each kind, classes and folds."""
 
-    features: dict[str, NDArray[np.float32]]
-    labels: Labels
-    fold: NDArray[np.int64]
+    features: Mapping[str, NDArray[np.float32]]  # (pixel, feature)
+    labels: Labels  # (pixel,)
+    fold: NDArray[np.int64]  # (pixel,)
     scenes: int
-    classes: int
 
 
-@dataclass
-class Fitted:
-    mixture: Mixture
-    scores: dict[str, float]
-    chosen: dict[str, int]
-    mixed: float
-    prior: float
-    seconds: dict[str, float] = field(default_factory=dict)
-    out_of_fold: Any = None
+@dataclass(frozen=True)
+class Judged:
+    """A candidate or mixture by cross-validation."""
+
+    name: str
+    miou: float
+    accuracy: float
+    seconds: float  # of a processor
+    weight: float = 0.0  # in the mixture
 
 
-def score_of(probability: Floats, labels: Labels, classes: int) -> float:
-    counts = metrics.confusion(labels, probability.argmax(axis=1).astype(np.uint8), classes)
-    return metrics.mean_iou(counts) + metrics.overall_accuracy(counts)
+@dataclass(frozen=True)
+class Fit:
+    """A fitted classifier and the standardisation of its features."""
+
+    fitted: Any
+    middle: Floats
+    spread: Floats
+
+    @classmethod
+    def of(cls, candidate: Candidate, features: Floats, labels: Labels) -> Fit:
+        """Fit a candidate to (pixel, feature) values."""
+        middle, spread = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a class of one pixel
+            return cls(candidate.make().fit((features - middle) / spread, labels), middle, spread)
+
+    def predict(self, features: Floats, classes: int) -> Floats:
+        """Return probabilities (pixel, class)."""
+        found = np.zeros((len(features), classes))
+        found[:, self.fitted.classes_.astype(int)] = self.fitted.predict_proba((features - self.middle) / self.spread)
+        return found
+
+    def store(self, part: Part, classes: int) -> None:
+        """Write the classifier into a part, the standardisation into its first layer."""
+        known = self.fitted.classes_.astype(int)
+        if part.last is None:
+            slope, offset = _of_classes(self.fitted.coef_, self.fitted.intercept_, known, classes)
+        else:
+            slope, offset = self.fitted.coefs_[0].T, self.fitted.intercepts_[0]
+            last = _of_classes(self.fitted.coefs_[1].T, self.fitted.intercepts_[1], known, classes)
+            _write(part.last, *last)
+        _write(part.first, slope / self.spread, offset - slope @ (self.middle / self.spread))
 
 
-def folds_of(labels: Sequence[Labels], rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Return the fold of each pixel (y, x): whole scenes, or blocks as large as the labelled patches."""
-    if len(labels) >= FOLDS:
-        order = rng.permutation(len(labels))
-        return [np.full(one.shape, int(np.flatnonzero(order == n)[0]) % FOLDS) for n, one in enumerate(labels)]
-    from scipy.ndimage import label as components
-
-    found = []
-    for one in labels:
-        fold = np.zeros(one.shape, np.int64)
-        known = one != UNLABELLED
-        marks = np.zeros(one.shape, np.int64)
-        top = 0
-        for c in np.unique(one[known]):  # patches of one class
-            own, count = components(one == c)
-            marks[own > 0] = own[own > 0] + top
-            top += count
-        sizes = np.bincount(marks.ravel())[1:]
-        side = int(np.clip(np.sqrt(np.median(sizes)) if len(sizes) else 1, 4, 64))
-        big = sizes > 4 * side * side
-        y, x = np.indices(one.shape)
-        block = (y // side) * 10_000 + x // side
-        group = np.where(big[np.maximum(marks - 1, 0)] if len(sizes) else False, block + 10**9, marks)
-        # groups of each class are dealt to the folds in turn, the largest first
-        for c in np.unique(one[known]):
-            ids, count = np.unique(group[one == c], return_counts=True)
-            load = np.zeros(FOLDS)
-            for k in np.lexsort((rng.random(len(ids)), -count)):
-                f = int(np.argmin(load + rng.random(FOLDS) * 1e-6))
-                load[f] += count[k]
-                fold[(group == ids[k]) & (one == c)] = f
-        found.append(fold)
-    return found
+def _of_classes(slope: Floats, offset: Floats, known: NDArray[np.intp], classes: int) -> tuple[Floats, Floats]:
+    """Return the layer of every class; scikit-learn has one function for two classes, and none for others."""
+    if len(known) == 2 and len(slope) == 1:
+        slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
+    weight, bias = np.zeros((classes, slope.shape[1])), np.full(classes, NEVER)
+    weight[known], bias[known] = slope, offset
+    return weight, bias
 
 
-def basis_of(mixture: Mixture, columns: Sequence[Floats], to_values: Floats, centre: Floats) -> None:
-    """Set the components of ctx from the pixels of all scenes."""
+def _write(layer: torch.nn.Linear, weight: Floats, bias: Floats) -> None:
     with torch.no_grad():
-        mixture.to_values.copy_(torch.from_numpy(np.asarray(to_values, np.float32)))
-        mixture.centre.copy_(torch.from_numpy(np.asarray(centre, np.float32)))
-        sample = np.concatenate([one[::3, ::3].reshape(-1, one.shape[-1]) for one in columns]).astype(np.float32)
-        sample = sample[np.isfinite(sample).all(axis=1)]
-        tensor = torch.from_numpy(sample)
-        mixture.own_axes.copy_(_whitened(sample, mixture.config.own)[0])
-        relative = mixture.relative(tensor).numpy()
-        axes, middle = _whitened(relative, mixture.config.shape)
-        mixture.shape_axes.copy_(axes)
-        mixture.shape_centre.copy_(middle)
+        layer.weight.copy_(torch.from_numpy(np.asarray(weight, np.float32)))
+        layer.bias.copy_(torch.from_numpy(np.asarray(bias, np.float32)))
 
 
-def _whitened(sample: Floats, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+def fit_mixture(
+    examples: Sequence[Example], normalisation: Normalisation, config: SegmenterConfig, seed: int, report: Report
+) -> tuple[Segmenter, list[Judged]]:
+    """Return a segmenter of pixels alone, by normalised scenes; and its candidates and itself by cross-validation.
+
+    Raises SceneError: there are as few labelled pixels as classes.
+    """
+    rng = np.random.default_rng([seed, 0x31])
+    columns = config.columns
+    components = min(COMPONENTS[0], columns), min(COMPONENTS[1], columns + 1)
+    measured = Mixture(replace(config, parts=((VALUES, 0),), components=components))
+    _measure(measured, examples, normalisation)
+    began = time.process_time()
+    taught = taught_pixels(measured, examples, rng)
+    known = np.unique(taught.labels)
+    if len(known) >= len(taught.labels):
+        raise SceneError(f"{len(taught.labels)} labelled pixels of {len(known)} classes are too few; label more of each")
+    apart = _apart(taught, config.classes, report)
+    weights, mixed = _chosen(apart, taught, config.classes)
+    power = _prior_power(mixed, taught, config.classes)
+    parts = [one for one in CANDIDATES if one.name in weights]
+    sizes = tuple((one.kind, one.hidden) for one in parts)
+    segmenter = Segmenter(replace(config, parts=sizes, components=components, corrected=False)).eval()
+    segmenter.mixture.load_state_dict(
+        {name: one for name, one in measured.state_dict().items() if not name.startswith(("parts", "weight"))}, strict=False
+    )
+    total = sum(weights.values())
+    with torch.no_grad():
+        for part, one in zip(segmenter.mixture.parts, parts, strict=True):
+            Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
+        segmenter.mixture.weight.copy_(torch.tensor([weights[one.name] / total for one in parts]))
+        fraction = np.bincount(taught.labels, minlength=config.classes) / len(taught.labels)
+        prior = np.where(fraction > 0, -power * np.log(np.maximum(fraction, 1e-12)), 0)
+        segmenter.mixture.prior.copy_(torch.from_numpy(prior.astype(np.float32)))
+    own = _judged("mixture", mixed, taught.labels, config.classes, time.process_time() - began)
+    shown = [replace(apart[name][1], weight=weights.get(name, 0) / total) for name in apart]
+    return segmenter, [*shown, own]
+
+
+def _measure(mixture: Mixture, examples: Sequence[Example], normalisation: Normalisation) -> None:
+    """Set the scale of scene values and the whitened components, by every third pixel of every third row."""
+    values = np.linalg.inv(normalisation.whitening.astype(np.float64)) * normalisation.spread
+    sample = np.concatenate([one.columns[::3, ::3].reshape(-1, one.columns.shape[-1]) for one in examples])
+    sample = np.asarray(sample[np.isfinite(sample).all(axis=1)], np.float32)
+    with torch.no_grad():
+        mixture.to_values.copy_(torch.from_numpy(values.astype(np.float32)))
+        mixture.centre.copy_(torch.from_numpy(normalisation.centre))
+        mixture.own_axes.copy_(_whitened(sample, mixture.own_axes.shape[1])[0])
+        axes, middle = _whitened(mixture.relative(torch.from_numpy(sample)).numpy(), mixture.relative_axes.shape[1])
+        mixture.relative_axes.copy_(axes)
+        mixture.relative_centre.copy_(middle)
+
+
+def _whitened(sample: Floats, count: int) -> tuple[Tensor, Tensor]:
+    """Return axes (feature, component) of variance 1, the largest first, and the mean."""
     exact = sample.astype(np.float64)
-    middle = exact.mean(axis=0)
-    power, axes = np.linalg.eigh(np.cov(exact.T))
+    power, axes = np.linalg.eigh(np.atleast_2d(np.cov(exact.T)))
     power, axes = power[::-1][:count], axes[:, ::-1][:, :count]
-    return torch.from_numpy((axes / np.sqrt(np.maximum(power, 1e-9 * power[0]))).astype(np.float32)), torch.from_numpy(middle.astype(np.float32))
+    scaled = axes / np.sqrt(np.maximum(power, 1e-9 * max(float(power[0]), 1e-12)))
+    return torch.from_numpy(scaled.astype(np.float32)), torch.from_numpy(exact.mean(axis=0).astype(np.float32))
 
 
-def teach(mixture: Mixture, columns: Sequence[Floats], labels: Sequence[Labels], rng: np.random.Generator, *, around: bool) -> Taught:
-    """Return the features of labelled pixels, `MOST_PIXELS` at most, from each class of each scene alike."""
-    folds = folds_of(labels, rng)
-    kinds = (PX, PXN, CTX) if around else (PX, PXN)
-    total = sum(int((one != UNLABELLED).sum()) for one in labels)
-    made: dict[str, list[Floats]] = {kind: [] for kind in kinds}
-    marks, fold = [], []
-    for one, own, part in zip(columns, labels, folds, strict=True):
-        places = np.flatnonzero(own != UNLABELLED)
-        if total > MOST_PIXELS:
-            places = np.sort(rng.choice(places, int(len(places) * MOST_PIXELS / total), replace=False))
+def taught_pixels(mixture: Mixture, examples: Sequence[Example], rng: np.random.Generator) -> Taught:
+    """Return labelled pixels of all scenes, `MOST_PIXELS` or so, in proportion; rare classes have more."""
+    counts = np.sum([np.bincount(one.labels.ravel(), minlength=256)[:UNLABELLED] for one in examples], axis=0)
+    fraction = np.minimum(1.0, np.maximum(MOST_PIXELS / counts.sum(), LEAST_PIXELS / np.maximum(counts, 1)))
+    features: dict[str, list[Floats]] = {kind: [] for kind in (VALUES, RELATIVE, AROUND)}
+    labels, folds = [], []
+    for example, fold in zip(examples, folds_of([one.labels for one in examples], rng), strict=True):
+        chance = np.append(fraction, np.zeros(256 - len(fraction)))[example.labels.ravel()]
+        places = np.flatnonzero(rng.random(len(chance)) < chance)
         if not len(places):
             continue
         with torch.inference_mode():
-            image = torch.from_numpy(np.asarray(one, np.float32)).movedim(-1, 0)[None]
-            for kind, every in mixture.features(image, kinds).items():
-                made[kind].append(every.reshape(-1, every.shape[-1])[torch.from_numpy(places)].numpy())
-        marks.append(own.ravel()[places])
-        fold.append(part.ravel()[places])
-    return Taught({kind: np.concatenate(parts) for kind, parts in made.items()}, np.concatenate(marks), np.concatenate(fold), len(marks), mixture.classes)
+            image = torch.from_numpy(np.asarray(example.columns, np.float32)).movedim(-1, 0)[None]
+            for kind, every in mixture.features(image, features).items():
+                features[kind].append(every.flatten(0, 2)[torch.from_numpy(places)].numpy())
+        labels.append(example.labels.ravel()[places])
+        folds.append(fold.ravel()[places])
+    joined = {kind: np.concatenate(parts) for kind, parts in features.items()}
+    return Taught(joined, np.concatenate(labels), np.concatenate(folds), len(labels))
 
 
-def _fit(candidate: Candidate, features: Floats, labels: Labels) -> tuple[Any, Floats, Floats]:
-    middle, spread = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
-    with warnings.catch_warnings(action="ignore"):
-        fitted = candidate.make().fit((features - middle) / spread, labels)
-    return fitted, middle, spread
+def folds_of(labels: Sequence[Labels], rng: np.random.Generator) -> list[NDArray[np.int64]]:
+    """Return the fold of each pixel (y, x) of each scene: whole scenes if there are enough, else labelled patches."""
+    if len(labels) >= FOLDS:
+        order = rng.permutation(len(labels))
+        return [np.full(one.shape, order[number] % FOLDS) for number, one in enumerate(labels)]
+    return [_patch_folds(one, rng) for one in labels]
 
 
-def _predicted(fit: tuple[Any, Floats, Floats], features: Floats, classes: int) -> NDArray[np.float64]:
-    fitted, middle, spread = fit
-    found = np.zeros((len(features), classes))
-    found[:, fitted.classes_.astype(int)] = fitted.predict_proba((features - middle) / spread)
+def _patch_folds(labels: Labels, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Deal the labelled patches of each class to the folds, large ones first; larger ones than usual are cut."""
+    patch, top = np.zeros(labels.shape, np.int64), 0
+    classes = [int(one) for one in np.unique(labels) if one != UNLABELLED]
+    for one in classes:
+        own, count = scipy.ndimage.label(labels == one)
+        patch[own > 0] = own[own > 0] + top
+        top += count
+    sizes = np.bincount(patch.ravel(), minlength=top + 1)
+    side = int(np.clip(np.sqrt(np.median(sizes[1:])), *BLOCK_PX)) if top else 1
+    y, x = np.indices(labels.shape) // side
+    cut = (sizes > 4 * side**2)[patch]
+    patch = np.where(cut, top + 1 + y * labels.shape[1] + x, patch)
+    fold = np.zeros(labels.shape, np.int64)
+    for one in classes:
+        numbers, counts = np.unique(patch[labels == one], return_counts=True)
+        load = np.zeros(FOLDS)
+        dealt = np.empty(len(numbers), np.int64)
+        for at in np.lexsort((rng.random(len(numbers)), -counts)):
+            dealt[at] = np.argmin(load + rng.random(FOLDS))
+            load[dealt[at]] += counts[at]
+        mine = labels == one
+        fold[mine] = dealt[np.searchsorted(numbers, patch[mine])]
+    return fold
+
+
+def _apart(taught: Taught, classes: int, report: Report) -> dict[str, tuple[Floats, Judged]]:
+    """Return the probabilities (pixel, class) of each candidate for the pixels that it was not fitted to."""
+    found: dict[str, tuple[Floats, Judged]] = {}
+    for number, one in enumerate(CANDIDATES):
+        began = time.process_time()
+        features = taught.features[one.kind]
+        probability = np.full((len(taught.labels), classes), 1 / classes)
+        for fold in range(FOLDS):
+            learn, judge = taught.fold != fold, taught.fold == fold
+            if judge.any() and 1 < len(np.unique(taught.labels[learn])) < np.count_nonzero(learn):
+                fit = Fit.of(one, features[learn], taught.labels[learn])
+                probability[judge] = fit.predict(features[judge], classes)
+        judged = _judged(one.name, probability, taught.labels, classes, time.process_time() - began)
+        found[one.name] = probability, judged
+        report("cross-validating", (number + 1) / len(CANDIDATES), f"{one.name}: {100 * judged.miou:.1f}")
     return found
 
 
-def fit_mixture(mixture_of: Callable[[MixtureConfig], Mixture], taught: Taught, *, around: bool, say=lambda *_: None) -> Fitted:
-    every = candidates(around=around)
-    known = np.unique(taught.labels)
-    out, seconds = {}, {}
-    for one in every:
-        began = time.process_time()
-        found = np.zeros((len(taught.labels), taught.classes))
-        for fold in range(FOLDS):
-            learn, judge = taught.fold != fold, taught.fold == fold
-            if not judge.any() or len(np.unique(taught.labels[learn])) < 2:
-                found[judge] = 1 / taught.classes
-                continue
-            features = taught.features[one.kind]
-            found[judge] = _predicted(_fit(one, features[learn], taught.labels[learn]), features[judge], taught.classes)
-        out[one.name] = found
-        seconds[one.name] = time.process_time() - began
-        say(one.name, score_of(found, taught.labels, taught.classes), seconds[one.name])
-    scores = {name: score_of(found, taught.labels, taught.classes) for name, found in out.items()}
-    usable = list(scores)
-    if taught.scenes > 1 and around:
-        best = {kind: max((scores[one.name] for one in every if (one.kind == CTX) == (kind == CTX)), default=-1) for kind in (PX, CTX)}
-        if best[CTX] <= best[PX]:
-            usable = [one.name for one in every if one.kind != CTX]
-    chosen = dict.fromkeys(sorted(usable, key=lambda name: -scores[name])[:FIRST], 1)
-    total = sum(out[name] for name in chosen)
+def _judged(name: str, probability: Floats, labels: Labels, classes: int, seconds: float) -> Judged:
+    counts = metrics.confusion(labels, probability.argmax(axis=1).astype(np.uint8), classes)
+    return Judged(name, metrics.mean_iou(counts), metrics.overall_accuracy(counts), seconds)
+
+
+def _chosen(
+    apart: Mapping[str, tuple[Floats, Judged]], taught: Taught, classes: int
+) -> tuple[dict[str, int], Floats]:
+    """Return how often each candidate is in the mixture, and its probabilities (Caruana et al. 2004)."""
+
+    def score(probability: Floats) -> float:
+        judged = _judged("", probability, taught.labels, classes, 0.0)
+        return judged.miou + judged.accuracy
+
+    scores = {name: score(one) for name, (one, _) in apart.items()}
+    around = {one.name for one in CANDIDATES if one.kind == AROUND}
+    best = max(scores[name] for name in scores if name not in around)
+    if taught.scenes > 1 and max(scores[name] for name in around) <= best:
+        scores = {name: one for name, one in scores.items() if name not in around}
+    weights = dict.fromkeys(sorted(scores, key=lambda name: -scores[name])[:FIRST], 1)
+    total = np.sum([apart[name][0] for name in weights], axis=0)
     for _ in range(ADDED):
-        now = score_of(total, taught.labels, taught.classes)
-        name, best = max(((name, score_of(total + out[name], taught.labels, taught.classes)) for name in usable), key=lambda pair: pair[1])
-        if best <= now:
+        name = max(scores, key=lambda one: score(total + apart[one][0]))
+        if score(total + apart[name][0]) <= score(total):
             break
-        chosen[name] = chosen.get(name, 0) + 1
-        total = total + out[name]
-    mixed = total / sum(chosen.values())
-    fraction = np.bincount(taught.labels, minlength=taught.classes) / len(taught.labels)
-    power = 0.0
-    if taught.scenes >= PRIOR_SCENES:
-        power = max(PRIORS, key=lambda a: (score_prior(mixed, fraction, a, taught), -a))
-    parts = [one for one in every if one.name in chosen]
-    mixture = mixture_of(MixtureConfig(tuple((one.kind, one.hidden) for one in parts), OWN, SHAPE))
-    with torch.no_grad():
-        for part, one in zip(mixture.parts, parts, strict=True):
-            _store(part, _fit(one, taught.features[one.kind], taught.labels), taught.classes)
-        mixture.weight.copy_(torch.tensor([chosen[one.name] for one in parts]) / sum(chosen.values()))
-        prior = np.full(taught.classes, -np.inf)
-        prior[known] = -power * np.log(fraction[known])
-        mixture.prior.copy_(torch.from_numpy(prior.astype(np.float32)))
-    return Fitted(mixture, scores, chosen, score_of(mixed, taught.labels, taught.classes), power, seconds, mixed)
+        weights[name] = weights.get(name, 0) + 1
+        total = total + apart[name][0]
+    return weights, total / sum(weights.values())
 
 
-def score_prior(mixed, fraction, a, taught):
-    with np.errstate(divide="ignore"):
-        factor = np.where(fraction > 0, np.maximum(fraction, 1e-12) ** -a, 0)
-    counts = metrics.confusion(taught.labels, (mixed * factor).argmax(axis=1).astype(np.uint8), taught.classes)
-    return metrics.mean_iou(counts)
-
-
-def _store(part: Any, fit: tuple[Any, Floats, Floats], classes: int) -> None:
-    """Write a fitted classifier into a part; standardisation is folded into its first layer."""
-    fitted, middle, spread = fit
-    known = fitted.classes_.astype(int)
-    if hasattr(fitted, "coefs_"):
-        slope, offset = fitted.coefs_[0].T, fitted.intercepts_[0]
-        last, last_offset = fitted.coefs_[1].T, fitted.intercepts_[1]
-        if len(known) == 2 and len(last) == 1:
-            last, last_offset = np.concatenate([0 * last, last]), np.concatenate([0 * last_offset, last_offset])
-        weight, bias = np.zeros((classes, last.shape[1])), np.full(classes, -1e4)
-        weight[known], bias[known] = last, last_offset
-        part.last.weight.copy_(torch.from_numpy(weight.astype(np.float32)))
-        part.last.bias.copy_(torch.from_numpy(bias.astype(np.float32)))
-        whole, start = slope, offset
-    else:
-        slope, offset = fitted.coef_, fitted.intercept_
-        if len(known) == 2 and len(slope) == 1:
-            slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
-        whole, start = np.zeros((classes, slope.shape[1])), np.full(classes, -1e4)
-        whole[known], start[known] = slope, offset
-    part.first.weight.copy_(torch.from_numpy((whole / spread).astype(np.float32)))
-    part.first.bias.copy_(torch.from_numpy((start - whole @ (middle / spread)).astype(np.float32)))
+def _prior_power(mixed: Floats, taught: Taught, classes: int) -> float:
+    """Return the power of the classes' fractions that probabilities are divided by."""
+    if taught.scenes < PRIOR_SCENES:
+        return 0.0
+    fraction = np.maximum(np.bincount(taught.labels, minlength=classes) / len(taught.labels), 1e-12)
+    return max(POWERS, key=lambda power: _judged("", mixed / fraction**power, taught.labels, classes, 0.0).miou)
