@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from types import MappingProxyType
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-from sklearn.ensemble import RandomForestClassifier
-from sklearn.linear_model import LogisticRegression
 
 from spectralzoom.flows.training.data import Report
 from spectralzoom.models.evaluation import metrics
@@ -22,7 +17,6 @@ from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from spectralzoom.models.training.examples import Example
-from spectralzoom.models.training.train import LabelledPixels, halfway, with_linear
 from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.planning.coverage import frame_patches
@@ -147,33 +141,7 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.ui
     return grid, example.labels[: grid.height, : grid.width]
 
 
-FEW_PIXELS = 50_000  # labelled pixels of a training, below which no reading is reliably the best
-WITH_START = "mean with --start"
-READINGS = MappingProxyType({"network": 1.0, "mean of both": 0.5, "linear classifier": 0.0})  # network's fraction
-
-
-def better_reading(
-    weights: Weights, start: Mapping[str, Any], validation: Sequence[Example], *, few: bool, begun: Weights | None
-) -> tuple[Weights, dict[str, Any]]:
-    """Choose between the trained network, its initial linear classifier and the mean of their logits.
-
-    A training from weights, ``begun``, also has the mean of both networks. With ``few`` labelled pixels the mean of the
-    logits is kept, as few validation pixels cannot tell. Else it is the best by mIoU of the validation scenes; without
-    one it is the mean of both networks, or the network. Returns the weights, and all scores.
-    """
-    readings = {
-        name: replace(weights, segmenter=with_linear(weights.segmenter, start, fraction))
-        for name, fraction in READINGS.items()
-    }
-    if begun is not None:
-        readings[WITH_START] = replace(weights, segmenter=halfway(begun.segmenter, weights.segmenter))
-    scores = {name: _miou(one, validation) for name, one in readings.items()} if validation else {}
-    best = max(scores, key=lambda name: scores[name], default="network" if begun is None else WITH_START)
-    kept = "mean of both" if few else best
-    return readings[kept], {"miou": scores, "kept": kept}
-
-
-def _miou(weights: Weights, examples: Sequence[Example]) -> float:
+def miou_of(weights: Weights, examples: Sequence[Example]) -> float:
     """Return the mIoU of all scenes together, by every line at the reference exposure."""
     counts = np.zeros((weights.config.classes,) * 2, np.int64)
     for example in examples:
@@ -181,34 +149,3 @@ def _miou(weights: Weights, examples: Sequence[Example]) -> float:
         drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
         counts += metrics.confusion(labels, drawn.classes, weights.config.classes)
     return metrics.mean_iou(counts)
-
-
-def judge_baselines(
-    train: Sequence[Example], validation: Sequence[Example], classes: int, seed: int, report: Report
-) -> dict[str, float] | None:
-    """Return the mIoU of LDA, logistic regression and a random forest on the same pixels of validation scenes.
-
-    Without such scenes they learn from a random half of the training pixels, and the other half judges them. Features
-    are those of `linear_classifier`. None with a single class, or if each has one pixel to learn from.
-    """
-    rng = np.random.default_rng([seed, 0xBA5])
-    learnt = LabelledPixels.drawn(train, rng)
-    if validation:
-        judged = LabelledPixels.drawn(validation, rng)
-    else:
-        half = rng.permutation(len(learnt.labels)) % 2 == 0
-        learnt, judged = (LabelledPixels(learnt.features[part], learnt.labels[part]) for part in (half, ~half))
-    if not 1 < len(np.unique(learnt.labels)) < len(learnt.labels):
-        return None
-    found: dict[str, float] = {}
-    for name, classifier in {
-        "LDA": LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"),
-        "logistic regression": LogisticRegression(max_iter=200),
-        "random forest": RandomForestClassifier(100, min_samples_leaf=2, random_state=seed),
-    }.items():
-        report("fitting baseline classifiers", len(found) / 3, name)
-        with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a single pixel
-            classifier.fit(learnt.features, learnt.labels)
-        drawn = classifier.predict(judged.features).astype(np.uint8)
-        found[name] = metrics.mean_iou(metrics.confusion(judged.labels, drawn, classes))
-    return found

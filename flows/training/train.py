@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable
-from dataclasses import asdict, replace
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from torch import Tensor
 
 from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.tasks.scene import masks_contain
@@ -28,11 +31,14 @@ from spectralzoom.flows.training.data import (
 )
 from spectralzoom.flows.training.train_scenes import CAMERA, Scenes, TrainRequest, network_config, observe_all
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
+from spectralzoom.models.network.segmenter import Segmenter
+from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
-from spectralzoom.models.training.train import PIXELS, LabelledPixels, continued, linear_classifier, train
+from spectralzoom.models.training.mixture import fit_mixture
+from spectralzoom.models.training.train import LabelledPixels, continued, halfway, linear_classifier, scaled, train
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
@@ -47,10 +53,11 @@ from spectralzoom.models.weights.files import (
     with_record,
 )
 from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
-from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
+
+CORRECTIONS = (0.25, 0.5, 0.75, 1.0)  # of the network, to choose from
 
 
 def train_weights(
@@ -83,8 +90,7 @@ def train_weights(
     scenes = scenes.normalised(normalisation)
     simulated = settings.darkest_ms < REFERENCE_MS
     augmentation = CaptureAugmentation(normalisation, min_exposure_ms=settings.darkest_ms) if simulated else None
-    weights, training = _learned(request, scenes, normalisation, augmentation, begun, checkpoint, device, report)
-    record = {
+    about = {
         "command": request.command,
         "data": data.law,
         TRAINED_ON: asdict(_trained_on(data, scenes, settings.darkest_ms)),
@@ -93,16 +99,31 @@ def train_weights(
         "camera": asdict(CAMERA),
         "device": device,
         **({} if begun is None else {"started_from": begun.record.get("command", "")}),
-        **training,
     }
-    frames = scenes.validation.examples
-    scans = figures.judge_scans(with_record(weights, **record), frames, augmentation, settings.seed, report)
+    learner = Learner(request, scenes, normalisation, augmentation, checkpoint, device, report)
+    if data.files is None:
+        record = _written(learner, about, learner.network(begun))
+    else:
+        mixed = learner.mixture()
+        record = _written(learner, about, mixed)  # usable after seconds
+        if (corrected := learner.correction(mixed.weights)) is not None:
+            record = _written(learner, about, corrected)
+    checkpoint.unlink(missing_ok=True)
+    return record
+
+
+def _written(learner: Learner, about: Mapping[str, Any], learned: Learned) -> dict[str, Any]:
+    """Judge and save weights; return their record."""
+    weights, request = learned.weights, learner.request
+    frames = learner.scenes.validation.examples
+    record = {**about, **learned.found, **learner.judged(weights)}
+    seed = request.flags.settings.seed
+    scans = figures.judge_scans(with_record(weights, **record), frames, learner.augmentation, seed, learner.report)
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
     if scans is not None:
         add_map_scores(request.out, scans[1])
-    checkpoint.unlink(missing_ok=True)
     return record
 
 
@@ -166,53 +187,102 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
             )
 
 
-def _learned(
-    request: TrainRequest,
-    scenes: Scenes,
-    normalisation: Normalisation,
-    augmentation: CaptureAugmentation | None,
-    begun: Weights | None,
-    checkpoint: Path,
-    device: str,
-    report: Report,
-) -> tuple[Weights, dict[str, Any]]:
-    """Train the network; return weights, and their figures on the validation scenes for the record."""
-    common = scenes.common
-    settings = request.flags.settings
-    examples = scenes.train.examples
-    config = replace(network_config(request.flags, common), untaught=scenes.untaught)
-    rng = np.random.default_rng([0x1DA])
-    pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
-    start = linear_classifier(pixels, config.classes) | (load_encoder() if config.deep else {})
-    if begun is not None:
-        begun = replace(begun, segmenter=continued(begun.segmenter, config, start))
-    model, summary = train(
-        config,
-        examples,
-        normalisation.gain_shift,
-        settings,
-        lambda now: report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
-        start=start if begun is None else begun.segmenter.state_dict(),
-        augmentation=augmentation,
-        checkpoint=checkpoint,
-        device=device,
-    )
-    weights = Weights(model, common.basis, normalisation, common.names, common.colours).on(device)
-    frames = scenes.validation.examples
-    found: dict[str, Any] = {}
-    labelled = sum(int(np.count_nonzero(one.labels != UNLABELLED)) for one in examples)
-    weights, found["readings"] = figures.better_reading(
-        weights, start, frames, few=begun is None and labelled < figures.FEW_PIXELS, begun=begun
-    )
-    found["baselines"] = figures.judge_baselines(examples, frames, config.classes, settings.seed, report)
-    if frames:
-        report("validating", 0.0, f"{len(frames)} scenes")
-        found[CALIBRATION] = figures.judge_calibration(weights, frames, settings.seed)
-    twice = figures.read_twice(weights, frames)
-    if twice:
-        found[CASCADE] = asdict(CascadeTable.judged(twice, config.classes))
-    found["validation"] = figures.validate(twice, config.classes)
-    return weights, {"training": summary, **found}
+@dataclass(frozen=True)
+class Learned:
+    """Weights and entries of their record."""
+
+    weights: Weights
+    found: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Learner:
+    """The ways to learn from normalised scenes."""
+
+    request: TrainRequest
+    scenes: Scenes
+    normalisation: Normalisation
+    augmentation: CaptureAugmentation | None
+    checkpoint: Path
+    device: str
+    report: Report
+
+    @cached_property
+    def config(self) -> SegmenterConfig:
+        """Return the sizes of the networks."""
+        return replace(network_config(self.request.flags, self.scenes.common), untaught=self.scenes.untaught)
+
+    def network(self, begun: Weights | None) -> Learned:
+        """Train networks from a linear classifier of mean spectra, or from weights."""
+        examples = self.scenes.train.examples
+        rng = np.random.default_rng([0x1DA])
+        pixels = LabelledPixels.drawn(examples, rng, self.augmentation).brightened(self.normalisation.gain_shift, rng)
+        start = linear_classifier(pixels, self.config.classes) | (load_encoder() if self.config.deep else {})
+        if begun is not None:
+            begun = replace(begun, segmenter=continued(begun.segmenter, self.config, start))
+        model, summary = self._trained(self.config, start if begun is None else begun.segmenter.state_dict())
+        if begun is not None:
+            model = self._better({"trained": model, "mean with --start": halfway(begun.segmenter, model)})[0]
+        return Learned(self._weights(model), {"training": summary})
+
+    def mixture(self) -> Learned:
+        """Fit a mixture of classifiers, without a network."""
+        began = time.process_time()
+        seed = self.request.flags.settings.seed
+        mixed = fit_mixture(self.scenes.train.examples, self.normalisation, self.config, seed, self.report)
+        spent = {"steps": 0, "processor_seconds": round(time.process_time() - began, 1)}
+        found = {"candidates": [asdict(one) for one in mixed.judged], "plain": mixed.plain, "training": spent}
+        return Learned(self._weights(mixed.segmenter), found)
+
+    def correction(self, mixed: Weights) -> Learned | None:
+        """Train networks that correct a mixture; None unless a fraction of them reads the validation scenes better."""
+        if not self.scenes.validation.examples:
+            return None
+        config = replace(mixed.config, corrected=True)
+        encoder = load_encoder() if config.deep else {}
+        model, summary = self._trained(config, {**mixed.segmenter.state_dict(), **encoder})
+        tried = {f"{part:g} of the network": scaled(model, part) for part in CORRECTIONS}
+        best, scores = self._better({"mixture": mixed.segmenter, **tried})
+        if best is mixed.segmenter:
+            return None
+        return Learned(self._weights(best), {"training": summary, "corrections": scores})
+
+    def judged(self, weights: Weights) -> dict[str, Any]:
+        """Return figures on the validation scenes, for the record."""
+        frames = self.scenes.validation.examples
+        twice = figures.read_twice(weights, frames)
+        found: dict[str, Any] = {"validation": figures.validate(twice, weights.config.classes)}
+        if not weights.config.corrected:
+            found[CASCADE] = asdict(CascadeTable.of_overview())
+        elif twice:
+            found[CASCADE] = asdict(CascadeTable.judged(twice, weights.config.classes))
+        if frames:
+            self.report("validating", 0.0, f"{len(frames)} scenes")
+            found[CALIBRATION] = figures.judge_calibration(weights, frames, self.request.flags.settings.seed)
+        return found
+
+    def _trained(self, config: SegmenterConfig, start: Mapping[str, Tensor]) -> tuple[Segmenter, dict[str, Any]]:
+        return train(
+            config,
+            self.scenes.train.examples,
+            self.normalisation.gain_shift,
+            self.request.flags.settings,
+            lambda now: self.report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
+            start=start,
+            augmentation=self.augmentation,
+            checkpoint=self.checkpoint,
+            device=self.device,
+        )
+
+    def _better(self, models: Mapping[str, Segmenter]) -> tuple[Segmenter, dict[str, float]]:
+        """Return the model that reads the validation scenes best, else the last one; and the mIoU of each."""
+        frames = self.scenes.validation.examples
+        scores = {name: figures.miou_of(self._weights(one), frames) for name, one in models.items()} if frames else {}
+        return models[max(scores, key=lambda name: scores[name], default=list(models)[-1])], scores
+
+    def _weights(self, model: Segmenter) -> Weights:
+        common = self.scenes.common
+        return Weights(model, common.basis, self.normalisation, common.names, common.colours).on(self.device)
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
@@ -240,18 +310,16 @@ def check_counts(flags: TrainFlags) -> None:
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
     size_mb = request.out.stat().st_size / 1e6
     show_text(f"weights: {request.out} ({size_mb:.1f} MB), {record['training']['steps']} steps", console)
-    readings = record["readings"]
-    of_readings, of_baselines = (
-        ", ".join(f"{name} {100 * miou:.1f}" for name, miou in scores.items())
-        for scores in (readings["miou"], record["baselines"] or {})
-    )
-    text = f"mIoU of the whole scenes by each reading: {of_readings}; " if of_readings else ""
-    show_text(f"{text}kept: {readings['kept']}", console)
-    what = "mIoU of classifiers of a random half of the training pixels, on the other half"
-    if of_readings:
-        what = f"on at most {PIXELS} of their pixels at full exposure"
-    if of_baselines:
-        show_text(f"{what}: {of_baselines}", console)
+    if "candidates" in record:
+        rows = [
+            [one["name"], f"{one['miou']:.1%}", f"{one['accuracy']:.1%}", f"{one['weight']:.2f}" if one["weight"] else "", f"{one['seconds']:.1f}"]
+            for one in record["candidates"]
+        ]
+        console.print(table(("classifier", "mIoU", "overall", "weight", "seconds"), rows, title="By cross-validation", left=1))
+        show_text("cross-validation on these scenes is no forecast for other ground", console)
+    if "corrections" in record:
+        shown = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in record["corrections"].items())
+        show_text(f"mIoU of the validation scenes: {shown}", console)
     judged = record["validation"]
     if judged is None:
         left = built_in_laws(request.dataset) or request.flags.hold_out or request.flags.train_mask is not None

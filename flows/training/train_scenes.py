@@ -23,7 +23,9 @@ from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
-COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files
+COLUMNS = 24  # spectral features of built-in scenes
+LEAST_COLUMNS, MOST_COLUMNS = 48, 256  # of files: one a band, if the memory has room
+COLUMN_BYTES = 1 << 30  # of all scenes
 CAMERA = LineCamera()
 UNFIT = "{validation scenes} left out, without a labelled pixel or with the image of a training scene: {names}"
 

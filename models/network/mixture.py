@@ -62,9 +62,8 @@ class Mixture(nn.Module):
         self.own_axes = nn.Parameter(torch.zeros(columns, own), requires_grad=False)
         self.relative_axes = nn.Parameter(torch.zeros(columns + 1, relative), requires_grad=False)
         self.relative_centre = nn.Parameter(torch.zeros(columns + 1), requires_grad=False)
-        self.weight = nn.Parameter(torch.full((len(config.parts),), 1 / len(config.parts)), requires_grad=False)
         self.prior = nn.Parameter(torch.zeros(config.classes), requires_grad=False)  # added to logarithms
-        self.parts = nn.ModuleList(Part(widths[kind], hidden, config.classes) for kind, hidden in config.parts)
+        self.parts = nn.ModuleList(Part(widths[kind], hidden, config.classes) for kind, hidden, _ in config.parts)
 
     def relative(self, columns: Tensor) -> Tensor:
         """Return scene values (..., column) over their norm, and its logarithm, (..., column + 1)."""
@@ -95,8 +94,19 @@ class Mixture(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the logarithms of the mixed probabilities and of the prior, (B, class, y, x)."""
-        found = self.features(image, {kind for kind, _ in self.config.parts})
+        used = [
+            (kind, part, weight)
+            for (kind, _, weight), part in zip(self.config.parts, self.parts, strict=True)
+            if weight
+        ]
+        found = self.features(image, {kind for kind, _, _ in used})
         mixed = torch.zeros((), device=image.device)
-        for (kind, _), part, weight in zip(self.config.parts, self.parts, self.weight, strict=True):
+        for kind, part, weight in used:
             mixed = mixed + weight * part(found[kind]).softmax(dim=-1)
         return mixed.clamp_min(LEAST).log().add(self.prior).movedim(-1, 1)
+
+    def by_part(self, image: Tensor, number: int) -> Tensor:
+        """Return the logits (B, class, y, x) of one part alone, such as the best plain classifier."""
+        kind = self.config.parts[number][0]
+        logits: Tensor = self.parts[number](self.features(image, {kind})[kind])
+        return logits.movedim(-1, 1)

@@ -64,7 +64,8 @@ class SegmenterConfig:
     mlp_ratio: int = 3
     deep: bool = False  # an overview for large frames, with an encoder that was trained on ImageNet
     untaught: tuple[int, ...] = ()  # classes without a training pixel: their probability is 0
-    parts: tuple[tuple[str, int], ...] = ()  # of a mixture: features, hidden channels (0: linear); none: linear alone
+    # of a mixture: features, hidden channels (0: linear) and weight; none: a linear classifier alone
+    parts: tuple[tuple[str, int, float], ...] = ()
     components: tuple[int, int] = (0, 0)  # of spectra and of relative spectra, around a pixel
     corrected: bool = True  # an overview and a full network correct the classifiers of pixels
 
@@ -76,7 +77,9 @@ class SegmenterConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "untaught", tuple(self.untaught))  # a list in files
         object.__setattr__(self, "components", tuple(self.components))
-        object.__setattr__(self, "parts", tuple((str(kind), int(hidden)) for kind, hidden in self.parts))
+        object.__setattr__(
+            self, "parts", tuple((str(kind), int(hidden), float(weight)) for kind, hidden, weight in self.parts)
+        )
         for name in ("classes", *MOST):
             if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
                 raise ShapeError(f"{name} of a segmenter must be a whole number, got {getattr(self, name)!r}")
@@ -86,10 +89,11 @@ class SegmenterConfig:
             if not 1 <= getattr(self, name) <= most:
                 least = f"{name} of a segmenter must be at least 1"
                 raise ShapeError(f"{least} and at most {most}, got {getattr(self, name)}")
-        kinds = {kind for kind, _ in self.parts}
-        sizes = [hidden for _, hidden in self.parts]
-        if not kinds <= {VALUES, RELATIVE, AROUND} or not all(0 <= size <= MOST["width"] for size in sizes):
-            raise ShapeError(f"parts of a mixture have features and hidden channels, got {self.parts}")
+        known = all(
+            kind in (VALUES, RELATIVE, AROUND) and 0 <= hidden <= MOST["width"] for kind, hidden, _ in self.parts
+        )
+        if not known or not all(0 <= weight <= 1 for _, _, weight in self.parts):
+            raise ShapeError(f"parts of a mixture have features, hidden channels and a weight, got {self.parts}")
         if not all(0 <= size <= self.columns + 1 for size in self.components):
             raise ShapeError(f"components {self.components} of {self.columns} columns do not exist")
         if not {*self.untaught} < {*range(self.classes)}:
@@ -156,13 +160,12 @@ def base_multiply_adds(config: SegmenterConfig) -> int:
     if not config.parts:
         return config.columns * config.classes
     widths = feature_widths(config)
+    used = [(kind, hidden) for kind, hidden, weight in config.parts if weight]
     found = config.columns**2  # scene values
-    if any(kind == AROUND for kind, _ in config.parts):
-        found += sum(config.components) * config.columns
-    return found + sum(
-        (widths[kind] + config.classes) * hidden if hidden else widths[kind] * config.classes
-        for kind, hidden in config.parts
-    )
+    found += sum(config.components) * config.columns if AROUND in dict(used) else 0
+    for kind, hidden in used:
+        found += (widths[kind] + config.classes) * hidden if hidden else widths[kind] * config.classes
+    return found
 
 
 def feature_widths(config: SegmenterConfig) -> dict[str, int]:

@@ -64,7 +64,9 @@ CANDIDATES = (
         for kind, weights in {VALUES: (0.3, 10.0), RELATIVE: (0.3, 10.0), AROUND: (0.1,)}.items()
         for weight in weights
     ),
-    Candidate(f"{AROUND}, MLP", AROUND, lambda: MLPClassifier(48, alpha=0.03, batch_size=128, max_iter=40, random_state=0), 48),
+    Candidate(
+        f"{AROUND}, MLP", AROUND, lambda: MLPClassifier(48, alpha=0.03, batch_size=128, max_iter=40, random_state=0), 48
+    ),
 )
 
 
@@ -87,6 +89,15 @@ class Judged:
     accuracy: float
     seconds: float  # of a processor
     weight: float = 0.0  # in the mixture
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A segmenter of pixels alone, without a network."""
+
+    segmenter: Segmenter
+    plain: int  # number of the part that is the best classifier of single spectra
+    judged: tuple[Judged, ...]  # every candidate, and last the mixture
 
 
 @dataclass(frozen=True)
@@ -139,41 +150,42 @@ def _write(layer: torch.nn.Linear, weight: Floats, bias: Floats) -> None:
 
 def fit_mixture(
     examples: Sequence[Example], normalisation: Normalisation, config: SegmenterConfig, seed: int, report: Report
-) -> tuple[Segmenter, list[Judged]]:
-    """Return a segmenter of pixels alone, by normalised scenes; and its candidates and itself by cross-validation.
+) -> Mixed:
+    """Return a segmenter of pixels alone, fitted to normalised scenes.
 
     Raises SceneError: there are as few labelled pixels as classes.
     """
     rng = np.random.default_rng([seed, 0x31])
     columns = config.columns
     components = min(COMPONENTS[0], columns), min(COMPONENTS[1], columns + 1)
-    measured = Mixture(replace(config, parts=((VALUES, 0),), components=components))
+    measured = Mixture(replace(config, parts=((VALUES, 0, 1.0),), components=components))
     _measure(measured, examples, normalisation)
     began = time.process_time()
     taught = taught_pixels(measured, examples, rng)
     known = np.unique(taught.labels)
     if len(known) >= len(taught.labels):
-        raise SceneError(f"{len(taught.labels)} labelled pixels of {len(known)} classes are too few; label more of each")
+        raise SceneError(
+            f"{len(taught.labels)} labelled pixels of {len(known)} classes are too few; label more of each"
+        )
     apart = _apart(taught, config.classes, report)
     weights, mixed = _chosen(apart, taught, config.classes)
     power = _prior_power(mixed, taught, config.classes)
-    parts = [one for one in CANDIDATES if one.name in weights]
-    sizes = tuple((one.kind, one.hidden) for one in parts)
-    segmenter = Segmenter(replace(config, parts=sizes, components=components, corrected=False)).eval()
-    segmenter.mixture.load_state_dict(
-        {name: one for name, one in measured.state_dict().items() if not name.startswith(("parts", "weight"))}, strict=False
-    )
+    plain = max((one for one in CANDIDATES if one.kind == VALUES), key=lambda one: apart[one.name][1].miou)
     total = sum(weights.values())
+    parts = [one for one in CANDIDATES if one.name in weights or one is plain]
+    sizes = tuple((one.kind, one.hidden, weights.get(one.name, 0) / total) for one in parts)
+    segmenter = Segmenter(replace(config, parts=sizes, components=components, corrected=False)).eval()
+    same = {name: one for name, one in measured.state_dict().items() if not name.startswith("parts")}
+    segmenter.mixture.load_state_dict(same, strict=False)
+    for part, one in zip(segmenter.mixture.parts, parts, strict=True):
+        Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
+    fraction = np.bincount(taught.labels, minlength=config.classes) / len(taught.labels)
+    prior = np.where(fraction > 0, -power * np.log(np.maximum(fraction, 1e-12)), 0)
     with torch.no_grad():
-        for part, one in zip(segmenter.mixture.parts, parts, strict=True):
-            Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
-        segmenter.mixture.weight.copy_(torch.tensor([weights[one.name] / total for one in parts]))
-        fraction = np.bincount(taught.labels, minlength=config.classes) / len(taught.labels)
-        prior = np.where(fraction > 0, -power * np.log(np.maximum(fraction, 1e-12)), 0)
         segmenter.mixture.prior.copy_(torch.from_numpy(prior.astype(np.float32)))
     own = _judged("mixture", mixed, taught.labels, config.classes, time.process_time() - began)
-    shown = [replace(apart[name][1], weight=weights.get(name, 0) / total) for name in apart]
-    return segmenter, [*shown, own]
+    shown = [replace(judged, weight=weights.get(name, 0) / total) for name, (_, judged) in apart.items()]
+    return Mixed(segmenter, parts.index(plain), (*shown, own))
 
 
 def _measure(mixture: Mixture, examples: Sequence[Example], normalisation: Normalisation) -> None:
@@ -277,9 +289,7 @@ def _judged(name: str, probability: Floats, labels: Labels, classes: int, second
     return Judged(name, metrics.mean_iou(counts), metrics.overall_accuracy(counts), seconds)
 
 
-def _chosen(
-    apart: Mapping[str, tuple[Floats, Judged]], taught: Taught, classes: int
-) -> tuple[dict[str, int], Floats]:
+def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught, classes: int) -> tuple[dict[str, int], Floats]:
     """Return how often each candidate is in the mixture, and its probabilities (Caruana et al. 2004)."""
 
     def score(probability: Floats) -> float:

@@ -107,6 +107,8 @@ class Trainer:
             self.model = Segmenter(config)
         if start is not None:
             self.model.load_state_dict(start, strict=False)
+        if config.parts:
+            self.model.mixture.requires_grad_(requires_grad=False)  # it is fitted already
         self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         groups: list[dict[str, object]] = []  # matrices and kernels decay, gains and shifts do not
@@ -123,8 +125,11 @@ class Trainer:
 
     @property
     def done(self) -> float:
-        """Progress of the run, 0..1, by steps or by time, whichever is further."""
-        seconds = self.course.seconds + time.monotonic() - self._started
+        """Progress of the run, 0..1, by steps or by time, whichever is further: of the processor, or by an accelerator."""
+        if self.model.device.type == PROCESSOR:
+            seconds = self.course.processor_seconds + time.process_time() - self._worked
+        else:
+            seconds = self.course.seconds + time.monotonic() - self._started
         return max(self.course.step / self.settings.steps, seconds / (60 * self.settings.minutes))
 
     def step(self, done: float) -> None:
@@ -280,12 +285,10 @@ def linear_classifier(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]
     }
 
 
-def with_linear(segmenter: Segmenter, start: Mapping[str, Tensor], fraction: float) -> Segmenter:
-    """Return a copy with a ``fraction`` of its own logits, and for the rest those of a linear classifier ``start``."""
+def scaled(segmenter: Segmenter, fraction: float) -> Segmenter:
+    """Return a copy whose networks correct the classifiers of pixels by a ``fraction``."""
     mixed = copy.deepcopy(segmenter)
     with torch.no_grad():
-        for name, own in mixed.spectral.named_parameters():
-            own.lerp_(start[f"spectral.{name}"].to(own.device), 1 - fraction)
         for last in (mixed.overview_classes, mixed.full_classes):
             for own in last.parameters():
                 own.mul_(fraction)
