@@ -33,7 +33,8 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.image_files import bad_bands, rescaled
+from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
