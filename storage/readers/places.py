@@ -10,7 +10,7 @@ import importlib
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import xarray as xr
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from pyproj import CRS
+from pyproj import CRS, Transformer
 from pyproj.database import get_units_map
 
 from spectralzoom.pipeline.errors import SceneError
@@ -107,13 +107,13 @@ def place_of_dataset(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> P
         if there and not notes:
             notes.append("it has coordinates and no CRS (write one: rio.write_crs of rioxarray)")
         return None, (*notes, *_other_places(dataset, cube, dims))
-    if not (crs.is_projected or crs.is_geographic):
-        return None, (*notes, _unmapped(crs))
+    if not _is_map(crs):
+        return _placed(shape, Affine.identity(), crs, notes)
     transform = _transform(axes, stated, crs, shape, notes)
     if transform is None:
         reason = () if notes else ("it has a CRS, and neither coordinates along its axes nor a GeoTransform",)
         return None, (*notes, *reason, *_other_places(dataset, cube, dims))
-    return _geobox(shape, transform, crs), tuple(notes)
+    return _placed(shape, transform, crs, notes)
 
 
 def _axis(dataset: xr.Dataset, dim: str, kind: str) -> _Axis | None:
@@ -169,15 +169,17 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
     """Return the first CRS that can be read: of the grid mapping, of attributes, WGS 84 of latitudes and longitudes."""
     given = [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS[:2] if mapping.get(key)]
     if mapping.get("grid_mapping_name"):
-        given.append(("its grid mapping", _in_metres(mapping, axes, notes)))
+        given.append(("its grid mapping", mapping))
     given += [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS[2:] if mapping.get(key)]
     given += [(key, attributes[key]) for key in _CRS_ATTRIBUTES if attributes.get(key)]
+    if isinstance(attributes.get("_CRS"), dict):  # GDAL's in Zarr
+        given += [("_CRS", attributes["_CRS"][key]) for key in ("wkt", "projjson") if key in attributes["_CRS"]]
     for where, value in given:
-        is_cf = isinstance(value, dict) and "grid_mapping_name" in value
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of old texts such as +init=epsg
-                return CRS.from_cf(value) if is_cf else CRS.from_user_input(value)
+                by_cf = value is mapping
+                return CRS.from_cf(_in_metres(mapping, axes, notes)) if by_cf else CRS.from_user_input(value)
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
             notes.append(f"the CRS cannot be read from {where}: {lacks}")
@@ -247,8 +249,9 @@ def _transform(
     if stated is not None and (stated.b or stated.d):
         notes.append(f"its grid is turned, so that {y.name} and {x.name} are not used")
         return stated
-    along_x = _line(x, None if stated is None else stated.a, crs, notes)
-    along_y = _line(y, None if stated is None else stated.e, crs, notes)
+    doubts: list[str] = []  # which a stated transform settles
+    along_x = _line(x, _per_unit(x, crs, doubts), None if stated is None else stated.a, notes)
+    along_y = _line(y, _per_unit(y, crs, doubts), None if stated is None else stated.e, notes)
     if along_x is None or along_y is None:
         return None
     (left, width, x_px), (top, height, y_px) = along_x, along_y
@@ -256,14 +259,13 @@ def _transform(
     if crs.is_geographic and left >= turn / 2:  # 0 to 360 degrees east
         left -= turn
     found = Affine(width, 0.0, left, 0.0, height, top)
-    if stated is None:
-        return found
-    corners = np.array([(0, 0, 1), (shape[1], 0, 1), (0, shape[0], 1)])
-    for other in (stated, stated * Affine(1, 0, 0, 0, -1, shape[0])):  # GDAL stores NetCDF from the bottom up
-        apart = np.abs(corners @ np.subtract(~found * other, Affine.identity()).reshape(3, 3).T)
-        if (apart[:, :2] <= np.maximum(OFF_GRID_PX, (x_px, y_px))).all():
+    flipped = Affine(1, 0, 0, 0, -1, shape[0])  # GDAL stores NetCDF from the bottom up
+    for other in () if stated is None else (stated, stated * flipped):
+        a, _, c, _, e, f = (~found * other)[:6]
+        away_x, away_y = max(abs(c), abs(c + (a - 1) * shape[1])), max(abs(f), abs(f + (e - 1) * shape[0]))
+        if away_x <= max(OFF_GRID_PX, x_px) and away_y <= max(OFF_GRID_PX, y_px):
             return other
-    notes.append(f"its GeoTransform contradicts {y.name} and {x.name}, which are used")
+    notes += doubts if stated is None else [*doubts, f"its transform contradicts {y.name} and {x.name}, which are used"]
     return found
 
 
@@ -276,10 +278,9 @@ def _part(y: _Axis, x: _Axis) -> Affine:
     return Affine.translation(*first) * Affine.scale(*steps)
 
 
-def _line(axis: _Axis, stated: float | None, crs: CRS, notes: list[str]) -> tuple[float, float, float] | None:
-    """Return the first edge and the step in units of the CRS, and the precision [px]; None with a note."""
+def _line(axis: _Axis, per_unit: float, stated: float | None, notes: list[str]) -> tuple[float, float, float] | None:
+    """Return the first edge and the step, in units of the CRS, and the precision [px]; None with a note."""
     values, count = axis.values, len(axis.values)
-    per_unit = _per_unit(axis, crs, notes)
     if count == 1:
         if stated is None:
             notes.append(f"{axis.name} has one value, so that the size of its pixel is not known")
@@ -291,7 +292,7 @@ def _line(axis: _Axis, stated: float | None, crs: CRS, notes: list[str]) -> tupl
         steps = np.diff(values)
         notes.append(f"{axis.name} is not evenly spaced (steps of {steps.min():g} to {steps.max():g}); resample it")
         return None
-    if axis.precision > abs(step) / 2:
+    if off > OFF_GRID_PX * abs(step) and axis.precision > abs(step) / 2:
         notes.append(f"{axis.name} is stored to {axis.precision:.2g}, too coarse for its steps of {abs(step):.2g}")
         return None
     return (float(values[0]) - step / 2) * per_unit, step * per_unit, axis.precision / abs(step)
@@ -377,20 +378,27 @@ def place_of_file(file: Any) -> Place:
         crs = CRS.from_wkt(file.crs.to_wkt())
     except Exception as error:  # of PROJ and of GDAL
         return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
-    if not (crs.is_projected or crs.is_geographic):
-        return None, (_unmapped(crs),)
-    return _geobox(file.shape, file.transform, crs), ()
+    return _placed(file.shape, file.transform, crs)
 
 
-def _unmapped(crs: CRS) -> str:
-    return f"its CRS, {crs.name!r}, is not geographic or projected; its place is not known"
+def _is_map(crs: CRS) -> bool:
+    return bool(crs.is_projected or crs.is_geographic)
 
 
-def _geobox(shape: tuple[int, int], transform: Affine, crs: CRS) -> GeoBox:
-    """Return a grid in the horizontal part of its CRS, by the EPSG code if it has one."""
+def _placed(shape: tuple[int, int], transform: Affine, crs: CRS, notes: Sequence[str] = ()) -> Place:
+    """Return a grid in the horizontal part of its CRS, by its EPSG code if it has one; None if it is on no map."""
+    if not _is_map(crs):
+        return None, (*notes, f"its CRS, {crs.name!r}, is not geographic or projected; its place is not known")
     flat = crs.to_2d() if len(crs.axis_info) > 2 else crs
+    geodetic = flat.geodetic_crs
+    assert geodetic is not None
+    x, y = transform * (shape[1] / 2, shape[0] / 2)
+    lon, lat = Transformer.from_crs(flat, geodetic, always_xy=True).transform(x, y)
+    turns = np.abs([lon, 2 * lat]) * geodetic.axis_info[0].unit_conversion_factor / (2 * math.pi)
+    if not (turns <= (1, 0.5)).all():  # inf and NaN, too
+        return None, (*notes, f"its middle, {x:g}, {y:g}, is no place in its CRS, {crs.name!r}; correct one of them")
     code = flat.to_epsg()
-    return odc_geobox.GeoBox(shape, transform, odc_crs.CRS(flat.to_wkt() if code is None else code))
+    return odc_geobox.GeoBox(shape, transform, odc_crs.CRS(flat.to_wkt() if code is None else code)), tuple(notes)
 
 
 def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int]) -> Place:
@@ -424,7 +432,7 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     as_wgs84 = crs.geodetic_crs is not None and re.match(_WGS84, crs.geodetic_crs.name)
     if as_wgs84 and "coordinate system string" not in header and not re.fullmatch(_WGS84, datum):
         notes = (*notes, f"its datum, {datum!r}, is read as WGS 84, so that its place may be some 100 m off")
-    return _geobox(shape, Affine.scale(scale) * found.affine, crs), notes
+    return _placed(shape, Affine.scale(scale) * found.affine, crs, notes)
 
 
 def _in_survey_feet(text: str) -> CRS | None:
