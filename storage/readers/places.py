@@ -11,6 +11,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,10 @@ import xarray as xr
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
+from odc.geo.math import affine_from_axis
 from pyproj import CRS, Transformer
 from pyproj.database import get_units_map
+from pyproj.exceptions import CRSError
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
@@ -32,7 +35,7 @@ Place = tuple[GeoBox | None, tuple[str, ...]]
 
 _CRS_TEXTS = ("crs_wkt", "spatial_ref", "esri_pe_string", "proj4_params", "proj4text", "epsg_code")  # grid mapping
 _CRS_ATTRIBUTES = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg", "crs_wkt", "crs")  # image, then dataset
-_NAMES = {"y": ("lat", "latitude"), "x": ("lon", "longitude", "long")}
+_NAMES = {"y": ("y", "lat", "latitude"), "x": ("x", "lon", "longitude")}
 _STANDARD = {"y": ("latitude", "grid_latitude"), "x": ("longitude", "grid_longitude")}
 _DIRECTIONS = {"y": r"degrees?_?n(orth)?", "x": r"degrees?_?e(ast)?"}
 _PIXELS = {"pixel", "pixels", "px"}  # units of coordinates that are no places
@@ -54,28 +57,10 @@ class _Axis:
     """The coordinates of the pixel centres along one axis."""
 
     name: str
-    kind: str  # y or x
-    about: Mapping[str, Any]
-    values: NDArray[Any]
+    values: NDArray[np.float64]
     precision: float  # by which stored numbers may be rounded
-
-    @property
-    def unit(self) -> str:
-        """Return the stated unit; degree for a latitude or longitude without one."""
-        stated = str(self.about.get("units", "")).strip()
-        return stated or ("degree" if self.geographic or self._standard in _STANDARD[self.kind] else "")
-
-    @property
-    def _standard(self) -> str:
-        return str(self.about.get("standard_name", ""))
-
-    @property
-    def geographic(self) -> bool:
-        """Return whether these are latitudes or longitudes, by unit, standard name or name."""
-        if self._standard:
-            return self._standard == _STANDARD[self.kind][0]
-        stated = str(self.about.get("units", "")).strip().lower()
-        return bool(re.fullmatch(_DIRECTIONS[self.kind], stated)) or self.name.lower() in _NAMES[self.kind]
+    unit: str  # as stated; degree for a latitude or longitude without one
+    geographic: bool  # a latitude or longitude, by unit, standard name or name
 
     @property
     def counts(self) -> bool:
@@ -123,14 +108,17 @@ def _axis(dataset: xr.Dataset, dim: str, kind: str) -> _Axis | None:
         found = dataset.variables.get(name)
         if found is None or found.dims != (dim,) or found.dtype.kind not in "iuf" or not found.size:
             continue
-        about = _plain(found.attrs)
-        marked = about.get("standard_name") in marks or str(about.get("axis")).lower() == kind
+        standard, axis, unit = (str(found.attrs.get(key, "")).strip() for key in ("standard_name", "axis", "units"))
         word = str(name).rpartition("/")[2]
-        if name == dim or marked or word.lower() in (kind, *_NAMES[kind]):
-            values = np.asarray(found.values)
-            rounded = float(np.spacing(np.abs(values).max())) if values.dtype.kind == "f" else 0.0
-            packed = abs(float(np.ravel(found.encoding.get("scale_factor", 0.0))[0])) / 2
-            return _Axis(word, kind, about, values.astype(np.float64), max(rounded, packed))
+        if name != dim and standard not in marks and axis.lower() != kind and word.lower() not in _NAMES[kind]:
+            continue
+        values = np.asarray(found.values)
+        rounded = float(np.spacing(np.abs(values).max())) if values.dtype.kind == "f" else 0.0
+        packed = abs(float(np.ravel(found.encoding.get("scale_factor", 0.0))[0])) / 2
+        by_name = bool(re.fullmatch(_DIRECTIONS[kind], unit.lower())) or word.lower() in _NAMES[kind][1:]
+        geographic = standard == _STANDARD[kind][0] if standard else by_name
+        unit = unit or ("degree" if geographic or standard in _STANDARD[kind] else "")
+        return _Axis(word, values.astype(np.float64), max(rounded, packed), unit, geographic)
     return None
 
 
@@ -193,12 +181,13 @@ def _in_metres(mapping: Mapping[str, Any], axes: list[_Axis], notes: list[str]) 
     """Return CF's parameters with a name, false easting and northing in metres: CF has them in the axes' unit."""
     parameters = {key: value for key, value in mapping.items() if key not in _CRS_TEXTS}
     parameters.setdefault("projected_crs_name", str(mapping["grid_mapping_name"]).replace("_", " "))
-    for axis, key in ((axis, f"false_{'easting' if axis.kind == 'x' else 'northing'}") for axis in axes):
+    for axis, key in zip(axes, ("false_northing", "false_easting"), strict=False):
         category, factor = _unit(axis.unit) or ("", 1.0)
-        given = float(parameters.get(key, 0.0))
-        if category == "linear" and factor != 1 and given:
-            notes.append(f"its {key} of {given:g} is read in {axis.unit}, the unit of {axis.name}, as CF says")
-            parameters[key] = given * factor
+        if category == "linear" and factor != 1 and parameters.get(key):
+            notes.append(
+                f"its {key} of {parameters[key]:g} is read in {axis.unit}, the unit of {axis.name}, as CF says"
+            )
+            parameters[key] *= factor
     return parameters
 
 
@@ -210,33 +199,24 @@ def _stated_transform(
     notes: list[str],
 ) -> Affine | None:
     """Return the transform of pixel corners by a GeoTransform or GeoZarr's attributes; None without one."""
-    if mapping.get("GeoTransform"):
-        words = re.split(r"[\s,\[\]()]+", str(mapping["GeoTransform"]))
-        numbers = _numbers([word for word in words if word])
-        found = Affine.from_gdal(*numbers) if len(numbers) == 6 else None
-    elif attributes.get("spatial:transform") or (attributes.get("transform") and attributes.get("crs")):
-        numbers = _numbers(attributes.get("spatial:transform") or attributes["transform"])[:6]
-        found = Affine(*numbers) if len(numbers) == 6 else None
-        if found is not None and attributes.get("spatial:registration") == "node":
-            found *= Affine.translation(-0.5, -0.5)
-        others = tuple(attributes.get("spatial:dimensions", dims)) != dims
-        if others or tuple(attributes.get("spatial:shape", shape)) != shape:
-            notes.append("its spatial:transform is that of an image of another shape")
-            return None
-    else:
+    of_gdal = mapping.get("GeoTransform")
+    numbers = of_gdal or attributes.get("spatial:transform") or (attributes.get("crs") and attributes.get("transform"))
+    if not numbers:
         return None
-    if found is None or not math.isfinite(found.determinant) or not found.determinant:
+    pair = tuple(attributes.get("spatial:dimensions", dims)), tuple(attributes.get("spatial:shape", shape))
+    if not of_gdal and pair != (dims, shape):
+        notes.append("its spatial:transform is that of an image of another shape")
+        return None
+    try:
+        words = [float(word) for word in re.split(r"[\s,\[\]()]+", str(numbers)) if word]
+        found = Affine.from_gdal(*words) if of_gdal else Affine(*words[:6])
+    except (TypeError, ValueError):
+        found = Affine.scale(0)
+    if not math.isfinite(found.determinant) or not found.determinant:
         notes.append("its transform is no grid of pixels")
         return None
-    return found
-
-
-def _numbers(words: Any) -> list[float]:
-    """Return a list of words as numbers; empty if one of them is none."""
-    try:
-        return [float(word) for word in words]
-    except (TypeError, ValueError):
-        return []
+    of_centres = not of_gdal and attributes.get("spatial:registration") == "node"
+    return found * Affine.translation(-0.5, -0.5) if of_centres else found
 
 
 def _transform(
@@ -244,8 +224,12 @@ def _transform(
 ) -> Affine | None:
     """Return the transform by coordinates in units of the CRS, else the stated one; None with a note."""
     y, x = axes
-    if y is None or x is None or y.counts or x.counts:
-        return stated if stated is None or y is None or x is None else stated * _part(y, x)
+    if y is None or x is None:
+        return stated
+    if y.counts or x.counts:
+        if stated is None or y.values[0] % 1 != 0.5 or x.values[0] % 1 != 0.5:
+            return stated
+        return stated * affine_from_axis(x.values, y.values, 1)  # odc-geo counts pixels from 0.5
     if stated is not None and (stated.b or stated.d):
         notes.append(f"its grid is turned, so that {y.name} and {x.name} are not used")
         return stated
@@ -267,15 +251,6 @@ def _transform(
             return other
     notes += doubts if stated is None else [*doubts, f"its transform contradicts {y.name} and {x.name}, which are used"]
     return found
-
-
-def _part(y: _Axis, x: _Axis) -> Affine:
-    """Return the offset and step of axes that count pixels from 0.5, as odc-geo writes them; else none."""
-    if not all(axis.counts and axis.values[0] % 1 == 0.5 and len(axis.values) > 1 for axis in (y, x)):
-        return Affine.identity()
-    steps = [float(axis.values[1] - axis.values[0]) for axis in (x, y)]
-    first = [float(axis.values[0]) - step / 2 for axis, step in zip((x, y), steps, strict=True)]
-    return Affine.translation(*first) * Affine.scale(*steps)
 
 
 def _line(axis: _Axis, per_unit: float, stated: float | None, notes: list[str]) -> tuple[float, float, float] | None:
@@ -349,7 +324,7 @@ def _other_places(dataset: xr.Dataset, cube: xr.Variable, dims: tuple[str, str])
     """Yield notes on other places that the file states, which are not read."""
     for name, one in dataset.variables.items():
         word = str(name).rpartition("/")[2].lower()
-        swath = word in _NAMES["y"] or one.attrs.get("standard_name") == "latitude"
+        swath = word in _NAMES["y"][1:] or one.attrs.get("standard_name") == "latitude"
         if swath and one.shape == (cube.sizes[dims[0]], cube.sizes[dims[1]]):
             yield f"its place is given by latitudes of each pixel ({name}), which are not read; resample it to a grid"
         elif one.ndim == 2 and word == "glt_x":
@@ -416,30 +391,27 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
                 found, notes = place_of_file(file)
     except Exception as error:  # of GDAL and PROJ
         return None, (f"its map info cannot be read: {error}",)
-    words = [word.strip() for word in re.split("[{},]", header.get("map info", "")) if word.strip()]
-    if found is None:
-        stated = "the header has " + " and ".join(key for key in _ENVI_PLACES if key in header)
-        return None, notes or (f"{stated}, which give no grid; its place on the earth is not known",)
-    assert found.crs is not None
-    crs = CRS(found.crs.to_wkt())
+    if found is None or found.crs is None:
+        stated = " and ".join(key for key in _ENVI_PLACES if key in header)
+        return None, notes or (f"the header has {stated}, which give no grid; its place on the earth is not known",)
+    crs, wkt = CRS(found.crs.to_wkt()), header.get("coordinate system string", "").strip("{} ")
+    words = [word.strip() for word in header.get("map info", "").strip("{} ").split(",")]
     unit = next((word.partition("=")[2].strip() for word in words if word.lower().startswith("units")), "")
-    by_gdal = not unit or (crs.is_geographic and unit.lower() in ("minutes", "seconds"))
-    if unit.lower() == "feet":  # GDAL takes all for international ones
-        survey_feet = _in_survey_feet(header.get("coordinate system string", "").strip("{} "))
-        crs, by_gdal = survey_feet or crs, survey_feet is not None
-    scale = 1.0 if by_gdal else _in_crs("map info", unit, crs)
+    scale = 1.0
+    if unit.lower() == "feet" and (in_feet := _in_survey_feet(wkt)) is not None:  # GDAL takes all as international
+        crs = in_feet
+    elif unit and not (crs.is_geographic and unit.lower() in ("minutes", "seconds")):  # which GDAL reads
+        scale = _in_crs("map info", unit, crs)
     datum = next((word for word in words[9 if words[0].lower() == "utm" else 7 : 10] if "=" not in word), "WGS-84")
     as_wgs84 = crs.geodetic_crs is not None and re.match(_WGS84, crs.geodetic_crs.name)
-    if as_wgs84 and "coordinate system string" not in header and not re.fullmatch(_WGS84, datum):
+    if as_wgs84 and not wkt and not re.fullmatch(_WGS84, datum):
         notes = (*notes, f"its datum, {datum!r}, is read as WGS 84, so that its place may be some 100 m off")
     return _placed(shape, Affine.scale(scale) * found.affine, crs, notes)
 
 
-def _in_survey_feet(text: str) -> CRS | None:
+def _in_survey_feet(wkt: str) -> CRS | None:
     """Return a CRS if its coordinates are US survey feet, else None."""
-    try:
-        crs = CRS.from_user_input(text)
-    except Exception:  # of PROJ
-        return None
-    factor = float(crs.axis_info[0].unit_conversion_factor)
-    return crs if crs.is_projected and math.isclose(factor, 1200 / 3937, rel_tol=1e-9) else None
+    with suppress(CRSError):
+        crs = CRS.from_wkt(wkt)
+        return crs if crs.is_projected and math.isclose(crs.axis_info[0].unit_conversion_factor, 1200 / 3937) else None
+    return None
