@@ -145,10 +145,12 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
 
 def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
     """Return CF's attributes of one axis of a map."""
+    unit = str(crs.proj.axis_info[0].unit_name).replace(" ", "_") if crs.proj.axis_info else "metre"
     if crs.geographic:
-        standard, unit = _DEGREES[name]
-        return {"standard_name": standard, "long_name": f"{standard} of the pixel's centre", "units": unit}
-    unit = crs.proj.axis_info[0].unit_name if crs.proj.axis_info else "metre"
+        standard, degrees = _DEGREES[name]
+        standard, degrees = (f"grid_{standard}", "degrees") if crs.proj.is_derived else (standard, degrees)
+        about = {"standard_name": standard, "long_name": f"{standard} of the pixel's centre"}
+        return {**about, "units": degrees if unit == "degree" else unit}
     return {
         "standard_name": f"projection_{name}_coordinate",
         "long_name": f"{name} of the pixel's centre on the map",

@@ -217,7 +217,9 @@ def _place_of(cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any]) ->
     read: dict[str, xr.Variable] = {}
     named: dict[str, xr.Variable] = {}
     for name, one in arrays.items():
-        own = one.dims or (name,) * one.ndim  # a scale of HDF5 is its own axis
+        axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if name.lower() in words), None)
+        by_name = name if name in dims or axis is None else dims[cube.order[axis]]
+        own = one.dims or (by_name,) * one.ndim  # a scale of HDF5 is its own axis
         fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
         if one.ndim < 2 and fits and one.dtype.kind in "iuf":
             plain = {key: value for key, value in one.attrs.items() if key not in (*_CODED, *_FILLS, *_ENDS)}

@@ -26,7 +26,7 @@ from odc.geo.geobox import GeoBox
 from odc.geo.math import affine_from_axis
 from pyproj import CRS, Transformer
 from pyproj.database import get_units_map
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
@@ -135,11 +135,13 @@ def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
 def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, axes: list[_Axis], notes: list[str]) -> dict[str, Any]:
     """Return the attributes of the grid mapping that the cube names for its axes, else of the only one there is."""
     named: dict[str, list[str]] = {}
-    for word in str(cube.encoding.get("grid_mapping", cube.attrs.get("grid_mapping", ""))).replace(":", ": ").split():
+    text = str(cube.encoding.get("grid_mapping", cube.attrs.get("grid_mapping", "")))
+    for word in text.replace(":", ": ").split():
         if word.endswith(":") or not named:  # "crs", or "crs: x y other: lat lon"
             named[word.removesuffix(":")] = []
         else:
             named[list(named)[-1]].append(word)
+    named = {key.removeprefix("/"): of_axes for key, of_axes in named.items()}
     fitting = [key for key, of_axes in named.items() if {axis.name for axis in axes} & set(of_axes)]
     for key in (*fitting, *named):
         if key in dataset.variables:
@@ -167,7 +169,7 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of old texts such as +init=epsg
                 by_cf = value is mapping
-                return CRS.from_cf(_in_metres(mapping, axes, notes)) if by_cf else CRS.from_user_input(value)
+                return CRS(CRS.from_cf(_in_metres(mapping, axes, notes)).to_wkt() if by_cf else value)
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
             notes.append(f"the CRS cannot be read from {where}: {lacks}")
@@ -203,8 +205,8 @@ def _stated_transform(
     numbers = of_gdal or attributes.get("spatial:transform") or (attributes.get("crs") and attributes.get("transform"))
     if not numbers:
         return None
-    pair = tuple(attributes.get("spatial:dimensions", dims)), tuple(attributes.get("spatial:shape", shape))
-    if not of_gdal and pair != (dims, shape):
+    pair = attributes.get("spatial:dimensions", [*dims]), attributes.get("spatial:shape", [*shape])
+    if not of_gdal and pair != ([*dims], [*shape]):
         notes.append("its spatial:transform is that of an image of another shape")
         return None
     try:
@@ -261,10 +263,11 @@ def _line(axis: _Axis, per_unit: float, stated: float | None, notes: list[str]) 
             notes.append(f"{axis.name} has one value, so that the size of its pixel is not known")
             return None
         return float(values[0]) * per_unit - stated / 2, stated, axis.precision * per_unit / abs(stated)
-    step = float(values[-1] - values[0]) / (count - 1)
-    off = np.abs(values - values[0] - step * np.arange(count)).max()
-    if not np.isfinite(off) or not step or off > max(OFF_GRID_PX * abs(step), axis.precision):
+    with np.errstate(all="ignore"):  # values may be any number
         steps = np.diff(values)
+        step = float(values[-1] - values[0]) / (count - 1)
+        off = np.abs(values - values[0] - step * np.arange(count)).max()
+    if not np.isfinite(off) or not step or off > max(OFF_GRID_PX * abs(step), axis.precision):
         notes.append(f"{axis.name} is not evenly spaced (steps of {steps.min():g} to {steps.max():g}); resample it")
         return None
     if off > OFF_GRID_PX * abs(step) and axis.precision > abs(step) / 2:
@@ -368,11 +371,14 @@ def _placed(shape: tuple[int, int], transform: Affine, crs: CRS, notes: Sequence
     geodetic = flat.geodetic_crs
     assert geodetic is not None
     x, y = transform * (shape[1] / 2, shape[0] / 2)
-    lon, lat = Transformer.from_crs(flat, geodetic, always_xy=True).transform(x, y)
+    try:
+        lon, lat = Transformer.from_crs(flat, geodetic, always_xy=True).transform(x, y)
+    except ProjError as error:
+        return None, (*notes, f"its CRS, {crs.name!r}, cannot be used: {error}")
     turns = np.abs([lon, 2 * lat]) * geodetic.axis_info[0].unit_conversion_factor / (2 * math.pi)
     if not (turns <= (1, 0.5)).all():  # inf and NaN, too
         return None, (*notes, f"its middle, {x:g}, {y:g}, is no place in its CRS, {crs.name!r}; correct one of them")
-    code = flat.to_epsg()
+    code = 4326 if flat.equals(CRS.from_epsg(4326), ignore_axis_order=True) else flat.to_epsg()
     return odc_geobox.GeoBox(shape, transform, odc_crs.CRS(flat.to_wkt() if code is None else code)), tuple(notes)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import odc.geo.xr
 import pytest
@@ -297,6 +298,15 @@ def test_a_dropped_place_has_its_reason(content: xr.Dataset, words: str) -> None
 def test_pixel_numbers_are_no_place() -> None:
     """Counted rows and columns without a CRS give no note: nothing is lost."""
     assert place_of_dataset(dataset(np.arange(6), np.arange(7), None), "v", ("y", "x")) == (None, ())
+
+
+def test_vectors_beside_a_cube_without_names_of_axes_are_coordinates(tmp_path: Path) -> None:
+    """HDF5 files of h5py often have no scales; a grid mapping may be named by its path, and have heights."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["v"], file["x"], file["y"], file["crs"] = VALUES, X, Y, 0
+        file["v"].attrs["grid_mapping"] = "/crs"
+        file["crs"].attrs.update({**TRANSVERSE, "geopotential_datum_name": "NAVD88"})
+    assert open_cube_source(tmp_path / "a.h5").geobox == GeoBox(SHAPE, PLACE, "EPSG:32632")
 
 
 def test_one_row_has_the_step_of_its_geotransform() -> None:
