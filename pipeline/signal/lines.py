@@ -67,7 +67,13 @@ class Signal:
         elements = self.elements if whole else self.elements.part(samples)
         raw = _raw_of(read, numbers, slice(0, self.samples) if whole else samples)
         saturated = full_scale_dn * self.lines.sweep.binning
-        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=self.lines.position[numbers])
+        values, valid = calibrate(
+            raw,
+            elements,
+            saturated_dn=saturated,
+            position=self.lines.position[numbers],
+            exposure_ms=self.lines.exposure_ms[numbers],
+        )
         if whole:
             values, valid = values[:, samples], valid[:, samples]
         return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))

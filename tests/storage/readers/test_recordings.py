@@ -349,5 +349,5 @@ def test_nodata_values_are_invalid(tmp_path: Path, kind: str, void: int) -> None
 def test_missing_line_times_follow_the_period() -> None:
     """Times before the first and after the last follow it too: lines at one time would count as repeated."""
     source: Any = SimpleNamespace(shape=(6,))
-    times = _middle_s(source, np.array([np.nan, 1.0, np.nan, 3.0, np.nan, np.nan]), CAMERA, [])
+    times = _middle_s(source, np.array([np.nan, 1.0, np.nan, 3.0, np.nan, np.nan]), CAMERA)[0]
     assert times.tolist() == [0, 1, 2, 3, 4, 5]

@@ -1,0 +1,194 @@
+"""Read and compare the exposure, gain and binning of cubes and reference frames.
+
+A camera's number is ``bias + gain * exposure * (dark current + light)``. White above its own dark frame is proportional
+to gain times exposure, and is scaled by the stated ratio. A dark frame is not scaled: how much of it is bias, which
+does not depend on the exposure, is not known.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number
+from spectralzoom.pipeline.errors import SceneError
+
+SAME = 1e-3  # largest relative difference of equal exposures, which cameras round
+MOST_DARK_ERROR = 0.05  # of white that the dark current of another exposure may stand for
+TO_MS = {"ns": 1e-6, "us": 1e-3, "ms": 1.0, "s": 1e3}
+_WORDS = {"ns": "nanosec", "us": "µs μs usec microsec", "ms": "msec millisec", "s": "sec"}
+_UNITS = {word: unit for unit, words in _WORDS.items() for word in (unit, *words.split())}
+_UNITS |= {f"{word}ond{end}": _UNITS[word] for word in list(_UNITS) if word.endswith("sec") for end in ("", "s")}
+_UNITS |= {"db": "dB", "decibel": "dB", "x": "x", "factor": "x"}
+_OWN_UNIT = {"tint": "ms", "shutter": "ms"}  # of Specim and of Resonon, whose headers do not state it
+
+_UNIT = rf"(?:\s*(?:in )?[(\[]\s*(?P<unit>\w+)\s*[)\]]| (?:in )?(?P<word>{'|'.join(_UNITS)})|(?P<end>ms|us|db))?"
+_TIME = re.compile(
+    r"(?:(?:camera|sensor|frame|line) )?(?P<name>exposure|integration|shutter|tint|t int|(?:exp|int)(?= ?time))"
+    rf" ?(?:time|period|duration)? ?(?P<detector>\d?){_UNIT}"
+)
+_GAIN = re.compile(r"(?:(?:camera|sensor|detector|analog|analogue|digital|em) )?gain ?(?P<detector>\d?)" + _UNIT)
+_FRAME = re.compile(r"(?:.* )?binning(?: ?\w+)?|aoi (?:left|top)")
+_VALUE = re.compile(r"(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """Exposure, gain and binning of a cube or frame; empty where nothing states them."""
+
+    where: str = ""
+    exposures: Mapping[str, float] = field(default_factory=dict)  # [ms], by the number of the detector
+    times: Mapping[str, float] = field(default_factory=dict)  # exposures without a unit, by their key
+    gains: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # number and unit (dB, x or none), by key
+    frame: Mapping[str, str] = field(default_factory=dict)  # binning, first elements and gain in words, by key
+    notes: tuple[str, ...] = ()
+
+    @property
+    def exposure_ms(self) -> float | None:
+        """Return the exposure, of several detectors the longest; None if nothing states it with a unit."""
+        return max(self.exposures.values(), default=None)
+
+    @property
+    def text(self) -> str:
+        """Return the exposure and the gain for messages."""
+        times = [f"{ms:g} ms" for ms in dict.fromkeys(self.exposures.values())]
+        times = (
+            times
+            or [f"{key} = {time:g} (no unit)" for key, time in self.times.items()]
+            or ["an exposure that is not stated"]
+        )
+        return ", ".join([*times, *(f"{key} = {gain:g} {unit}".strip() for key, (gain, unit) in self.gains.items())])
+
+
+def taken_with(header: EnviHeader, where: str) -> Taken:
+    """Return what the fields and comments of a header state; messages call it ``where``.
+
+    Keys are those of several makes, with the unit in key or value. Numbers that are no exposure are left out with a
+    note. Raises SceneError: two keys state different exposures.
+    """
+    exposures: dict[str, tuple[str, float]] = {}
+    times: dict[str, float] = {}
+    gains: dict[str, tuple[float, str]] = {}
+    frame: dict[str, str] = {}
+    notes: list[str] = []
+    for key, value in _settings(header):
+        name = " ".join(key.replace("_", " ").split())
+        if _FRAME.fullmatch(name):
+            frame[key] = ", ".join(re.findall(r"[\d.]+", value))
+        elif (match := _GAIN.fullmatch(name)) is not None:
+            number, unit = _number(value, match)
+            if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
+                frame[key] = value.lower()
+            else:
+                gains[name[: match.end("detector")].strip()] = number, unit
+        elif (match := _TIME.fullmatch(name)) is not None:
+            number, unit = _number(value, match)
+            unit = unit or _OWN_UNIT.get(match["name"], "")
+            if number is None and not re.search(r"\d|nan|inf", value.lower()):
+                continue  # the state of a shutter
+            if number is None or number <= 0 or (unit and unit not in TO_MS):
+                notes.append(f"{where}: {key} = {value[:40]} is no exposure that can be read, and is left out")
+            elif not unit:
+                times[name] = number
+            else:
+                ms = number * TO_MS[unit]
+                other, known = exposures.setdefault(match["detector"], (key, ms))
+                if not all_alike([ms, known]):
+                    raise SceneError(
+                        f"{where} states {other} of {known:g} ms and {key} of {ms:g} ms; correct the header, or remove "
+                        "the wrong one"
+                    )
+    found = {detector: ms for detector, (_, ms) in exposures.items()}
+    return Taken(where, found, {} if found else times, gains, frame, tuple(notes))
+
+
+def _settings(header: EnviHeader) -> Iterable[tuple[str, str]]:
+    """Yield keys and values of fields, of comments, and of the lines of the description."""
+    yield from header.fields.items()
+    yield from header.settings.items()
+    for line in header.fields.get("description", "").splitlines():
+        key, sign, value = line.partition("=")
+        if sign:
+            yield key.strip().lower(), value.strip()
+
+
+def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
+    """Return the number of a value, None if there is none, and its unit as in the value, else in the key."""
+    match = _VALUE.fullmatch(value.strip().lower())
+    if match is None:
+        return None, ""
+    word = match["unit"] or key["unit"] or key["word"] or key["end"] or ""
+    return finite_number(match["number"].replace(",", ".")), _UNITS.get(word, word)
+
+
+def all_alike(values: Iterable[float]) -> bool:
+    """Return whether exposures or their ratios are equal but for the rounding of cameras."""
+    found = list(values)
+    return max(found) - min(found) <= SAME * max(found)
+
+
+def check_binning(frame: Taken, cube: Taken) -> None:
+    """Refuse a frame of another binning or detector area than the cube's (SceneError)."""
+    for key in sorted(frame.frame.keys() & cube.frame.keys()):
+        if frame.frame[key] != cube.frame[key]:
+            raise SceneError(
+                f"{frame.where} was taken with {key} = {frame.frame[key]}, {cube.where} with {cube.frame[key]}; give "
+                "a frame taken with the cube's own settings"
+            )
+
+
+def gain_ratio(frame: Taken, cube: Taken) -> float:
+    """Return the gain of a frame over that of the cube; 1 where either states none.
+
+    Raises SceneError: gains differ, and their unit is not stated.
+    """
+    ratio = 1.0
+    for key in frame.gains.keys() & cube.gains.keys():
+        (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
+        if unit == unit_of_cube and one == other:
+            continue
+        if not unit or unit != unit_of_cube:
+            raise SceneError(
+                f"{frame.where} was taken with {key} = {one:g} {unit or '(no unit)'}, {cube.where} with {other:g} "
+                f"{unit_of_cube or '(no unit)'}; state both as '{key} (dB)' or '{key} (x)', or give a frame of the "
+                "cube's gain"
+            )
+        ratio *= 10 ** ((one - other) / 20) if unit == "dB" else one / other
+    return ratio
+
+
+def exposure_at_gain(frame: Taken, cube: Taken, lines_ms: float, *, stated: bool) -> float | None:
+    """Return the exposure [ms] of a frame at the gain of the cube; None if it is not known.
+
+    ``lines_ms`` is an exposure of the cube's lines; ``stated`` is whether its header or a pointing table has it. Times
+    without a unit count if both headers have the same key. Raises SceneError: gains differ without a unit, or detectors
+    differ in the ratio of their exposures.
+    """
+    gain = gain_ratio(frame, cube)
+    if frame.exposure_ms is not None:
+        both = frame.exposures.keys() & cube.exposures.keys()
+        ratios = [frame.exposures[one] / cube.exposures[one] for one in sorted(both)]
+        if ratios and not all_alike(ratios):
+            times = [
+                f"{frame.exposures[one]:g} and {cube.exposures[one]:g} ms (detector {one})" for one in sorted(both)
+            ]
+            raise SceneError(
+                f"the exposures of {frame.where} and {cube.where} have another ratio for each detector: "
+                f"{', '.join(times)}; give a frame taken with the cube's own exposures"
+            )
+        if stated:
+            return frame.exposure_ms * gain
+    for key in sorted(frame.times.keys() & cube.times.keys()):
+        return frame.times[key] / cube.times[key] * lines_ms * gain
+    return None if gain == 1 else lines_ms * gain
+
+
+def dark_error(level: float, dark_ms: float, white_ms: float, lines_ms: Iterable[float]) -> float:
+    """Return the largest error of values, in parts of white, if all of the dark frame were dark current.
+
+    ``level`` is the dark frame over white above dark. Lines of another exposure than the dark frame have another dark
+    current in their numbers, and so has the white frame.
+    """
+    of_lines = (abs(ms / dark_ms - 1) * white_ms / ms for ms in lines_ms)
+    return abs(level) * max((*of_lines, abs(white_ms / dark_ms - 1)))
