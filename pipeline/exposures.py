@@ -11,6 +11,9 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number
 from spectralzoom.pipeline.errors import SceneError
 
@@ -53,12 +56,13 @@ class Taken:
     def text(self) -> str:
         """Return the exposure and the gain for messages."""
         times = [f"{ms:g} ms" for ms in dict.fromkeys(self.exposures.values())]
-        times = (
-            times
-            or [f"{key} = {time:g} (no unit)" for key, time in self.times.items()]
-            or ["an exposure that is not stated"]
-        )
-        return ", ".join([*times, *(f"{key} = {gain:g} {unit}".strip() for key, (gain, unit) in self.gains.items())])
+        times = times or [f"{key} = {time:g} (no unit)" for key, time in self.times.items()]
+        return " and ".join(times or ["an exposure that is not stated"]) + self.gains_text
+
+    @property
+    def gains_text(self) -> str:
+        """Return the gains as the end of `text`."""
+        return "".join(f", {key} = {gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items())
 
 
 def taken_with(header: EnviHeader, where: str) -> Taken:
@@ -128,6 +132,12 @@ def all_alike(values: Iterable[float]) -> bool:
     return max(found) - min(found) <= SAME * max(found)
 
 
+def span_text(exposure_ms: NDArray[np.float64]) -> str:
+    """Return the exposures of lines as a text."""
+    low, high = float(exposure_ms.min()), float(exposure_ms.max())
+    return f"{low:g} ms" if all_alike([low, high]) else f"{low:g} to {high:g} ms"
+
+
 def check_binning(frame: Taken, cube: Taken) -> None:
     """Refuse a frame of another binning or detector area than the cube's (SceneError)."""
     for key in sorted(frame.frame.keys() & cube.frame.keys()):
@@ -184,11 +194,59 @@ def exposure_at_gain(frame: Taken, cube: Taken, lines_ms: float, *, stated: bool
     return None if gain == 1 else lines_ms * gain
 
 
-def dark_error(level: float, dark_ms: float, white_ms: float, lines_ms: Iterable[float]) -> float:
-    """Return the largest error of values, in parts of white, if all of the dark frame were dark current.
+Frames = Mapping[str, tuple[NDArray[np.float32], Taken]]  # (sample, band) DN, by dark and white
 
-    ``level`` is the dark frame over white above dark. Lines of another exposure than the dark frame have another dark
-    current in their numbers, and so has the white frame.
+
+def match_exposures(
+    frames: Frames, cube: Taken, lines_ms: NDArray[np.float64], *, stated: bool
+) -> tuple[float | None, list[str]]:
+    """Return the exposure [ms] of the white frame at the gain of the cube, and notes; None if it is that of all lines.
+
+    ``lines_ms`` (line,) are exposures of the lines, and ``stated`` is whether a
+    file has them. An exposure that is not stated is assumed to be that of the lines. A dark frame of another exposure
+    is used as it is. Raises SceneError: a frame has another binning, another gain without a unit, or a dark frame may
+    change values by more than 5 %.
     """
-    of_lines = (abs(ms / dark_ms - 1) * white_ms / ms for ms in lines_ms)
-    return abs(level) * max((*of_lines, abs(white_ms / dark_ms - 1)))
+    usual = float(np.median(lines_ms))
+    lines = cube.text if not stated else span_text(lines_ms) + cube.gains_text
+    notes: list[str] = []
+    found: dict[str, float] = {}
+    for kind in sorted(frames.keys() & {"dark", "white"}):
+        frame = frames[kind][1]
+        check_binning(frame, cube)
+        notes += frame.notes
+        ms = exposure_at_gain(frame, cube, usual, stated=stated)
+        both = f"{frame.where} was taken with {frame.text}, the lines with {lines}"
+        if ms is None:
+            notes.append(f"{both}: the same exposure is assumed")
+            continue
+        found[kind] = ms
+        if kind == "white" and not all_alike([ms, *lines_ms]):
+            notes.append(f"{both}: values are scaled by the ratio")
+    white_ms = found.get("white")
+    if "dark" in found and not all_alike([found["dark"], white_ms or usual, *lines_ms]):
+        notes.append(_dark_note(frames, found["dark"], white_ms or usual, lines_ms, lines))
+    same = white_ms is None or all_alike([white_ms, *lines_ms])
+    return None if same else white_ms, notes
+
+
+def _dark_note(frames: Frames, dark_ms: float, white_ms: float, lines_ms: NDArray[np.float64], lines: str) -> str:
+    """Return a note on a dark frame of another exposure (SceneError: it may change values by more than 5 %).
+
+    All of it may be dark current at most. Lines of another exposure then have another dark level, and so has white.
+    """
+    (dark, taken), (white, of_white) = frames["dark"], frames.get("white", (None, Taken()))
+    what = f"{taken.where} was taken with {taken.text}, the lines with {lines}"
+    kept = "it is used as it is, since its bias does not depend on the exposure"
+    if white is None or white.shape != dark.shape:
+        return f"{what}: {kept}"
+    span = white - dark
+    lit = span[np.isfinite(span) & (span > 0)]
+    level = abs(float(np.nanmedian(dark))) / float(np.median(lit)) if lit.size else 0.0
+    off = np.abs(lines_ms / dark_ms - 1) * white_ms / lines_ms
+    most = level * max(float(off.max()), abs(white_ms / dark_ms - 1))
+    what = f"{what}, and {of_white.where} with {of_white.text}"
+    effect = f"values may be off by up to {most:.2g} of white, if all of it is dark current"
+    if most > MOST_DARK_ERROR:
+        raise SceneError(f"{what}: {effect}; give one of the exposure of the lines, or correct the header")
+    return f"{what}: {kept}; {effect}"

@@ -1,4 +1,4 @@
-"""Find and read dark and white frames, and compare their exposures with those of a cube's lines."""
+"""Find and read dark and white frames."""
 
 from __future__ import annotations
 
@@ -10,15 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.exposures import (
-    MOST_DARK_ERROR,
-    Taken,
-    all_alike,
-    check_binning,
-    dark_error,
-    exposure_at_gain,
-    taken_with,
-)
+from spectralzoom.pipeline.exposures import Frames, Taken, taken_with
 from spectralzoom.storage.readers.array_files import load_npy
 from spectralzoom.storage.readers.cube_sources import reading
 from spectralzoom.storage.readers.envi_files import open_envi_cube
@@ -84,58 +76,6 @@ def load_frame(path: Path, kind: str = "reference") -> Frame:
     return Frame(np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files, taken, fields)
 
 
-def match_exposures(
-    frames: Mapping[str, Frame], cube: Taken, lines_ms: NDArray[np.float64], *, stated: bool
-) -> tuple[float | None, list[str]]:
-    """Return the exposure [ms] of the white frame at the gain of the cube, and notes; None if it is that of all lines.
-
-    ``lines_ms`` (line,) are exposures of the lines; ``stated`` is whether a file has them. An exposure that is
-    not stated is assumed to be that of the lines. A dark frame of another exposure is used as it is. Raises SceneError:
-    a frame has another binning, another gain without a unit, or a dark frame may change values by more than 5 %.
-    """
-    usual = float(np.median(lines_ms))
-    low, high = float(lines_ms.min()), float(lines_ms.max())
-    lines = f"{low:g} ms" if all_alike(lines_ms) else f"{low:g} to {high:g} ms"
-    gains = "".join(f", {key} = {gain:g} {unit}".rstrip() for key, (gain, unit) in cube.gains.items())
-    lines = f"{lines}{gains}" if stated else cube.text
-    notes: list[str] = []
-    found: dict[str, float] = {}
-    for kind, frame in frames.items():
-        if kind not in ("dark", "white"):
-            continue
-        check_binning(frame.taken, cube)
-        notes += frame.taken.notes
-        ms = exposure_at_gain(frame.taken, cube, usual, stated=stated)
-        both = f"{frame.taken.where} was taken with {frame.taken.text}, the lines with {lines}"
-        if ms is None:
-            notes.append(f"{both}: the same exposure is assumed")
-        elif not all_alike([ms, *lines_ms]):
-            found[kind] = ms
-            notes += [f"{both}: values are scaled by the ratio"] if kind == "white" else []
-        else:
-            found[kind] = ms
-    white_ms = found.get("white")
-    if "dark" in found and not all_alike([found["dark"], *lines_ms, white_ms or usual]):
-        notes.append(_dark_note(frames, found["dark"], white_ms or usual, lines_ms, lines))
-    same = white_ms is None or all_alike([white_ms, *lines_ms])
-    return None if same else white_ms, notes
-
-
-def _dark_note(
-    frames: Mapping[str, Frame], dark_ms: float, white_ms: float, lines_ms: NDArray[np.float64], lines: str
-) -> str:
-    """Return a note on a dark frame of another exposure (SceneError: it may change values by more than 5 %)."""
-    dark, white = frames["dark"], frames.get("white")
-    what = f"{dark.taken.where} was taken with {dark.taken.text}, the lines with {lines}"
-    kept = "it is used as it is, since its bias does not depend on the exposure"
-    if white is None or white.values.shape != dark.values.shape:
-        return f"{what}: {kept}"
-    span = white.values - dark.values
-    lit = span[np.isfinite(span) & (span > 0)]
-    level = float(np.nanmedian(dark.values))
-    most = dark_error(level / float(np.median(lit)) if lit.size else 0.0, dark_ms, white_ms, np.unique(lines_ms))
-    what = f"{what}, and {white.taken.where} with {white.taken.text}"
-    effect = f"values may be off by up to {most:.2g} of white, if all of it is dark current"
-    if most > MOST_DARK_ERROR:
-        raise SceneError(f"{what}: {effect}; give one of the exposure of the lines, or correct the header")
-    return f"{what}: {kept}; {effect}"
+def taken_of(frames: Mapping[str, Frame]) -> Frames:
+    """Return values of frames and how they were taken."""
+    return {kind: (frame.values, frame.taken) for kind, frame in frames.items()}

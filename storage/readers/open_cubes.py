@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.exposures import all_alike
+from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
 from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
 from spectralzoom.storage.readers.array_files import (
     ARRAY_ENDINGS,
@@ -25,7 +25,7 @@ from spectralzoom.storage.readers.array_files import (
 )
 from spectralzoom.storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_source, open_headwall_cube
-from spectralzoom.storage.readers.frames import find_reference, load_frame, match_exposures
+from spectralzoom.storage.readers.frames import find_reference, load_frame, taken_of
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 from spectralzoom.storage.readers.zarr_files import find_zarr_store, zarr_arrays
@@ -101,12 +101,13 @@ def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     """Return a Headwall cube with the dark and white frames of its folder, if there are some."""
     found = {kind: find_reference(folder, kind) for kind in ("dark", "white")}
     frames = {kind: load_frame(file, kind) for kind, file in found.items() if file is not None}
-    lines_ms = np.ones(1) if source.lines.exposure_ms is None else source.lines.exposure_ms
-    white_ms, notes = match_exposures(frames, source.taken, lines_ms, stated=source.lines.exposure_ms is not None)
+    stated_ms = source.lines.exposure_ms
+    lines_ms = np.ones(1) if stated_ms is None else stated_ms
+    white_ms, notes = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
     if len(frames) < 2 and not all_alike(lines_ms):
         notes.append(
-            f"the lines were taken with {lines_ms.min():g} to {lines_ms.max():g} ms, and without a dark and a white "
-            "frame their numbers are not scaled"
+            f"the lines were taken with {span_text(lines_ms)}, and without a dark and a white frame their numbers are "
+            "not scaled"
         )
     named = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]
     return replace(

@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.envi_headers import listed_numbers
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
-from spectralzoom.pipeline.exposures import all_alike
+from spectralzoom.pipeline.exposures import all_alike, match_exposures
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Axis, Floats
 from spectralzoom.pipeline.signal.calibrate import find_bad_elements, full_scale_notes
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, load_envi_header
-from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, match_exposures
+from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, taken_of
 from spectralzoom.storage.readers.open_cubes import open_cube, reader_of, with_wavelengths
 from spectralzoom.storage.readers.pointing_tables import LinePointing
 from spectralzoom.storage.readers.scene_files import bands_text
@@ -153,7 +153,7 @@ def references_of(
     frame = source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
     notes = [f"{kind} frame from {one.files[0].name}" for kind, one in frames.items()]
-    white_ms, more = match_exposures(frames, source.taken, exposure_ms, stated=cube.exposure_ms is not None)
+    white_ms, more = match_exposures(taken_of(frames), source.taken, exposure_ms, stated=cube.exposure_ms is not None)
     notes += more
     for kind, one in frames.items():
         if one.values.shape != frame:

@@ -29,7 +29,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
 from spectralzoom.pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
-from spectralzoom.pipeline.exposures import all_alike
+from spectralzoom.pipeline.exposures import all_alike, span_text
 from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, scan_positions
@@ -234,16 +234,9 @@ def _point(cube: FileCube, given: RecordedWith, alone: bool) -> FileCube:
     notes = [f"{cube.name}: pointing from {file.name}"]
     stated, pointed = cube.exposure_ms, pointing.exposure_ms
     if stated is not None and pointed is not None and not all(map(all_alike, zip(stated, pointed, strict=True))):
-        notes.append(
-            f"{cube.name}: the exposures of {file.name}, {_span(pointed)}, count; the files state {_span(stated)}"
-        )
+        both = f"{span_text(pointed)}, count; the files state {span_text(stated)}"
+        notes.append(f"{cube.name}: the exposures of {file.name}, {both}")
     return replace(cube, pointing=pointing, notes=tuple(notes))
-
-
-def _span(exposure_ms: Floats) -> str:
-    """Return exposures as a text."""
-    low, high = exposure_ms.min(), exposure_ms.max()
-    return f"{low:g} ms" if low == high else f"{low:g} to {high:g} ms"
 
 
 def _without_mirror(cube: FileCube, camera: LineCamera) -> tuple[LineCamera, FileCube, list[str]]:
