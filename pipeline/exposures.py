@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,45 +77,42 @@ def taken_with(header: EnviHeader, where: str) -> Taken:
     gains: dict[str, tuple[float, str]] = {}
     frame: dict[str, str] = {}
     notes: list[str] = []
-    for key, value in _settings(header):
-        name = " ".join(key.replace("_", " ").split())
+    about = re.findall(r"^\s*([^=:\n]+)[=:](.*)$", header.fields.get("description", ""), re.MULTILINE)
+    for key, value in (*header.fields.items(), *header.settings.items(), *about):
+        name = " ".join(key.lower().replace("_", " ").split())
         if _FRAME.fullmatch(name):
-            frame[key] = ", ".join(re.findall(r"[\d.]+", value))
+            _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)), where)
         elif (match := _GAIN.fullmatch(name)) is not None:
             number, unit = _number(value, match)
             if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
-                frame[key] = value.lower()
+                _put(frame, name, value.strip().lower(), where)
             else:
-                gains[name[: match.end("detector")].strip()] = number, unit
+                _put(gains, name[: match.end("detector")].strip(), (number, unit), where)
         elif (match := _TIME.fullmatch(name)) is not None:
             number, unit = _number(value, match)
             unit = unit or _OWN_UNIT.get(match["name"], "")
             if number is None and not re.search(r"\d|nan|inf", value.lower()):
                 continue  # the state of a shutter
             if number is None or number <= 0 or (unit and unit not in TO_MS):
-                notes.append(f"{where}: {key} = {value[:40]} is no exposure that can be read, and is left out")
+                notes.append(f"{where}: {name} = {value.strip()[:40]} is no exposure that can be read, and is left out")
             elif not unit:
-                times[name] = number
+                _put(times, name, number, where)
             else:
                 ms = number * TO_MS[unit]
-                other, known = exposures.setdefault(match["detector"], (key, ms))
+                other, known = exposures.setdefault(match["detector"], (name, ms))
                 if not all_alike([ms, known]):
                     raise SceneError(
-                        f"{where} states {other} of {known:g} ms and {key} of {ms:g} ms; correct the header, or remove "
-                        "the wrong one"
+                        f"{where} states {other} of {known:g} ms and {name} of {ms:g} ms; correct the "
+                        "header, or remove the wrong one"
                     )
     found = {detector: ms for detector, (_, ms) in exposures.items()}
     return Taken(where, found, {} if found else times, gains, frame, tuple(notes))
 
 
-def _settings(header: EnviHeader) -> Iterable[tuple[str, str]]:
-    """Yield keys and values of fields, of comments, and of the lines of the description."""
-    yield from header.fields.items()
-    yield from header.settings.items()
-    for line in header.fields.get("description", "").splitlines():
-        key, sign, value = line.partition("=")
-        if sign:
-            yield key.strip().lower(), value.strip()
+def _put(table: dict[str, Any], name: str, value: Any, where: str) -> None:
+    """Add an entry to a table (SceneError: it has another one)."""
+    if table.setdefault(name, value) != value:
+        raise SceneError(f"{where} states {name} of {table[name]} and of {value}; correct the header")
 
 
 def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
@@ -122,8 +120,9 @@ def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
     match = _VALUE.fullmatch(value.strip().lower())
     if match is None:
         return None, ""
-    word = match["unit"] or key["unit"] or key["word"] or key["end"] or ""
-    return finite_number(match["number"].replace(",", ".")), _UNITS.get(word, word)
+    of_key = key["unit"] or key["word"] or key["end"]
+    units = {_UNITS.get(word, word) for word in (match["unit"], of_key) if word}
+    return finite_number(match["number"].replace(",", ".")), " and ".join(sorted(units))
 
 
 def all_alike(values: Iterable[float]) -> bool:
@@ -198,16 +197,16 @@ Frames = Mapping[str, tuple[NDArray[np.float32], Taken]]  # (sample, band) DN, b
 
 
 def match_exposures(
-    frames: Frames, cube: Taken, lines_ms: NDArray[np.float64], *, stated: bool
+    frames: Frames, cube: Taken, lines_ms: NDArray[np.float64], *, stated: bool, usual_ms: float | None = None
 ) -> tuple[float | None, list[str]]:
     """Return the exposure [ms] of the white frame at the gain of the cube, and notes; None if it is that of all lines.
 
-    ``lines_ms`` (line,) are exposures of the lines, and ``stated`` is whether a
-    file has them. An exposure that is not stated is assumed to be that of the lines. A dark frame of another exposure
-    is used as it is. Raises SceneError: a frame has another binning, another gain without a unit, or a dark frame may
-    change values by more than 5 %.
+    ``lines_ms`` (line,) are exposures of the lines, and ``stated`` is whether a file has them. A white frame that
+    states no exposure is assumed to have ``usual_ms``, by default the median of the lines. A dark frame of another
+    exposure is used as it is. Raises SceneError: a frame has another binning, another gain without a unit, or a dark
+    frame may change values by more than 5 %.
     """
-    usual = float(np.median(lines_ms))
+    usual = float(np.median(lines_ms)) if usual_ms is None else usual_ms
     lines = cube.text if not stated else span_text(lines_ms) + cube.gains_text
     notes: list[str] = []
     found: dict[str, float] = {}
@@ -218,7 +217,9 @@ def match_exposures(
         ms = exposure_at_gain(frame, cube, usual, stated=stated)
         both = f"{frame.where} was taken with {frame.text}, the lines with {lines}"
         if ms is None:
-            notes.append(f"{both}: the same exposure is assumed")
+            same = kind == "dark" or not stated or all_alike([usual, *lines_ms])
+            notes.append(f"{both}: {'the same exposure' if same else f'{usual:g} ms'} is assumed")
+            found |= {} if same else {kind: usual}
             continue
         found[kind] = ms
         if kind == "white" and not all_alike([ms, *lines_ms]):
@@ -226,8 +227,7 @@ def match_exposures(
     white_ms = found.get("white")
     if "dark" in found and not all_alike([found["dark"], white_ms or usual, *lines_ms]):
         notes.append(_dark_note(frames, found["dark"], white_ms or usual, lines_ms, lines))
-    same = white_ms is None or all_alike([white_ms, *lines_ms])
-    return None if same else white_ms, notes
+    return None if white_ms is None or all_alike([white_ms, *lines_ms]) else white_ms, notes
 
 
 def _dark_note(frames: Frames, dark_ms: float, white_ms: float, lines_ms: NDArray[np.float64], lines: str) -> str:

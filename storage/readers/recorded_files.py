@@ -47,6 +47,10 @@ class FileCube:
         count = self.source.shape[2]
         return np.isin(np.arange(count), self.source.bad_bands if len(self.source.bad_bands) < count else ())
 
+    def owns(self, frame: Frame) -> bool:
+        """Return whether a frame is named like the cube, and so is of no other cube."""
+        return frame.files[0].name.startswith(f"{self.name}.")
+
     @property
     def exposure_ms(self) -> Floats | None:
         """Return (line,) exposures by the pointing table, else by the files; None if nothing states them."""
@@ -153,7 +157,13 @@ def references_of(
     frame = source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
     notes = [f"{kind} frame from {one.files[0].name}" for kind, one in frames.items()]
-    white_ms, more = match_exposures(taken_of(frames), source.taken, exposure_ms, stated=cube.exposure_ms is not None)
+    white_ms, more = match_exposures(
+        taken_of(frames),
+        source.taken,
+        exposure_ms,
+        stated=cube.exposure_ms is not None,
+        usual_ms=None if "white" in frames and cube.owns(frames["white"]) else camera.exposure_ms,
+    )
     notes += more
     for kind, one in frames.items():
         if one.values.shape != frame:

@@ -108,6 +108,10 @@ def test_each_cube_and_each_line_has_its_own_ratio(tmp_path: Path) -> None:
     assert_true(recording, [TRUTH] * 3)
     assert recording.sweeps[0].references.same_as(recording.sweeps[1].references)  # they serve one request together
     assert "c: the exposures of c.pointing.csv, 5 to 20 ms, count; the files state 7 ms" in recording.notes
+    for header in tmp_path.glob("[wd]*.hdr"):
+        header.write_text(header.read_text().replace("exposure (ms) = 8\n", ""))
+    recording = open_recording(tmp_path)  # white is assumed to have one exposure, so that sweeps fit each other
+    assert_true(recording, [TRUTH * 10 / 8] * 3)
     for path in tmp_path.glob("white.*"):
         path.unlink()
     recording = open_recording(tmp_path)  # relative values are relative to one exposure
@@ -154,6 +158,8 @@ def test_numbers_without_frames_are_not_scaled(tmp_path: Path) -> None:
         ({MS: "nan"}, "exposure (ms) = nan is no exposure that can be read"),
         ({MS: 0}, "exposure (ms) = 0 is no exposure that can be read"),
         ({"exposure (frames)": 3}, "exposure (frames) = 3 is no exposure that can be read"),
+        ({"exposure (ms)": "5 us"}, "exposure (ms) = 5 us is no exposure that can be read"),
+        ({"tint": "{5, 8}"}, "tint = 5, 8 is no exposure that can be read"),
         ({"integration time": 5}, "with integration time = 5 (no unit), the lines with 10 ms: the same exposure is"),
         ({"shutter": "open"}, "an exposure that is not stated"),
     ],
@@ -186,6 +192,11 @@ REFUSED: dict[str, tuple[Header, Header, str]] = {
     "gain in words": ({"gain": "low"}, {"gain": "high"}, "was taken with gain = high, scan.hdr with low; give a frame"),
     "binning": ({"binning": "{2, 2}"}, {"binning": "{1, 1}"}, "with binning = 1, 1, scan.hdr with 2, 2; give a frame"),
     "spectral binning": ({";Spectral binning": 2}, {";Spectral binning": 1}, "with spectral binning = 1, scan.hdr"),
+    "gain twice": (
+        {"gain": "1 x", ";gain": "2 x"},
+        {},
+        "scan.hdr states gain of (1.0, 'x') and of (2.0, 'x'); correct",
+    ),
     "area": ({";AOI left": 0}, {";AOI left": 480}, "with aoi left = 480, scan.hdr with 0; give a frame taken"),
     "detectors": ({"tint1": 10, "tint2": 4}, {"tint1": 5, "tint2": 4}, "5 and 10 ms (detector 1), 4 and 4 ms"),
 }
