@@ -137,60 +137,48 @@ def span_text(exposure_ms: NDArray[np.float64]) -> str:
     return f"{low:g} ms" if all_alike([low, high]) else f"{low:g} to {high:g} ms"
 
 
-def check_binning(frame: Taken, cube: Taken) -> None:
-    """Refuse a frame of another binning or detector area than the cube's (SceneError)."""
-    for key in sorted(frame.frame.keys() & cube.frame.keys()):
-        if frame.frame[key] != cube.frame[key]:
-            raise SceneError(
-                f"{frame.where} was taken with {key} = {frame.frame[key]}, {cube.where} with {cube.frame[key]}; give "
-                "a frame taken with the cube's own settings"
-            )
-
-
-def gain_ratio(frame: Taken, cube: Taken) -> float:
-    """Return the gain of a frame over that of the cube; 1 where either states none.
-
-    Raises SceneError: gains differ, and their unit is not stated.
-    """
-    ratio = 1.0
-    for key in frame.gains.keys() & cube.gains.keys():
-        (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
-        if unit == unit_of_cube and one == other:
-            continue
-        if not unit or unit != unit_of_cube:
-            raise SceneError(
-                f"{frame.where} was taken with {key} = {one:g} {unit or '(no unit)'}, {cube.where} with {other:g} "
-                f"{unit_of_cube or '(no unit)'}; state both as '{key} (dB)' or '{key} (x)', or give a frame of the "
-                "cube's gain"
-            )
-        ratio *= 10 ** ((one - other) / 20) if unit == "dB" else one / other
-    return ratio
-
-
-def exposure_at_gain(frame: Taken, cube: Taken, lines_ms: float, *, stated: bool) -> float | None:
+def _exposure_at_gain(frame: Taken, cube: Taken, usual_ms: float, *, stated: bool) -> float | None:
     """Return the exposure [ms] of a frame at the gain of the cube; None if it is not known.
 
-    ``lines_ms`` is an exposure of the cube's lines; ``stated`` is whether its header or a pointing table has it. Times
-    without a unit count if both headers have the same key. Raises SceneError: gains differ without a unit, or detectors
-    differ in the ratio of their exposures.
+    Times without a unit count if both headers have the same key: the cube's is ``usual_ms``. Raises SceneError: they
+    were taken with another binning or area, gains differ without a unit, or detectors have different ratios.
     """
-    gain = gain_ratio(frame, cube)
-    if frame.exposure_ms is not None:
-        both = frame.exposures.keys() & cube.exposures.keys()
-        ratios = [frame.exposures[one] / cube.exposures[one] for one in sorted(both)]
-        if ratios and not all_alike(ratios):
-            times = [
-                f"{frame.exposures[one]:g} and {cube.exposures[one]:g} ms (detector {one})" for one in sorted(both)
-            ]
-            raise SceneError(
-                f"the exposures of {frame.where} and {cube.where} have another ratio for each detector: "
-                f"{', '.join(times)}; give a frame taken with the cube's own exposures"
-            )
-        if stated:
-            return frame.exposure_ms * gain
+    for key in sorted(frame.frame.keys() & cube.frame.keys()):
+        _check_same(frame, cube, key, frame.frame[key], cube.frame[key])
+    gain = 1.0
+    for key in sorted(frame.gains.keys() & cube.gains.keys()):
+        (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
+        if not unit or unit != unit_of_cube:
+            texts = (f"{number:g} {word or '(no unit)'}" for number, word in (frame.gains[key], cube.gains[key]))
+            _check_same(frame, cube, key, *texts)
+        else:
+            gain *= 10 ** ((one - other) / 20) if unit == "dB" else one / other
+    both = sorted(frame.exposures.keys() & cube.exposures.keys())
+    if both and not all_alike(frame.exposures[one] / cube.exposures[one] for one in both):
+        times = (" and ".join(f"{taken.exposures[one]:g}" for one in both) + " ms" for taken in (frame, cube))
+        _check_same(frame, cube, "exposures", *times)
+    if frame.exposure_ms is not None and stated:
+        return frame.exposure_ms * gain
     for key in sorted(frame.times.keys() & cube.times.keys()):
-        return frame.times[key] / cube.times[key] * lines_ms * gain
-    return None if gain == 1 else lines_ms * gain
+        return frame.times[key] / cube.times[key] * usual_ms * gain
+    return None if gain == 1 else usual_ms * gain
+
+
+def _check_same(frame: Taken, cube: Taken, key: str, one: str, other: str) -> None:
+    """Refuse a frame with another setting than the cube's (SceneError)."""
+    if one != other:
+        unit = ", or state the unit of both (dB or x)" if "(no unit)" in one + other else ""
+        both = f"{frame.where} was taken with {key} = {one}, {cube.where} with {other}"
+        raise SceneError(f"{both}; give a frame taken with the cube's own settings{unit}")
+
+
+def check_parts(one: Taken, first: Taken) -> None:
+    """Refuse a part of a cube with another gain or binning than the first (SceneError)."""
+    mine, other = ({**taken.gains, **taken.frame, **taken.times} for taken in (one, first))
+    for key in mine | other:
+        if mine.get(key) != other.get(key):
+            both = f"{one.where} was taken with {key} = {mine.get(key)}, {first.where} with {other.get(key)}"
+            raise SceneError(f"{both}; name these parts one by one")
 
 
 Frames = Mapping[str, tuple[NDArray[np.float32], Taken]]  # (sample, band) DN, by dark and white
@@ -207,23 +195,23 @@ def match_exposures(
     frame may change values by more than 5 %.
     """
     usual = float(np.median(lines_ms)) if usual_ms is None else usual_ms
-    lines = cube.text if not stated else span_text(lines_ms) + cube.gains_text
+    lines = span_text(lines_ms) + cube.gains_text if stated else cube.text
     notes: list[str] = []
     found: dict[str, float] = {}
     for kind in sorted(frames.keys() & {"dark", "white"}):
         frame = frames[kind][1]
-        check_binning(frame, cube)
         notes += frame.notes
-        ms = exposure_at_gain(frame, cube, usual, stated=stated)
+        ms = _exposure_at_gain(frame, cube, usual, stated=stated)
         both = f"{frame.where} was taken with {frame.text}, the lines with {lines}"
-        if ms is None:
-            same = kind == "dark" or not stated or all_alike([usual, *lines_ms])
-            notes.append(f"{both}: {'the same exposure' if same else f'{usual:g} ms'} is assumed")
-            found |= {} if same else {kind: usual}
-            continue
-        found[kind] = ms
-        if kind == "white" and not all_alike([ms, *lines_ms]):
-            notes.append(f"{both}: values are scaled by the ratio")
+        if ms is not None:
+            found[kind] = ms
+            scaled = kind == "white" and not all_alike([ms, *lines_ms])
+            notes += [f"{both}: values are scaled by the ratio"] if scaled else []
+        elif kind == "white" and stated and not all_alike([usual, *lines_ms]):
+            found[kind] = usual
+            notes.append(f"{both}: {usual:g} ms is assumed")
+        else:
+            notes.append(f"{both}: the same exposure is assumed")
     white_ms = found.get("white")
     if "dark" in found and not all_alike([found["dark"], white_ms or usual, *lines_ms]):
         notes.append(_dark_note(frames, found["dark"], white_ms or usual, lines_ms, lines))
@@ -240,11 +228,9 @@ def _dark_note(frames: Frames, dark_ms: float, white_ms: float, lines_ms: NDArra
     kept = "it is used as it is, since its bias does not depend on the exposure"
     if white is None or white.shape != dark.shape:
         return f"{what}: {kept}"
-    span = white - dark
-    lit = span[np.isfinite(span) & (span > 0)]
+    lit = (white - dark)[white > dark]
     level = abs(float(np.nanmedian(dark))) / float(np.median(lit)) if lit.size else 0.0
-    off = np.abs(lines_ms / dark_ms - 1) * white_ms / lines_ms
-    most = level * max(float(off.max()), abs(white_ms / dark_ms - 1))
+    most = level * float(max(*np.abs(lines_ms / dark_ms - 1) * white_ms / lines_ms, abs(white_ms / dark_ms - 1)))
     what = f"{what}, and {of_white.where} with {of_white.text}"
     effect = f"values may be off by up to {most:.2g} of white, if all of it is dark current"
     if most > MOST_DARK_ERROR:

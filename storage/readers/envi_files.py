@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.exposures import Taken, check_binning, gain_ratio, taken_with
+from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
 from spectralzoom.pipeline.rig.camera.frame_indices import (
     FRAME_INDEX,
     LONGEST_LINE,
@@ -264,11 +264,7 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
     exposure_ms = np.full(height, np.nan)
     for (start, one), part in zip(every.items(), parts.values(), strict=True):
         notes.extend(one.notes)
-        check_binning(one, first)
-        if gain_ratio(one, first) != 1 or one.times != first.times:
-            raise SceneError(
-                f"{one.where} was taken with {one.text}, {first.where} with {first.text}; name these parts one by one"
-            )
+        check_parts(one, first)
         if one.exposure_ms is not None:
             exposure_ms[start : start + len(part.values)] = one.exposure_ms
     known = np.isfinite(exposure_ms)
