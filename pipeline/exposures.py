@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number
+from spectralzoom.pipeline.envi_headers import finite_number
 from spectralzoom.pipeline.errors import SceneError
 
 SAME = 1e-3  # largest relative difference of equal exposures, which cameras round
@@ -66,19 +66,20 @@ class Taken:
         return "".join(f", {key} = {gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items())
 
 
-def taken_with(header: EnviHeader, where: str) -> Taken:
-    """Return what the fields and comments of a header state; messages call it ``where``.
+def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
+    """Return what headers (fields, comments, attributes) of one file state; messages call it ``where``.
 
-    Keys are those of several makes, with the unit in key or value. Numbers that are no exposure are left out with a
-    note. Raises SceneError: two keys state different exposures.
+    Keys are those of several makes, with the unit in key or value; lines of ``description`` may be keys. Numbers that
+    are no exposure are left out with a note. Raises SceneError: two keys contradict each other.
     """
     exposures: dict[str, tuple[str, float]] = {}
     times: dict[str, float] = {}
     gains: dict[str, tuple[float, str]] = {}
     frame: dict[str, str] = {}
     notes: list[str] = []
-    about = re.findall(r"^\s*([^=:\n]+)[=:](.*)$", header.fields.get("description", ""), re.MULTILINE)
-    for key, value in (*header.fields.items(), *header.settings.items(), *about):
+    every = [(key, str(value)) for header in headers for key, value in header.items()]
+    about = "\n".join(value for key, value in every if key == "description")
+    for key, value in (*every, *re.findall(r"^\s*([^=:\n]+)[=:](.*)$", about, re.MULTILINE)):
         name = " ".join(key.lower().replace("_", " ").split())
         if _FRAME.fullmatch(name):
             _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)), where)

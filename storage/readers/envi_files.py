@@ -259,21 +259,22 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
 
     Raises SceneError: parts were taken with another gain or binning.
     """
-    every = {start: taken_with(part.header, part.header_path.name) for start, part in parts.items()}
+    every = {
+        start: taken_with(part.header_path.name, part.header.fields, part.header.settings)
+        for start, part in parts.items()
+    }
     first = next(iter(every.values()))
     exposure_ms = np.full(height, np.nan)
-    for (start, one), part in zip(every.items(), parts.values(), strict=True):
+    for start, one in every.items():
         notes.extend(one.notes)
         check_parts(one, first)
-        if one.exposure_ms is not None:
-            exposure_ms[start : start + len(part.values)] = one.exposure_ms
-    known = np.isfinite(exposure_ms)
-    if not known.any():
+        exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
+    if np.isnan(exposure_ms).all():
         return first, None
-    usual = float(np.median(exposure_ms[known]))
+    usual = float(np.nanmedian(exposure_ms))
     unknown = [one.where for one in every.values() if one.exposure_ms is None]
     notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]
-    return first, np.where(known, exposure_ms, usual)
+    return first, np.nan_to_num(exposure_ms, nan=usual)
 
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:

@@ -68,7 +68,7 @@ def load_frame(path: Path, kind: str = "reference") -> Frame:
     else:
         cube = open_envi_cube(path)
         values, fields = cube.values, dict(cube.header.fields)
-        files, taken = (cube.header_path, cube.path), taken_with(cube.header, where)
+        files, taken = (cube.header_path, cube.path), taken_with(where, fields, cube.header.settings)
     values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")

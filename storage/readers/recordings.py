@@ -116,11 +116,6 @@ class RecordedWith:
     white_reference: ArrayLike = 1.0  # value of the white reference, one or (band,)
     mounting: Mounting = STRAIGHT  # of the device whose positions the pointing has
 
-    @property
-    def frames(self) -> dict[str, Path | None]:
-        """Return the files of reference frames by their kind."""
-        return {"dark": self.dark, "white": self.white}
-
 
 def open_recording(
     address: str | Path, camera: LineCamera | None = None, given: RecordedWith | None = None
@@ -181,7 +176,8 @@ def _stamps(files: Iterable[Path]) -> list[str]:
 def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recording:
     """Open cubes of files with their pointing and reference frames."""
     paths = find_cubes(path)
-    cubes = [_point(open_file_cube(one, given.wavelengths, given.frames), given, len(paths) == 1) for one in paths]
+    frames = {"dark": given.dark, "white": given.white}
+    cubes = [_point(open_file_cube(one, given.wavelengths, frames), given, len(paths) == 1) for one in paths]
     bands = cubes[0].source.bands
     assert bands.wavelength_nm is not None
     for one, cube in zip(paths, cubes, strict=True):

@@ -123,7 +123,7 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
     if len(data) > stated:
         raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {stated}; is it another file's?")
     try:
-        return replace(cube_lines(found, data), taken=taken_with(found, by_name[name]))
+        return replace(cube_lines(found, data), taken=taken_with(by_name[name], found.fields, found.settings))
     except SceneError as error:
         raise RigError(str(error)) from error
 

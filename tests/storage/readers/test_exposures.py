@@ -248,7 +248,8 @@ def test_real_headers_are_read(real_data: Path) -> None:
     """Headers of two makes state exposures, gains, binning and areas."""
 
     def taken(name: str) -> Taken:
-        return taken_with(load_envi_header(real_data / "envi_headers" / name), name)
+        header = load_envi_header(real_data / "envi_headers" / name)
+        return taken_with(name, header.fields, header.settings)
 
     fenix = taken("specim_fenix_cal__Radiometric_8x2_1x1.hdr")
     assert (fenix.exposures, fenix.frame) == ({"1": 28.0, "2": 7.9992}, {"binning": "8, 2", "binning2": "1, 1"})
