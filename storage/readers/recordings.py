@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,37 +105,43 @@ class Recording:
         return RecordedSource(self.sweeps, self.camera, self.wavelength_nm, field_shape, notes=self.notes)
 
 
-@dataclass(frozen=True)
-class RecordedWith:
-    """Flags on the files of a recording; None is looked for beside them, or assumed with a note."""
-
-    pointing: Path | None = None  # a table, or a folder with one for each cube
-    dark: Path | None = None
-    white: Path | None = None
-    wavelengths: Sequence[float] | None = None  # of all bands [nm]
-    white_reference: ArrayLike = 1.0  # value of the white reference, one or (band,)
-    mounting: Mounting = STRAIGHT  # of the device whose positions the pointing has
-
-
 def open_recording(
-    address: str | Path, camera: LineCamera | None = None, given: RecordedWith | None = None
+    address: str | Path,
+    camera: LineCamera | None = None,
+    *,
+    pointing: Path | None = None,
+    dark: Path | None = None,
+    white: Path | None = None,
+    wavelengths: Sequence[float] | None = None,
+    white_reference: ArrayLike = 1.0,
+    mounting: Mounting = STRAIGHT,
 ) -> Recording:
     """Open a recording, by default with the default camera.
 
-    Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
+    For files, ``pointing`` is a table or a folder with one for each cube; it and the frames ``dark`` and ``white`` are
+    looked for beside the cubes, or assumed with a note. ``wavelengths`` [nm] are of all bands, ``white_reference`` is
+    the value of the white reference, one or (band,), and ``mounting`` is of the device whose positions the pointing
+    has. Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
     wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
     be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera = camera or LineCamera()
-    given = given or RecordedWith()
     stores = find_raw_cubes(address)
+    flags = {"pointing": pointing, "dark": dark, "white": white, "wavelengths": wavelengths}
     if stores is None:
-        return _open_files(Path(address), camera, given)
-    for name in ("pointing", "dark", "white", "wavelengths"):
-        if getattr(given, name) is not None:
-            raise SettingsError(
-                f"--{name} is for files, and {address} holds raw cubes, which have their own; leave --{name} out"
-            )
+        paths = find_cubes(Path(address))
+        opened = [open_file_cube(one, wavelengths, {"dark": dark, "white": white}) for one in paths]
+        cubes = [_point(one, pointing, mounting, len(paths) == 1) for one in opened]
+        return _recording_of(str(address), dict(zip(paths, cubes, strict=True)), camera, white_reference)
+    if (flag := next((name for name, value in flags.items() if value is not None), None)) is not None:
+        raise SettingsError(
+            f"--{flag} is for files, and {address} holds raw cubes, which have their own; leave --{flag} out"
+        )
+    return _stored_recording(str(address), stores, camera)
+
+
+def _stored_recording(address: str, stores: Sequence[Path], camera: LineCamera) -> Recording:
+    """Open raw cubes, or condensed sweeps, of an archive."""
     for folder in {path.parent for path in stores if (path.parent / MANIFEST).is_file()}:
         check_store(folder)
     cubes = [open_lines(path) for path in stores]
@@ -159,7 +165,7 @@ def open_recording(
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
     notes = (RESTORED,) if any(isinstance(cube, RestoredCube) for cube in cubes) else ()
-    return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, notes, light)
+    return Recording(address, sweeps, first.wavelength_nm, first.fwhm_nm, camera, notes, light)
 
 
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
@@ -173,14 +179,14 @@ def _stamps(files: Iterable[Path]) -> list[str]:
     return [f"{file.name}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
 
 
-def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recording:
-    """Open cubes of files with their pointing and reference frames."""
-    paths = find_cubes(path)
-    frames = {"dark": given.dark, "white": given.white}
-    cubes = [_point(open_file_cube(one, given.wavelengths, frames), given, len(paths) == 1) for one in paths]
+def _recording_of(
+    address: str, files: Mapping[Path, FileCube], camera: LineCamera, white_reference: ArrayLike
+) -> Recording:
+    """Return cubes of files as a recording."""
+    paths, cubes = list(files), list(files.values())
     bands = cubes[0].source.bands
     assert bands.wavelength_nm is not None
-    for one, cube in zip(paths, cubes, strict=True):
+    for one, cube in files.items():
         if not np.array_equal(np.asarray(cube.source.bands.wavelength_nm), bands.wavelength_nm):
             raise SceneError(f"{one} has other wavelengths than {paths[0]}; survey them one by one")
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin, *cube.notes) if note]
@@ -204,17 +210,16 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     notes += more
     sweeps: list[RecordedSweep] = []
     for cube in cubes:
-        found, more = _sweeps_of(cube, camera, given)
+        found, more = _sweeps_of(cube, camera, white_reference)
         sweeps += found
         notes += more
     light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
     unique = tuple(dict.fromkeys(notes))
-    return Recording(str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light)
+    return Recording(address, tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light)
 
 
-def _point(cube: FileCube, given: RecordedWith, alone: bool) -> FileCube:
+def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -> FileCube:
     """Return a cube with its pointing by the file given, else by one with the cube's name, if there is one."""
-    file = given.pointing
     if file is not None and file.is_dir():
         folder = file
         names = [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
@@ -226,7 +231,7 @@ def _point(cube: FileCube, given: RecordedWith, alone: bool) -> FileCube:
         return cube
     if not file.is_file():
         raise SceneError(f"there is no pointing table {file}; check the name (seen from {Path.cwd()})")
-    pointing = load_pointing(file, cube.name, cube.source.shape[0], given.mounting, alone=alone)
+    pointing = load_pointing(file, cube.name, cube.source.shape[0], mounting, alone=alone)
     notes = [f"{cube.name}: pointing from {file.name}"]
     stated, pointed = cube.exposure_ms, pointing.exposure_ms
     if stated is not None and pointed is not None and not all(map(all_alike, zip(stated, pointed, strict=True))):
@@ -277,7 +282,7 @@ def _timed(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera, l
     return camera, [f"lines follow each other every {period:.6g} ms, by their times"]
 
 
-def _sweeps_of(cube: FileCube, camera: LineCamera, given: RecordedWith) -> tuple[list[RecordedSweep], list[str]]:
+def _sweeps_of(cube: FileCube, camera: LineCamera, white_reference: ArrayLike) -> tuple[list[RecordedSweep], list[str]]:
     """Return the sweep of one cube, or the sweeps that its pointing table cuts it into, and notes."""
     source, pointing = cube.source, cube.pointing
     assert pointing is not None
@@ -287,7 +292,7 @@ def _sweeps_of(cube: FileCube, camera: LineCamera, given: RecordedWith) -> tuple
     if exposure_ms is None:
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
         exposure_ms = np.full(source.shape[0], camera.exposure_ms)
-    references, more = references_of(cube, camera, exposure_ms, given.white_reference)
+    references, more = references_of(cube, camera, exposure_ms, white_reference)
     notes += more
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
     sweeps: list[RecordedSweep] = []
@@ -369,16 +374,8 @@ def _is_raw_cube(path: Path) -> bool:
         return False
 
 
-class RecordedRun(NamedTuple):
-    """Run whose lines are a recording, with the field's (y, x) size and place on the earth, if known."""
-
-    run: Run
-    shape: tuple[int, int] | None
-    geobox: GeoBox | None
-
-
-def find_recorded_run(address: str | Path) -> RecordedRun | None:
-    """Return the run of an address; None if the address is no archive's.
+def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None, GeoBox | None] | None:
+    """Return the run of an address, and size (y, x) and place of its field, if known; None if it is no archive's.
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
@@ -393,9 +390,9 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
     frame = params.get("frame", {})
     grid = frame.get("grid", {})
     if not {"height", "width"} <= set(grid):
-        return RecordedRun(run, None, None)
+        return run, None, None
     shape = int(grid["height"]), int(grid["width"])
-    return RecordedRun(run, shape, geobox_of_record(frame, shape))
+    return run, shape, geobox_of_record(frame, shape)
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:

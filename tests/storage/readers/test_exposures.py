@@ -14,7 +14,7 @@ from spectralzoom.pipeline.exposures import Taken, taken_with
 from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.storage.readers.envi_files import load_envi_header
 from spectralzoom.storage.readers.open_cubes import open_cube
-from spectralzoom.storage.readers.recordings import RecordedWith, Recording, open_recording
+from spectralzoom.storage.readers.recordings import Recording, open_recording
 from spectralzoom.storage.readers.scene_files import load_scene_file
 from tests.storage.readers.test_envi_cubes import write_envi
 
@@ -175,7 +175,7 @@ def test_a_frame_without_a_header_has_the_exposure_of_the_lines(tmp_path: Path) 
     """A ``.npy`` states nothing, which a note says; so does a cube that states nothing below a frame that does."""
     write_taken(tmp_path, (10, {MS: 10}), (10, {MS: 10}), {MS: 10})
     np.save(tmp_path / "w.npy", numbers(np.ones((1, SAMPLES, BANDS)), 10)[0])
-    recording = open_recording(tmp_path, given=RecordedWith(white=tmp_path / "w.npy"))
+    recording = open_recording(tmp_path, white=tmp_path / "w.npy")
     assert_true(recording)
     expected = "the white frame w.npy was taken with an exposure that is not stated, the lines with 10 ms: the same"
     assert any(note.startswith(expected) for note in recording.notes)
