@@ -80,9 +80,9 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     every = [(key, str(value)) for header in headers for key, value in header.items()]
     about = "\n".join(value for key, value in every if key == "description")
     for key, value in (*every, *re.findall(r"^\s*([^=:\n]+)[=:](.*)$", about, re.MULTILINE)):
-        name = " ".join(key.lower().replace("_", " ").split())
+        name = re.sub(r"[\s_.,/]+", " ", key.lower()).strip()
         if _FRAME.fullmatch(name):
-            _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)), where)
+            _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)) or value.strip().lower(), where)
         elif (match := _GAIN.fullmatch(name)) is not None:
             number, unit = _number(value, match)
             if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
@@ -231,7 +231,8 @@ def _dark_note(frames: Frames, dark_ms: float, white_ms: float, lines_ms: NDArra
         return f"{what}: {kept}"
     lit = (white - dark)[white > dark]
     level = abs(float(np.nanmedian(dark))) / float(np.median(lit)) if lit.size else 0.0
-    most = level * float(max(*np.abs(lines_ms / dark_ms - 1) * white_ms / lines_ms, abs(white_ms / dark_ms - 1)))
+    of_lines = np.abs(lines_ms / dark_ms - 1) * white_ms / lines_ms
+    most = level * max(float(of_lines.max()), abs(white_ms / dark_ms - 1))
     what = f"{what}, and {of_white.where} with {of_white.text}"
     effect = f"values may be off by up to {most:.2g} of white, if all of it is dark current"
     if most > MOST_DARK_ERROR:

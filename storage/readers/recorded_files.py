@@ -109,7 +109,7 @@ def open_file_cube(path: Path, wavelengths: Sequence[float] | None, stated: Mapp
             + (", or write a list 'wavelength' into its header" if reader_of(path) == "envi" else "")
         )
     folder = path if path.is_dir() and find_zarr_store(path) is None else path.parent
-    name = _stem(path)
+    name = _stem(path.absolute())  # of the folder ., too
     fields = load_envi_header(find_envi_pair(path)[0]).fields if reader_of(path) == "envi" else {}
     if (axis := fields.get("line axis", "x").strip()) not in ("x", "y"):
         raise SceneError(f"{path} has line axis = {axis!r}, expected x or y; correct the header")
