@@ -47,6 +47,7 @@ class Taken:
     gains: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # number and unit (dB, x or none), by key
     frame: Mapping[str, str] = field(default_factory=dict)  # binning, first elements and gain in words, by key
     notes: tuple[str, ...] = ()
+    conflicts: tuple[str, ...] = ()  # keys that contradict each other
 
     @property
     def exposure_ms(self) -> float | None:
@@ -70,25 +71,26 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     """Return what headers (fields, comments, attributes) of one file state; messages call it ``where``.
 
     Keys are those of several makes, with the unit in key or value; lines of ``description`` may be keys. Numbers that
-    are no exposure are left out with a note. Raises SceneError: two keys contradict each other.
+    are no exposure are left out with a note.
     """
     exposures: dict[str, tuple[str, float]] = {}
     times: dict[str, float] = {}
     gains: dict[str, tuple[float, str]] = {}
     frame: dict[str, str] = {}
     notes: list[str] = []
+    conflicts: list[str] = []
     every = [(key, str(value)) for header in headers for key, value in header.items()]
     about = "\n".join(value for key, value in every if key == "description")
     for key, value in (*every, *re.findall(r"^\s*([^=:\n]+)[=:](.*)$", about, re.MULTILINE)):
         name = re.sub(r"[\s_.,/]+", " ", key.lower()).strip()
         if _FRAME.fullmatch(name):
-            _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)) or value.strip().lower(), where)
+            conflicts += _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)) or value.strip().lower())
         elif (match := _GAIN.fullmatch(name)) is not None:
             number, unit = _number(value, match)
             if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
-                _put(frame, name, value.strip().lower(), where)
+                conflicts += _put(frame, name, value.strip().lower())
             else:
-                _put(gains, name[: match.end("detector")].strip(), (number, unit), where)
+                conflicts += _put(gains, name[: match.end("detector")].strip(), (number, unit))
         elif (match := _TIME.fullmatch(name)) is not None:
             number, unit = _number(value, match)
             unit = unit or _OWN_UNIT.get(match["name"], "")
@@ -97,23 +99,19 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
             if number is None or number <= 0 or (unit and unit not in TO_MS):
                 notes.append(f"{where}: {name} = {value.strip()[:40]} is no exposure that can be read, and is left out")
             elif not unit:
-                _put(times, name, number, where)
+                conflicts += _put(times, name, number)
             else:
                 ms = number * TO_MS[unit]
                 other, known = exposures.setdefault(match["detector"], (name, ms))
                 if not all_alike([ms, known]):
-                    raise SceneError(
-                        f"{where} states {other} of {known:g} ms and {name} of {ms:g} ms; correct the "
-                        "header, or remove the wrong one"
-                    )
+                    conflicts.append(f"{other} of {known:g} ms and {name} of {ms:g} ms")
     found = {detector: ms for detector, (_, ms) in exposures.items()}
-    return Taken(where, found, {} if found else times, gains, frame, tuple(notes))
+    return Taken(where, found, {} if found else times, gains, frame, tuple(notes), tuple(conflicts))
 
 
-def _put(table: dict[str, Any], name: str, value: Any, where: str) -> None:
-    """Add an entry to a table (SceneError: it has another one)."""
-    if table.setdefault(name, value) != value:
-        raise SceneError(f"{where} states {name} of {table[name]} and of {value}; correct the header")
+def _put(table: dict[str, Any], name: str, value: Any) -> list[str]:
+    """Add an entry to a table, and return a text if it has another one."""
+    return [] if table.setdefault(name, value) == value else [f"{name} of {table[name]} and of {value}"]
 
 
 def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
@@ -192,12 +190,15 @@ def match_exposures(
 
     ``lines_ms`` (line,) are exposures of the lines, and ``stated`` is whether a file has them. A white frame that
     states no exposure is assumed to have ``usual_ms``, by default the median of the lines. A dark frame of another
-    exposure is used as it is. Raises SceneError: a frame has another binning, another gain without a unit, or a dark
-    frame may change values by more than 5 %.
+    exposure is used as it is. Raises SceneError: a header contradicts itself, a frame has another binning, another gain
+    without a unit, or a dark frame may change values by more than 5 %.
     """
+    for taken in (cube, *(taken for _, taken in frames.values())):
+        if taken.conflicts:
+            raise SceneError(f"{taken.where} states {taken.conflicts[0]}; correct the header, or remove the wrong one")
     usual = float(np.median(lines_ms)) if usual_ms is None else usual_ms
     lines = span_text(lines_ms) + cube.gains_text if stated else cube.text
-    notes: list[str] = []
+    notes = list(cube.notes)
     found: dict[str, float] = {}
     for kind in sorted(frames.keys() & {"dark", "white"}):
         frame = frames[kind][1]

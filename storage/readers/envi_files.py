@@ -266,7 +266,6 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
     first = next(iter(every.values()))
     exposure_ms = np.full(height, np.nan)
     for start, one in every.items():
-        notes.extend(one.notes)
         check_parts(one, first)
         exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
     if np.isnan(exposure_ms).all():

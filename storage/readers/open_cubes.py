@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
+from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text, taken_with
 from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
 from spectralzoom.storage.readers.array_files import (
     ARRAY_ENDINGS,
@@ -103,7 +103,9 @@ def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     frames = {kind: load_frame(file, kind) for kind, file in found.items() if file is not None}
     stated_ms = source.lines.exposure_ms
     lines_ms = np.ones(1) if stated_ms is None else stated_ms
-    white_ms, notes = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
+    white_ms, notes = None, []
+    if frames:
+        white_ms, notes = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
     if len(frames) < 2 and not all_alike(lines_ms):
         notes.append(
             f"the lines were taken with {span_text(lines_ms)}, and without a dark and a white frame their numbers are "
@@ -138,6 +140,11 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         notes += [f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else []
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
         source = replace(source, bad_bands=marked_bands(near, source.shape[2]), notes=(*notes, *plain))
+        taken = taken_with(path.name, about, cube.array.attrs)
+        if taken.exposure_ms is not None:
+            exposure_ms = np.full(source.shape[0], taken.exposure_ms)
+            source = replace(source, lines=replace(source.lines, exposure_ms=exposure_ms))
+        source = replace(source, taken=taken)
         if path.is_dir():
             source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
         return source

@@ -122,10 +122,7 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
     stated = found.offset + (found.lines or 0) * found.line_bytes
     if len(data) > stated:
         raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {stated}; is it another file's?")
-    try:
-        return replace(cube_lines(found, data), taken=taken_with(by_name[name], found.fields, found.settings))
-    except SceneError as error:
-        raise RigError(str(error)) from error
+    return replace(cube_lines(found, data), taken=taken_with(by_name[name], found.fields, found.settings))
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zarr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
@@ -216,6 +217,22 @@ def test_contradictions_are_refused_by_name(tmp_path: Path, case: str) -> None:
     with pytest.raises(SceneError) as caught:
         open_recording(write_taken(tmp_path / "a", (10, cube), (10, white)))
     assert message in str(caught.value)
+
+
+def test_a_scene_without_frames_may_contradict_itself(tmp_path: Path) -> None:
+    """Its values do not depend on exposures."""
+    write_envi(tmp_path / "a.img", TRUTH.astype("<f4"), **NM, **{MS: 10, "tint": 5})
+    np.testing.assert_array_equal(load_scene_file(tmp_path / "a.hdr").values, TRUTH.astype(np.float32))
+
+
+def test_attributes_of_arrays_state_exposures(tmp_path: Path) -> None:
+    """A Zarr cube of 10 ms is below a white frame of 5 ms."""
+    group = zarr.create_group(tmp_path / "scan.zarr", attributes={"integration_time": "10 ms"})
+    group.create_array("counts", data=numbers(TRUTH, 10), dimension_names=("y", "x", "band"))
+    group.create_array("wavelength", data=np.array([500.0, 600, 700]), attributes={"units": "nm"})
+    for name, ms in (("white", 5), ("dark", 0)):
+        write_envi(tmp_path / f"scan.{name}.img", numbers(np.ones((1, SAMPLES, BANDS)), ms), **{MS: 5})
+    assert_true(open_recording(tmp_path / "scan.zarr"))
 
 
 def test_parts_of_another_gain_are_refused(tmp_path: Path) -> None:
