@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ LIGHT = 150.0  # DN of white in a millisecond
 NM = {"wavelength_units": "nm", "wavelength": "{500, 600, 700}"}
 Header = Mapping[str, object]
 MS = "exposure (ms)"
+write: Any = write_envi
 
 
 def numbers(values: NDArray[np.floating], ms: float | NDArray[np.floating], gain: float = 1) -> NDArray[np.uint16]:
@@ -38,9 +40,9 @@ def write_taken(
     """Write a cube and frames of these exposures [ms] and headers; ``gain`` is that of the white frame."""
     folder.mkdir(exist_ok=True)
     frame = np.ones((1, SAMPLES, BANDS))
-    write_envi(folder / "scan.img", numbers(TRUTH, cube[0]), **NM, **dict(cube[1]))
-    write_envi(folder / "scan.white.img", numbers(frame, white[0], gain), **dict(white[1]))
-    write_envi(folder / "scan.dark.img", numbers(frame, 0), **dict(dark or {}))
+    write(folder / "scan.img", numbers(TRUTH, cube[0]), **NM, **dict(cube[1]))
+    write(folder / "scan.white.img", numbers(frame, white[0], gain), **dict(white[1]))
+    write(folder / "scan.dark.img", numbers(frame, 0), **dict(dark or {}))
     return folder
 
 
@@ -98,13 +100,13 @@ def test_each_cube_and_each_line_has_its_own_ratio(tmp_path: Path) -> None:
     frame = np.ones((1, SAMPLES, BANDS))
     lines_ms = np.linspace(5, 20, LINES)
     for name, ms in (("a", 10.0), ("b", 20.0), ("c", lines_ms)):
-        write_envi(tmp_path / f"{name}.img", numbers(TRUTH, ms), **NM, **({MS: ms} if name != "c" else {MS: 7}))
+        write(tmp_path / f"{name}.img", numbers(TRUTH, ms), **NM, **({MS: ms} if name != "c" else {MS: 7}))
         every = np.broadcast_to(ms, LINES).tolist()
         rows = [f"0,{line / 100},{one!r}" for line, one in enumerate(every)]
         head = "angle_x_deg,angle_y_deg,exposure_ms"
         (tmp_path / f"{name}.pointing.csv").write_text("\n".join([head, *rows]))
-    write_envi(tmp_path / "white.img", numbers(frame, 8.0), **{MS: 8})
-    write_envi(tmp_path / "dark.img", numbers(frame, 0.0), **{MS: 8})
+    write(tmp_path / "white.img", numbers(frame, 8.0), **{MS: 8})
+    write(tmp_path / "dark.img", numbers(frame, 0.0), **{MS: 8})
     recording = open_recording(tmp_path)
     assert_true(recording, [TRUTH] * 3)
     assert recording.sweeps[0].references.same_as(recording.sweeps[1].references)  # they serve one request together
@@ -125,9 +127,9 @@ def write_folder(folder: Path, white: Header, exposures: Sequence[float] = (10, 
     folder.mkdir()
     frame = np.ones((1, SAMPLES, BANDS))
     for start, ms in zip((0, 6), exposures, strict=True):
-        write_envi(folder / f"raw_{start}", numbers(TRUTH[start : start + 6], ms), **NM, **{";Exposure (ms)": ms})
-    write_envi(folder / "whiteReference", numbers(frame, 5), **dict(white))
-    write_envi(folder / "darkReference", numbers(frame, 0), **{";Exposure (ms)": 10})
+        write(folder / f"raw_{start}", numbers(TRUTH[start : start + 6], ms), **NM, **{";Exposure (ms)": ms})
+    write(folder / "whiteReference", numbers(frame, 5), **dict(white))
+    write(folder / "darkReference", numbers(frame, 0), **{";Exposure (ms)": 10})
     return folder
 
 
@@ -221,7 +223,7 @@ def test_contradictions_are_refused_by_name(tmp_path: Path, case: str) -> None:
 
 def test_a_scene_without_frames_may_contradict_itself(tmp_path: Path) -> None:
     """Its values do not depend on exposures."""
-    write_envi(tmp_path / "a.img", TRUTH.astype("<f4"), **NM, **{MS: 10, "tint": 5})
+    write(tmp_path / "a.img", TRUTH.astype("<f4"), **NM, **{MS: 10, "tint": 5})
     np.testing.assert_array_equal(load_scene_file(tmp_path / "a.hdr").values, TRUTH.astype(np.float32))
 
 
@@ -231,7 +233,7 @@ def test_attributes_of_arrays_state_exposures(tmp_path: Path) -> None:
     group.create_array("counts", data=numbers(TRUTH, 10), dimension_names=("y", "x", "band"))
     group.create_array("wavelength", data=np.array([500.0, 600, 700]), attributes={"units": "nm"})
     for name, ms in (("white", 5), ("dark", 0)):
-        write_envi(tmp_path / f"scan.{name}.img", numbers(np.ones((1, SAMPLES, BANDS)), ms), **{MS: 5})
+        write(tmp_path / f"scan.{name}.img", numbers(np.ones((1, SAMPLES, BANDS)), ms), **{MS: 5})
     assert_true(open_recording(tmp_path / "scan.zarr"))
 
 
@@ -260,7 +262,7 @@ def test_an_overexposed_white_frame_is_still_named(tmp_path: Path) -> None:
     """Saturation is judged by the numbers as they are, not by scaled ones."""
     folder = write_taken(tmp_path / "a", (5, {MS: 5}), (20, {MS: 20}), {MS: 5})
     values = np.minimum(numbers(np.ones((1, SAMPLES, BANDS)) * 2, 20), 4095)
-    write_envi(folder / "scan.white.img", values, **{MS: 20})
+    write(folder / "scan.white.img", values, **{MS: 20})
     assert any("at full scale in 1e+02 % of the elements" in note for note in open_recording(folder).notes)
 
 
