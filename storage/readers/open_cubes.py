@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.exposures import Taken, all_alike, match_exposures, span_text, taken_with
+from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text, taken_with
 from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
 from spectralzoom.storage.readers.array_files import (
     ARRAY_ENDINGS,
@@ -103,20 +103,20 @@ def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     frames = {kind: load_frame(file, kind) for kind, file in found.items() if file is not None}
     stated_ms = source.lines.exposure_ms
     lines_ms = np.ones(1) if stated_ms is None else stated_ms
-    taken = source.taken if frames else Taken()  # numbers alone do not depend on exposures
-    white_ms, notes = match_exposures(taken_of(frames), taken, lines_ms, stated=stated_ms is not None)
-    if len(frames) < 2 and not all_alike(lines_ms):
-        notes.append(
-            f"the lines were taken with {span_text(lines_ms)}, and without a dark and a white frame their numbers are "
-            "not scaled"
-        )
-    named = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]
+    notes = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]
+    white_ms = None
+    if len(frames) == 2:
+        white_ms, more = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
+        notes += more
+    else:
+        notes = [f"{note} is not used: values over white need a dark and a white frame" for note in notes]
+        notes += [] if all_alike(lines_ms) else [f"numbers of {span_text(lines_ms)} are not scaled to one exposure"]
     return replace(
         source,
         **{kind: frame.values for kind, frame in frames.items()},  # type: ignore[arg-type]
         white_ms=white_ms,
         files=(*source.files, *(file for frame in frames.values() for file in frame.files)),
-        notes=(*source.notes, *named, *notes),
+        notes=(*source.notes, *notes),
     )
 
 

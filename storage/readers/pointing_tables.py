@@ -131,19 +131,15 @@ def _read_table(path: Path) -> pd.DataFrame:
     if cells.empty:
         raise SceneError(f"{path} has no row below its header; give a row for each line")
     for name in cells.columns.drop("sweep", errors="ignore"):
-        cells[name] = [_number(path, number, name, cell) for number, cell in cells[name].items()]
-    return cells
-
-
-def _number(path: Path, row: object, name: str, cell: str) -> float:
-    """Return a cell as a number, NaN if it is empty."""
-    try:
-        return float(cell or "nan")
-    except ValueError:
-        raise SceneError(
-            f"{path}, row {row}: {name} = {cell[:40]!r} is no number; write numbers with a decimal point, and 1 or 0 "
-            "for valid"
-        ) from None
+        texts = cells[name].mask(cells[name] == "", "nan")
+        cells[name] = pd.to_numeric(texts, errors="coerce")
+        wrong = texts[cells[name].isna() & (texts.str.lower() != "nan")]
+        if len(wrong):
+            raise SceneError(
+                f"{path}, row {wrong.index[0]}: {name} = {wrong.iloc[0][:40]!r} is no number; write numbers with a "
+                "decimal point, and 1 or 0 for valid"
+            )
+    return cells.astype(dict.fromkeys(cells.columns.drop("sweep", errors="ignore"), np.float64))
 
 
 def _kind_of(path: Path, columns: Sequence[str]) -> Kind:

@@ -149,11 +149,12 @@ def test_a_camera_folder_is_scaled_as_a_scene_and_as_a_recording(
 
 
 def test_numbers_without_frames_are_not_scaled(tmp_path: Path) -> None:
-    """A note says so where the parts of a folder have different exposures."""
+    """Notes say so where the parts of a folder have different exposures, and which frame is not used."""
     folder = write_folder(tmp_path / "a", {}, (10, 20))
     for path in folder.glob("whiteReference*"):
         path.unlink()
-    assert any("10 to 20 ms, and without a dark and a white frame" in note for note in open_cube(folder).notes)
+    dark = "dark frame from darkReference.hdr is not used: values over white need a dark and a white frame"
+    assert open_cube(folder).notes == (dark, "numbers of 10 to 20 ms are not scaled to one exposure")
 
 
 @pytest.mark.parametrize(
