@@ -207,7 +207,8 @@ def open_labelled(path: Path) -> xarray.Dataset:
     """Open a store lazily, in dask's blocks of whole shards, with a coordinate on every axis.
 
     ``y`` and ``x`` are in metres for a georeferenced store (its CRS in ``spatial_ref``). Otherwise they are tangents of
-    the angle from the undeflected direction [rad], or pixels. ``band`` and ``wavelength`` are in nm, both an index.
+    the angle from the undeflected direction [rad], or pixels. ``band`` and ``wavelength`` are in nm, rising, both an
+    index; ``detector`` numbers the detectors of overlapping bands.
     Numbers keep their type: no class becomes a float. Attributes are text, numbers or lists of them, others JSON text,
     so that ``to_netcdf`` and ``to_zarr`` write them. Raises IncompleteStoreError: the store is missing or damaged.
     """
@@ -220,8 +221,9 @@ def open_labelled(path: Path) -> xarray.Dataset:
         opened = xarray.open_dataset(
             store, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )
+        opened = by_wavelength(opened)
         for name, one in opened.data_vars.items():
             blocks = one.encoding.get("shards") or one.encoding.get("chunks") or one.shape
             opened = opened.assign({name: one.chunk(dict(zip(one.dims, blocks, strict=True)))})
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
-    return by_wavelength(with_plain_attributes(opened.assign_coords(bare)))
+    return with_plain_attributes(opened.assign_coords(bare))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from spectralzoom.storage.arrays.band_order import sort_bands
 from spectralzoom.storage.arrays.georeference import GRID_MAPPING
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
@@ -88,19 +89,25 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], open_st
     bare = {name: np.arange(length) for name, length in zip(dims, shape, strict=True) if name not in coords}
     mapped = {"grid_mapping": GRID_MAPPING} if GRID_MAPPING in coords else {}
     spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, path, open_store)), VALUE | mapped)
-    found = xarray.Dataset({"spectra": spectra.chunk(dict(zip(dims, (*block, -1), strict=True)))}, coords | bare)
-    return by_wavelength(with_plain_attributes(xarray.decode_cf(found, mask_and_scale=False)))["spectra"]
+    found = xarray.decode_cf(xarray.Dataset({"spectra": spectra}, coords | bare), mask_and_scale=False)
+    return by_wavelength(with_plain_attributes(found))["spectra"].chunk(dict(zip(dims, (*block, -1), strict=True)))
 
 
 def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
-    """Index by ``band`` and ``wavelength``, as in ``.sel(wavelength=660, method="nearest")``.
+    """Sort bands by wavelength, for ``.sel(wavelength=660, method="nearest")``, and index them by it and by ``band``.
 
-    Slices and the nearest need ascending or descending wavelengths: ``.sortby("wavelength")`` gives them.
+    ``detector`` is the number of each band's detector, as `sort_bands` finds it: overlapping ones alternate.
     """
-    for name in OF_WAVELENGTHS:
-        if name in opened.coords and opened[name].dims == ("band",):
-            opened = opened.drop_indexes(name, errors="ignore").set_xindex(name)
-    return opened
+    if "wavelength" not in opened.coords or opened["wavelength"].dims != ("band",):
+        return opened
+    bands = sort_bands(opened["wavelength"].values)
+    sorted_ = opened.drop_indexes(OF_WAVELENGTHS, errors="ignore")
+    if (np.diff(bands.order) < 0).any():
+        sorted_ = sorted_.isel(band=bands.order)
+    about = {"long_name": "detector, numbered from 0 in the order of the file", "units": "1"}
+    coords = {name: ("band", bands.wavelength_nm, opened[name].attrs) for name in OF_WAVELENGTHS}
+    sorted_ = sorted_.assign_coords(detector=("band", bands.detector, about)).assign_coords(coords)
+    return sorted_.drop_indexes("band", errors="ignore").set_xindex("band").set_xindex("wavelength")
 
 
 def with_plain_attributes(opened: xarray.Dataset) -> xarray.Dataset:

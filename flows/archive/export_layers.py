@@ -28,7 +28,7 @@ from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
-from spectralzoom.storage.runs import RECEIPT, read_run
+from spectralzoom.storage.runs import RECEIPT, has_time, read_run
 from spectralzoom.storage.store import LATEST, Archive, Ref, uri_of
 
 
@@ -96,14 +96,18 @@ class ExportedRun:
 
     @property
     def observed(self) -> tuple[str, str]:
-        """Return begin and end of the observation: those of the run, unless its visit is another moment.
+        """Return begin and end of the observation: those of the run, unless visit or file state another moment or day.
 
         A visit of a rig may be known by its date alone, and captures lines during the run.
         """
         began, ended = self.receipt["started"], self.receipt["finished"]
-        visit = time_of_visit(read_run(self.folder)) or began
+        run = read_run(self.folder)
+        moment = time_of_visit(run) or began
         known = 10 if self.receipt["source"] == RIG else 19  # characters: to the day, or to the second
-        return (began, ended) if visit[:known] == began[:known] else (visit, visit)
+        if moment[:known] == began[:known]:
+            return began, ended
+        whole_day = run.acquired is not None and not has_time(run.acquired)
+        return moment, f"{moment[:10]}T23:59:59+00:00" if whole_day else moment
 
     def store(self, product: str) -> Ref | None:
         """Return the store of a product; None if there is none, or if its files were cleared away.

@@ -36,7 +36,7 @@ from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntr
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
-from spectralzoom.storage.runs import RECEIPT
+from spectralzoom.storage.runs import RECEIPT, moment_of
 from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
@@ -70,7 +70,8 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         (folder / REPORT).write_text(page, encoding="utf-8")
         return {"survey": receipt["survey"], "settings": receipt["settings"]}
 
-    folder = stores.archive.publish_run(plan.field.name, write, stores.refs)
+    day = moment_of(plan.field.acquired)
+    folder = stores.archive.publish_run(plan.field.name, write, stores.refs, None if day is None else day.date())
     return Published(receipt, folder)
 
 
@@ -97,6 +98,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
         seed=plan.settings.seed,
         started=in_seconds(started),
         finished=in_seconds(datetime.now(UTC)),
+        acquired=field.acquired,
         versions=versions(),
         settings={**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)},
         stages=[_stage_row(row) for row in stores.rows.values()],

@@ -73,6 +73,7 @@ class OpenedRecording:
             class_names=() if found is None else found.names,
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
             geobox=self.geobox,
+            acquired=self.recording.acquired,
         )
         return scene, (*self.notes, *notes)
 

@@ -118,7 +118,8 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
-    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
+    known = {name: getattr(file, name) for name in ("regridded", "content", "pixel_m", "acquired")}
+    return replace(scene, **known)
 
 
 def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -147,6 +148,7 @@ def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...
         missing=missing,
         geobox=file.geobox,
         pixel_m=file.pixel_m,
+        acquired=file.acquired,
         content=file.content,
     )
     return file, *_with_notes(scene, file, settings, "whose other bands are used")

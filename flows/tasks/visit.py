@@ -9,13 +9,22 @@ from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.scene import scene_of_visit
+from spectralzoom.storage.readers.open_cubes import open_cube
 
 
 def settings_of_visit(parameters: SurveySettings) -> Settings:
-    """Return the settings of a run; a run of a deployment is a visit of its due time. Raises SettingsError."""
+    """Return the settings of a run of a deployment: a visit of its due time, for a raster of that in its file.
+
+    Other runs keep theirs. Raises SettingsError, SceneError: the settings or the raster cannot be used.
+    """
     due = due_time()
     settings = parameters.settings()
-    return settings if due is None else scene_of_visit(at_due_time(settings, due), due.astimezone())
+    if due is None:
+        return settings
+    settings = scene_of_visit(settings, due.astimezone())
+    if settings.is_map and settings.visit is None:
+        settings = replace(settings, visit=open_cube(settings.scene).acquired)
+    return at_due_time(settings, due)
 
 
 def due_time() -> datetime | None:

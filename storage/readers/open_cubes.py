@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
 from spectralzoom.storage.readers.array_files import (
     ARRAY_ENDINGS,
@@ -129,9 +130,11 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
         notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
-        notes += [f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else []
+        acquired = acquired_of({**about, **cube.array.attrs})
+        notes += [*acquired.notes, *([f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else [])]
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
-        source = replace(source, bad_bands=marked_bands(near, source.shape[2]), notes=(*notes, *plain))
+        bad = marked_bands(near, source.shape[2])
+        source = replace(source, bad_bands=bad, acquired=acquired.text, notes=(*notes, *plain))
         if path.is_dir():
             source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
         return source

@@ -84,6 +84,7 @@ class Recording:
     camera: LineCamera
     notes: tuple[str, ...]
     light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
+    acquired: str | None = None  # when the first lines were captured, by files: a day or a moment in UTC, ISO 8601
 
     def key(self) -> dict[str, Any]:
         """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
@@ -214,7 +215,8 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     ]
     unique = tuple(dict.fromkeys(notes))
     light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
-    return Recording(str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light)
+    acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
+    return Recording(str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light, acquired)
 
 
 def _point(cube: RecordedFile, given: RecordedWith, notes: list[str], *, alone: bool) -> LinePointing | None:
