@@ -65,7 +65,7 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
         (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
-            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]))
+            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]), encoding="utf-8")
         (folder / RECEIPT).write_text(to_json(receipt), encoding="utf-8")
         (folder / REPORT).write_text(page, encoding="utf-8")
         return {"survey": receipt["survey"], "settings": receipt["settings"]}

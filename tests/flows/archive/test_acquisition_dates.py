@@ -53,7 +53,7 @@ def test_the_date_of_a_file_is_kept_beside_the_day_of_processing(tmp_path: Path,
     assert about["datetime"] == about["start_datetime"] == about["end_datetime"] == "2022-07-08T10:11:12Z"
     assert about["created"] == later.receipt["finished"]
     with rasterio.open(next(tmp_path.rglob("*-north-*/class_map.tif"))) as file:
-        assert file.tags(ns="IMAGERY")["ACQUISITIONDATETIME"] == "2022-07-08T10:11:12+00:00"
+        assert file.tags()["ACQUISITIONDATETIME"] == "2022-07-08T10:11:12+00:00"
         assert file.tags()["processed"] == later.receipt["finished"]
     assert open_cube(next(tmp_path.rglob("class_map.tif")), labels=True).acquired == "2022-07-08T10:11:12Z"
 
