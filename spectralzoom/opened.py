@@ -127,7 +127,7 @@ class OpenedRun:
 
     @property
     def mosaic(self) -> xarray.DataArray:
-        """(y, x, band) float32 values of all passes, NaN where not captured; also indexed by ``wavelength``, which rises.
+        """(y, x, band) float32 values of all passes, NaN where not captured, by rising ``wavelength``, an index.
 
         Spectra are restored from their components when they are used.
         """
