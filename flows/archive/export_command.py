@@ -90,7 +90,7 @@ def run_export(
         with ExitStack() as stack:
             release = take_lock(out / ".export.lock")
             stack.callback(release if release is not None else lambda: None)
-            collection = _empty_collection(out, opened.archive.root.name)
+            _collection_id(out, opened.archive.root.name)
             for one in (out, folder):
                 remove_leftovers(one)
             assets = _write_images(folder, layers, console)
@@ -98,7 +98,7 @@ def run_export(
                 assets |= _write_tables(opened, folder, doses, polygons=polygons)
             for name, (title, kind) in RUN_FILES.items():
                 assets[Path(name).stem] = _asset(folder, opened.folder / name, title, kind, "metadata")
-            written = _write_catalogue(out, collection, _describe(opened, folder, assets))
+            written = _write_catalogue(out, opened.archive.root.name, _describe(opened, folder, assets))
     except PipelineError:  # some are OSErrors
         raise
     except (OSError, UnicodeEncodeError) as error:
@@ -176,10 +176,8 @@ def _describe(run: ExportedRun, folder: Path, assets: Assets) -> Any:
     return item
 
 
-def _empty_collection(out: Path, archive: str) -> Any:
-    """Return the collection of an archive's exports (ArchiveError: ``out`` has another one's)."""
-    import pystac
-
+def _collection_id(out: Path, archive: str) -> str:
+    """Return the identifier of an archive's collection (ArchiveError: ``out`` has another one's)."""
     made = re.sub(r"[^A-Za-z0-9_-]+", "-", archive).strip("-") or "surveys"
     path = out / COLLECTION
     try:
@@ -190,12 +188,10 @@ def _empty_collection(out: Path, archive: str) -> Any:
         raise ArchiveError(
             f"{path} is the collection {found!r} of another archive, expected {made!r}; choose another --out"
         )
-    earth, ever = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]]), pystac.TemporalExtent([[None, None]])
-    everywhere = pystac.Extent(earth, ever)
-    return pystac.Collection(made, f"Surveys exported from the archive {archive}.", everywhere, license="other")
+    return made
 
 
-def _write_catalogue(out: Path, collection: Any, item: Any) -> tuple[Path, Path]:
+def _write_catalogue(out: Path, archive: str, item: Any) -> tuple[Path, Path]:
     """Write ``ID/ID.json`` and the collection of all items in the folder; return both paths.
 
     Raises ArchiveError: an item of an earlier export cannot be read.
@@ -210,14 +206,15 @@ def _write_catalogue(out: Path, collection: Any, item: Any) -> tuple[Path, Path]
                 items.append(pystac.Item.from_dict(content, href=f"/{path.relative_to(out)}"))
             except (OSError, ValueError, KeyError, TypeError, pystac.STACError, pystac.STACTypeError) as error:
                 raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
+    extent = pystac.Extent.from_items(items)
+    if all(one.bbox is None for one in items):
+        extent.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
+    text = f"Surveys exported from the archive {archive}."
+    collection = pystac.Collection(_collection_id(out, archive), text, extent, license="other")
     collection.add_items(sorted(items, key=lambda one: (str(one.datetime), one.id)))
-    found = pystac.Extent.from_items(items)
-    collection.extent.temporal = found.temporal
-    if any(one.bbox is not None for one in items):
-        collection.extent.spatial = found.spatial
     collection.catalog_type = pystac.CatalogType.SELF_CONTAINED
     collection.normalize_hrefs("/")  # links are relative; a folder's name may have characters of addresses, as # and ?
-    paths = tuple(out / one.self_href.lstrip("/") for one in (item, collection))
-    for path, one in zip(paths, (item, collection), strict=True):
+    written = out / item.self_href.lstrip("/"), out / COLLECTION
+    for path, one in zip(written, (item, collection), strict=True):
         write_whole(path, to_json(one.to_dict(include_self_link=False)))
-    return paths[0], paths[1]
+    return written

@@ -13,18 +13,13 @@ from spectralzoom.storage.readers.open_cubes import open_cube
 
 
 def settings_of_visit(parameters: SurveySettings) -> Settings:
-    """Return the settings of a run of a deployment: a visit of its due time, for a raster of that in its file.
+    """Return the settings of a run; a run of a deployment is a visit of its due time.
 
-    Other runs keep theirs. Raises SettingsError, SceneError: the settings or the raster cannot be used.
+    Raises SettingsError, SceneError: the settings or the raster cannot be used.
     """
     due = due_time()
     settings = parameters.settings()
-    if due is None:
-        return settings
-    settings = scene_of_visit(settings, due.astimezone())
-    if settings.is_map and settings.visit is None:
-        settings = replace(settings, visit=open_cube(settings.scene).acquired)
-    return at_due_time(settings, due)
+    return settings if due is None else at_due_time(scene_of_visit(settings, due.astimezone()), due)
 
 
 def due_time() -> datetime | None:
@@ -43,11 +38,13 @@ def due_time() -> datetime | None:
 def at_due_time(settings: Settings, due: datetime) -> Settings:
     """Return the settings of a scheduled visit: it has the due time as its name and starts from the newest prior map.
 
+    The visit of a raster has the time of acquisition in its file, if any (SceneError: it cannot be read).
     The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
+    acquired = open_cube(settings.scene).acquired if settings.is_map and settings.visit is None else None
     requested = replace(
         settings,
-        visit=settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
+        visit=settings.visit or acquired or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
         prior="latest" if settings.prior == "auto" else settings.prior,
     )
     if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:

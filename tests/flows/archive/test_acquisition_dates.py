@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.recorded_field import open_recorded
+from spectralzoom.flows.tasks.visit import at_due_time
 from spectralzoom.storage.readers.open_cubes import open_cube
 from spectralzoom.storage.readers.scene_files import open_scene_file
 from tests.conftest import QUIET
@@ -97,3 +100,27 @@ def netcdf(folder: Path) -> Path:
 def test_readers_find_the_date(tmp_path: Path, write: Any) -> None:
     """The kinds of files give the same moment, and none the day on which the file was made."""
     assert open_scene_file(write(tmp_path)).acquired == "2022-07-01T10:11:12Z"
+
+
+@pytest.mark.parametrize(
+    ("flags", "visit"),
+    [
+        ({"source": "raster"}, "2022-07-01T10:11:12Z"),
+        ({"source": "raster", "visit": "mine"}, "mine"),
+        ({"source": "sim"}, "2026-06-01T12:00:00Z"),
+    ],
+)
+def test_a_scheduled_raster_has_the_date_of_its_file(tmp_path: Path, flags: dict[str, str], visit: str) -> None:
+    """The due time is that of the processing; a stated visit is kept, and a simulated capture has its due time."""
+    settings = load_settings(None, {"scene": str(envi(tmp_path)), **flags})
+    assert at_due_time(settings, datetime(2026, 6, 1, 12, tzinfo=UTC)).visit == visit
+
+
+def test_two_cubes_of_a_recording_have_the_date_of_the_first(tmp_path: Path) -> None:
+    """Runs of sweeps have the date in the headers of their files."""
+    for number, day in enumerate(("2022-07-02", "2022-07-01")):
+        told = {"wavelength_units": "nm", "wavelength": "{640, 550, 460}", "acquisition_date": day}
+        write_envi(tmp_path / f"{number}.img", PIXELS.astype(np.uint16), "bil", **told)
+        rows = "".join(f"{line / 1000},0\n" for line in range(len(PIXELS)))
+        (tmp_path / f"{number}.pointing.csv").write_text(f"mirror_x,mirror_y\n{rows}")
+    assert open_recorded(load_settings(None, {"sweeps": str(tmp_path)})).scene()[0].acquired == "2022-07-01"
