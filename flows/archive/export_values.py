@@ -198,19 +198,22 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     legend = legend_of(stored.group)
     place = geobox_of(stored).affine
     found = list(rasterio_features.shapes(classes, mask=classes != UNLABELLED, transform=place))
-    frame = geopandas.GeoDataFrame(
-        {"class": [int(number) for _, number in found]},
-        geometry=[shapely.geometry.shape(outline) for outline, _ in found],
-        crs=None if run.geobox is None else str(run.geobox.crs),
-    )
-    frame["name"] = [legend.names[number] for number in frame["class"]]
-    frame["colour"] = [f"#{bytes(legend.colours[number].tolist()).hex()}" for number in frame["class"]]
-    if frame.crs is not None:
+    numbers = [int(number) for _, number in found]
+    names = [legend.names[number] for number in numbers]
+    columns = {
+        "class": numbers,
+        "name": names,
+        "colour": [f"#{bytes(legend.colours[number].tolist()).hex()}" for number in numbers],
+    }
+    crs = None if run.geobox is None else str(run.geobox.crs)
+    outlines = [shapely.geometry.shape(outline) for outline, _ in found]
+    frame = geopandas.GeoDataFrame(columns, geometry=outlines, crs=crs)
+    if crs is not None:
         frame["hectares"] = frame.to_crs(EQUAL_AREA).area / M2_PER_HECTARE
     if doses:
-        frame["dose"] = [doses.get(name, 0.0) for name in frame["name"]]
+        frame["dose"] = [doses.get(name, 0.0) for name in names]
     package, shapefile = folder / "classes.gpkg", folder / "classes.shp"
-    parts = [f"classes{ending}" for ending in (PARTS if frame.crs is not None else PARTS[:-1])]
+    parts = [f"classes{ending}" for ending in (PARTS if crs is not None else PARTS[:-1])]
     day = {"DBF_DATE_LAST_UPDATE": run.receipt["finished"][:10]}  # the same polygons, the same bytes
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": run.receipt["finished"]})
     try:

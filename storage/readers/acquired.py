@@ -14,9 +14,11 @@ from dateutil.parser import parse
 NAMES = (
     *("acquisitiondatetime", "acquisitionstarttime", "acquisitiontime", "acquisitiondate", "dateacquired", "acquired"),
     *("datetimeoriginal", "datetimedigitized", "timecoveragestart", "startdatetime", "datatakesensingstart"),
-    *("sensingstart", "sensingtime", "productstarttime", "starttime", "scenecentertime", "time", "datetime"),
+    *("sensingstart", "sensingtime", "sensingdate", "capturetime", "capturedate", "observationtime", "observationdate"),
+    *("flightdate", "productstarttime", "starttime", "scenecentertime", "time", "datetime"),
+    *("tifftagdatetime", "exifdatetime"),  # of the image, or of its last change
 )
-_PREFIX = re.compile(r"^(ncglobal|exif|tifftag|emit|datatake1|spacecraft)")
+_PREFIX = re.compile(r"^(ncglobal|exif(?=datetime[od])|emit|datatake1|spacecraft)")
 _LABEL = re.compile(r"(?P<words>[A-Za-z ]+)(?P<form>\([a-z/. -]+\))?:\s*(?=\d)")  # DATE(yyyy-mm-dd): or UTC TIME:
 _FIRST_YEAR = 1971  # a clock that was never set says 1970 or 0
 _DEFAULTS = (datetime(2000, 1, 1), datetime(2001, 2, 2, 1))  # what differs with them is not in a text
