@@ -118,8 +118,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
-    known = {name: getattr(file, name) for name in ("regridded", "content", "pixel_m", "acquired")}
-    return replace(scene, **known)
+    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
 
 
 def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -148,7 +147,6 @@ def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...
         missing=missing,
         geobox=file.geobox,
         pixel_m=file.pixel_m,
-        acquired=file.acquired,
         content=file.content,
     )
     return file, *_with_notes(scene, file, settings, "whose other bands are used")
@@ -162,6 +160,7 @@ def _with_notes(
     ``became`` says what became of pixels without a value in some bands.
     """
     notes = file.provenance
+    scene = replace(scene, acquired=file.acquired)
     if scene.geobox is not None and settings.pose is not None:
         scene = replace(scene, geobox=None)
         notes = (*notes, POSE_WINS)
