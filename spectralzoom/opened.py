@@ -214,7 +214,8 @@ def open_labelled(path: Path) -> xarray.Dataset:
     """
     import xarray  # takes a second
 
-    from spectralzoom.spectra import by_wavelength, with_plain_attributes
+    from spectralzoom.spectra import with_plain_attributes
+    from spectralzoom.storage.arrays.band_order import by_wavelength
 
     with damage_named(str(path)):
         store: Any = open_group(path).store  # xarray takes a path with :: for a chain of file systems

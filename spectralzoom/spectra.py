@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from spectralzoom.storage.arrays.band_order import sort_bands
+from spectralzoom.storage.arrays.band_order import OF_WAVELENGTHS, by_wavelength
 from spectralzoom.storage.arrays.georeference import GRID_MAPPING
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
 from spectralzoom.storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
 
 OpenStore = Callable[[Path], Mosaic | SignalCube]
-OF_WAVELENGTHS = ("band", "wavelength")
 OF_BANDS = (*OF_WAVELENGTHS, "fwhm")
 OF_LINES = ("line", "sample", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line")
 OF_PLACES = ("y", "x", GRID_MAPPING)
@@ -91,23 +90,6 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], open_st
     spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, path, open_store)), VALUE | mapped)
     found = xarray.decode_cf(xarray.Dataset({"spectra": spectra}, coords | bare), mask_and_scale=False)
     return by_wavelength(with_plain_attributes(found))["spectra"].chunk(dict(zip(dims, (*block, -1), strict=True)))
-
-
-def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
-    """Sort bands by wavelength, for ``.sel(wavelength=660, method="nearest")``, and index them by it and by ``band``.
-
-    ``detector`` is the number of each band's detector, as `sort_bands` finds it: overlapping ones alternate.
-    """
-    if "wavelength" not in opened.coords or opened["wavelength"].dims != ("band",):
-        return opened
-    bands = sort_bands(opened["wavelength"].values)
-    sorted_ = opened.drop_indexes(OF_WAVELENGTHS, errors="ignore")
-    if (np.diff(bands.order) < 0).any():
-        sorted_ = sorted_.isel(band=bands.order)
-    about = {"long_name": "detector, numbered from 0 in the order of the file", "units": "1"}
-    coords = {name: ("band", bands.wavelength_nm, opened[name].attrs) for name in OF_WAVELENGTHS}
-    sorted_ = sorted_.assign_coords(detector=("band", bands.detector, about)).assign_coords(coords)
-    return sorted_.drop_indexes("band", errors="ignore").set_xindex("band").set_xindex("wavelength")
 
 
 def with_plain_attributes(opened: xarray.Dataset) -> xarray.Dataset:

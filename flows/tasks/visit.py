@@ -9,7 +9,7 @@ from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.scene import scene_of_visit
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 
 
 def settings_of_visit(parameters: SurveySettings) -> Settings:
@@ -41,7 +41,7 @@ def at_due_time(settings: Settings, due: datetime) -> Settings:
     The visit of a raster has the time of acquisition in its file, if any (SceneError: it cannot be read).
     The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
-    acquired = open_cube(settings.scene).acquired if settings.is_map and settings.visit is None else None
+    acquired = open_cube_source(settings.scene).acquired if settings.is_map and settings.visit is None else None
     requested = replace(
         settings,
         visit=settings.visit or acquired or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+
+OF_WAVELENGTHS = ("band", "wavelength")  # coordinates [nm]
+Labelled = TypeVar("Labelled", xr.Dataset, xr.DataArray)
 
 
 class SortedBands(NamedTuple):
@@ -37,3 +41,23 @@ def sort_bands(wavelength_nm: ArrayLike) -> SortedBands:
     for band in np.flatnonzero(np.diff(found) <= 0) + 1:
         found[band] = np.nextafter(found[band - 1], np.inf)
     return SortedBands(order, found, detector[order])
+
+
+def by_wavelength(opened: Labelled) -> Labelled:
+    """Sort bands by wavelength, for ``.sel(wavelength=660, method="nearest")``, and index them by it and by ``band``.
+
+    ``detector`` is the number of each band's detector, as `sort_bands` finds it: overlapping ones alternate.
+    """
+    if "wavelength" not in opened.coords or opened["wavelength"].dims != ("band",):
+        return opened
+    bands = sort_bands(opened["wavelength"].values)
+    names = [name for name in OF_WAVELENGTHS if name in opened.coords]
+    opened = opened.drop_indexes(names, errors="ignore")
+    if (np.diff(bands.order) < 0).any():
+        opened = opened.isel(band=bands.order)
+    about = {"long_name": "detector, numbered from 0 in the order of the file", "units": "1"}
+    coords = {name: ("band", bands.wavelength_nm, opened[name].attrs) for name in names}
+    opened = opened.assign_coords({**coords, "detector": ("band", bands.detector, about)})
+    for name in names:
+        opened = opened.drop_indexes(name, errors="ignore").set_xindex(name)
+    return opened
