@@ -20,7 +20,7 @@ from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RIG
 from spectralzoom.flows.stages.ground import colours_of
-from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
+from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out
 from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
@@ -28,7 +28,7 @@ from spectralzoom.storage.arrays.georeference import load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import CogImage
-from spectralzoom.storage.runs import RECEIPT, has_time, read_run
+from spectralzoom.storage.runs import has_time, read_run
 from spectralzoom.storage.store import LATEST, Archive, read_manifest
 
 
@@ -144,13 +144,10 @@ class ExportedRun:
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """Return a run by name or address, else the latest.
 
-    Raises NoRunError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
+    Raises NoRunError: there is none; IncompleteStoreError, ShapeError: its receipt is damaged, or is no survey's.
     """
     folder = archive.run_folder(name or LATEST)
-    try:
-        return ExportedRun(archive, folder, load_receipt(folder))
-    except ShapeError as error:
-        raise IncompleteStoreError(f"{folder / RECEIPT} is no survey's: {error}; export another run") from error
+    return ExportedRun(archive, folder, load_receipt(folder))
 
 
 @dataclass(frozen=True)
