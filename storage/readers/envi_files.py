@@ -33,6 +33,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     place_parts,
     times_of_lines,
 )
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import bad_bands, rescaled
 from spectralzoom.storage.readers.places import place_of_envi
@@ -233,6 +234,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         header = with_bands.header
         bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
 
+    acquired = acquired_of({**cubes[0].header.settings, **cubes[0].header.fields})
+
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
         for begin, part in parts.items():
@@ -256,7 +259,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         bands=bands,
         nodata=cubes[0].header.nodata,
         bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
-        notes=tuple(notes),
+        acquired=acquired.text,
+        notes=(*notes, *acquired.notes),
     )
 
 
