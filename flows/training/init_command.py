@@ -8,7 +8,7 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, S
 from spectralzoom.storage.whole_files import write_whole
 
 KEPT = ("class_attribute", "unlabelled")  # of an existing file
+DOUBTFUL = (0, 255, 65535, (0, 0, 0), (255, 255, 255))  # labels that may mean no class
+SPARSE = 0.8  # fraction of the borders between labels that one takes part in if it fills the gaps between all others
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class FoundClass:
     name: str
     value: ClassValue
     fraction: float
+    borders: float = 0.0  # fraction of the borders between labels that it takes part in
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class SceneDraft:
     files: label_files.MatchedFiles
     cube: CubeSource  # the first scene
     classes: tuple[FoundClass, ...]
+    void: FoundClass | None  # a label that is assumed to mean no class
     unseen: tuple[str, ...]  # on files that cannot be read or do not fit
 
 
@@ -76,13 +80,14 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     path = (place if place.is_dir() and not label_files.is_store(place) else place.parent) / SETTINGS_NAME
     if path.exists() and not force:
         raise SettingsError(f"{path} exists; edit it, or replace it with --force")
-    stated: dict[str, Any] = {}
+    before = SceneSettings()
     with suppress(PipelineError, FileNotFoundError):  # a file that cannot be read is replaced
         before = load_scene_settings(path)
-        stated = {name: value for name in KEPT if (value := getattr(before, name)) is not None}
     with writing(path.parent, "folder"), _set_aside(path):
         with console.status("reading images and labels"):
-            draft = draft_scene(source, SceneSettings(**stated))
+            draft = draft_scene(source, before)
+        stated = {name: value for name in KEPT if (value := getattr(before, name)) is not None}
+        stated |= {} if draft.void is None else {"unlabelled": draft.void.value}
         write_whole(path, _toml(draft, path.parent, stated))
     files, cube = draft.files, draft.cube
     nm = cube.bands.wavelength_nm
@@ -101,11 +106,12 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "labelled": len(files.labels),
         "shape": list(cube.shape),
         "wavelengths_nm": None if nm is None else nm.tolist(),
-        "classes": [asdict(one) for one in draft.classes],
+        "classes": [{"name": one.name, "value": one.value, "fraction": one.fraction} for one in draft.classes],
         "notes": list(cube.notes),
         "unseen": [*_missing(draft), *draft.unseen],
         "first": first,
         "next": shlex.join(["spectralzoom", *following]),
+        "assumed": _assumed(draft, before, path),
     }
 
 
@@ -139,7 +145,7 @@ def _toml(draft: SceneDraft, folder: Path, stated: dict[str, Any]) -> str:
             lines.append(f"labels = {as_toml(Path(os.path.relpath(label, folder)).as_posix())}")
     if not files.labels:
         lines.append('# labels = "labels/{name}.png"   # no label files were found: {name} is an image\'s name')
-    return "\n".join([*lines, "", *_value_lines(draft.cube), *_class_lines(draft.classes), ""])
+    return "\n".join([*lines, "", *_value_lines(draft.cube), *_class_lines(draft), ""])
 
 
 def _value_lines(cube: CubeSource) -> Iterator[str]:
@@ -161,15 +167,28 @@ def _value_lines(cube: CubeSource) -> Iterator[str]:
         yield "# pixel_m = 0.05   # side of a pixel on the ground [m], where it is known: gives hectares"
 
 
-def _class_lines(classes: Sequence[FoundClass]) -> Iterator[str]:
-    """Yield the table of classes, and the value that may mean no class."""
-    for one in [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))][:1]:
-        yield f"\n# unlabelled = {as_toml(one.value)}   # if it means no class: remove the #, and its line below"
-    if classes:
+def _class_lines(draft: SceneDraft) -> Iterator[str]:
+    """Yield the table of classes; the label that is assumed to mean none is a comment."""
+    if draft.classes:
         yield "\n[classes]   # name = value in the label files, with its fraction of the labelled pixels"
-    for one in classes:
+    for one in (*draft.classes, *([] if draft.void is None else [draft.void])):
         name = one.name if re.fullmatch(r"[A-Za-z0-9_-]+", one.name) else as_toml(one.name)
-        yield f"{name} = {as_toml(one.value)}   # {one.fraction:.1%}"
+        yield f"{'# ' * (one is draft.void)}{name} = {as_toml(one.value)}   # {one.fraction:.1%}"
+
+
+def _assumed(draft: SceneDraft, before: SceneSettings, path: Path) -> list[str]:
+    """Return a line for each label that may mean no class: what is assumed, and how to change it."""
+    lines = []
+    if before.unlabelled is not None:
+        lines = [f"label {as_toml(before.unlabelled)} means no class, as {path.name} said before"]
+    for one in draft.classes:
+        if one.value in DOUBTFUL:
+            way = f"if it means no class, write unlabelled = {as_toml(one.value)} into {path}, and remove {one.name} there"
+            lines.append(f"label {as_toml(one.value)} ({one.fraction:.1%} of the pixels) is a class; {way}")
+    if (void := draft.void) is not None:
+        way = f"if it is a class, remove unlabelled from {path}, and the # in front of {void.name}"
+        lines.append(f"label {as_toml(void.value)} ({void.fraction:.1%} of the pixels) means no class; {way}")
+    return lines
 
 
 def _missing(draft: SceneDraft) -> Iterator[str]:
@@ -200,10 +219,12 @@ def _show(record: dict[str, Any], console: Console) -> None:
     if record["first"]:
         show_text(f"first: {record['first']}", console)
     show_text(f"{'then' if record['first'] else 'next'}: {record['next']}", console)
+    for line in record["assumed"]:
+        show_text(f"assumed: {line}", console)
 
 
-def draft_scene(address: str | Path, known: SceneSettings = SceneSettings()) -> SceneDraft:  # noqa: B008 - frozen
-    """Inspect the images and labels of a folder, or one file and its labels, by what is ``known`` of the labels.
+def draft_scene(address: str | Path, before: SceneSettings = SceneSettings()) -> SceneDraft:  # noqa: B008 - frozen
+    """Inspect the images and labels of a folder, or one file and its labels, by an earlier scene.toml of them.
 
     The first image is read, of others only the size; all label files are read. Raises SceneError: there is no image, or
     the first one cannot be read; labels may belong to several images, or have mixed values.
@@ -222,30 +243,48 @@ def draft_scene(address: str | Path, known: SceneSettings = SceneSettings()) -> 
             raise SceneError(f"{path} holds no image that is read; {way}")
         first = found.images[0]
     source = with_wavelengths(open_cube(first), first, None)
+    known = SceneSettings(class_attribute=before.class_attribute, unlabelled=before.unlabelled)
     classes, unseen = _classes(found, source.shape[2], known)
-    return SceneDraft(found, source, classes, unseen)
+    void = None if before.unlabelled is not None else _void(classes, before)
+    return SceneDraft(found, source, tuple(one for one in classes if one is not void), void, tuple(unseen))
 
 
-def _classes(
-    found: label_files.MatchedFiles, bands: int, settings: SceneSettings
-) -> tuple[tuple[FoundClass, ...], tuple[str, ...]]:
+def _void(classes: Sequence[FoundClass], before: SceneSettings) -> FoundClass | None:
+    """Return the label that looks like no class: the highest of a type, or 0 between three others or more.
+
+    Classes of a map that is labelled everywhere touch each other; between sparse labels 0 fills the gaps. A name in an
+    earlier scene.toml says that it is a class.
+    """
+    numbers = [one for one in classes if isinstance(one.value, int) and one.value not in before.classes.values()]
+    found = [one for one in numbers if one.value in (255, 65535) and len(classes) > 2]
+    found += [one for one in numbers if one.value == 0 and one.borders >= SPARSE and len(classes) - len(found) > 3]
+    return max(found, key=lambda one: one.fraction, default=None)
+
+
+def _classes(found: label_files.MatchedFiles, bands: int, known: SceneSettings) -> tuple[list[FoundClass], list[str]]:
     """Return all classes of the label files, and notes on files that cannot be used."""
-    counts: Counter[str] = Counter()
+    pixels: Counter[str] = Counter()
+    borders: Counter[str] = Counter()
     used: list[Path] = []
     unseen: list[str] = []
     for image, label in found.labels.items():
         try:
             source = open_cube(image)
-            labels = label_files.read_labels(label, source.shape[:2], source.geobox, settings)
+            labels = label_files.read_labels(label, source.shape[:2], source.geobox, known)
         except PipelineError as error:
             unseen.append(str(error))
             continue
         if source.shape[2] != bands:
             unseen.append(f"{image} has {source.shape[2]} bands, the first image {bands}: use one camera")
         used.append(label)
-        pixels = np.bincount(labels.index[labels.index != UNLABELLED], minlength=len(labels.names))
-        counts.update(dict(zip(labels.names, pixels.tolist(), strict=True)))
-    values = label_files.classes_of_files(used, settings) if used else {}
-    return tuple(FoundClass(name, value, counts[name] / counts.total()) for name, value in values.items()), tuple(
-        unseen
-    )
+        left, right = labels.index[:, :-1], labels.index[:, 1:]
+        between = (left != right) & (left != UNLABELLED) & (right != UNLABELLED)
+        borders[""] += int(np.count_nonzero(between))
+        for number, name in enumerate(labels.names):
+            pixels[name] += int(np.count_nonzero(labels.index == number))
+            borders[name] += int(np.count_nonzero(between & ((left == number) | (right == number))))
+    values = label_files.classes_of_files(used, known) if used else {}
+    total, edges = pixels.total() or 1, borders[""] or 1
+    return [
+        FoundClass(name, value, pixels[name] / total, borders[name] / edges) for name, value in values.items()
+    ], unseen

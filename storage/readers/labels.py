@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -252,6 +252,12 @@ def _index(
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
     colours = any(isinstance(value, tuple) for value in classes.values())
     return f"colour {list(colour_of(code))}" if colours else f"value {code}"
+
+
+def map_values(values: Sequence[ClassValue]) -> tuple[int, ...]:
+    """Return the numbers of classes in maps: the values of the label files, empty unless all are 0 to 254."""
+    numbers = tuple(value for value in values if isinstance(value, int) and 0 <= value < UNLABELLED)
+    return numbers if len(numbers) == len(values) else ()
 
 
 def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour] | None = None) -> NDArray[np.uint8]:

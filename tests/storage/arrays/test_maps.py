@@ -220,7 +220,7 @@ def test_class_map_tiles_equal_the_map_written_at_once(tmp_path: Path) -> None:
     """Tiles of whole shards, in any order, give the same files byte by byte."""
     classes, confidence = _drawn()
     grid = georeference.AngularGrid(1e-4, SHAPE)
-    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours), grid)
+    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND), grid)
     class_maps.create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
     begun = class_maps.load_class_map(tmp_path / "tiles.zarr")
     assert (begun.classes == 255).all()  # unwritten tiles
@@ -244,7 +244,7 @@ def test_write_class_tile_refuses_wrong_input(tmp_path: Path) -> None:
 def test_blank_pixels_clears_only_the_chosen_pixels(tmp_path: Path) -> None:
     """The pixels may lie in any shard; if none is chosen, the files keep their bytes."""
     classes, confidence = _drawn()
-    write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
+    write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND))
     before = _contents(tmp_path / "m.zarr")
     gone = np.zeros(SHAPE, np.bool_)
     layout.blank_pixels(tmp_path / "m.zarr", gone, layout.NO_CLASS)
@@ -262,7 +262,7 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
     colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
-    made = class_maps.ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours)
+    made = class_maps.ClassMap(classes, confidence, class_maps.ClassNames(("bare soil", "crop", "weed"), colours))
     write_class_map(tmp_path / "c.zarr", made)
     found = class_maps.load_class_map(tmp_path / "c.zarr")
     np.testing.assert_array_equal(found.classes, classes)
