@@ -95,13 +95,15 @@ def load_labels(
     none = None if unlabelled is None else _code(unlabelled)
     stated = dict(classes) or found_codes(codes, none, read.of_colours, str(address))
     negative = (codes < 0) & (codes != NO_VALUE) & ~np.isin(codes, [none or 0, *map(_code, stated.values())])
-    note = (f"{negative.sum()} px of labels {address} have negative values: unlabelled",) if negative.any() else ()
+    notes = [f"{negative.sum()} px of labels {address} have negative values: unlabelled"] if negative.any() else []
+    if not (by_colour or read.of_colours or map_values(tuple(stated.values()))) and stated:
+        notes.append("maps number the classes from 0, as a label is not 0 to 254")
     return Labels(
         index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address), of_colours=read.of_colours),
         names=tuple(stated),
         values=tuple(stated.values()),
         colours=class_colours(stated, colours),
-        notes=(*read.notes, *note),
+        notes=(*read.notes, *notes),
         regridded=read.regridded,
     )
 

@@ -145,6 +145,8 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(address, layer=found))
     if head.startswith(SHAPEFILE_MAGIC) and path.suffix.lower() == ".shp":
         _check_within(path, [path.with_suffix(end) for part in SHAPEFILE_PARTS for end in (part, part.upper())])
+        if "!" in str(path.absolute()):
+            raise ValueError('a "!" in its path stands for an archive; rename that folder')
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(path.absolute()))
     if not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         raise ValueError("its content is none of GeoJSON, GeoPackage and shapefile")

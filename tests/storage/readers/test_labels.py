@@ -93,6 +93,14 @@ def test_maps_have_label_values_where_a_byte_holds_all(values: Any, numbers: tup
     assert map_values(values) == numbers
 
 
+def test_a_note_says_where_maps_cannot_have_the_labels_values(tmp_path: Path) -> None:
+    """A label above 254 does not fit the byte of a map."""
+    np.save(tmp_path / "a.npy", np.array([[1, 300]]))
+    found = load_labels(tmp_path / "a.npy", (1, 2), classes={})
+    assert found.values == (1, 300)
+    assert found.notes == ("maps number the classes from 0, as a label is not 0 to 254",)
+
+
 def test_class_colours_are_distinct() -> None:
     """Stated colours and those of the file win; others get the default colours that are free, in their order."""
     colours = class_colours({str(number): number for number in range(8)})
@@ -111,7 +119,7 @@ def test_negative_values_are_unlabelled_unless_stated(tmp_path: Path, classes: d
     np.save(tmp_path / "a.npy", np.array([[-1.0, 5.0], [np.nan, 1.0]]))
     found = load_labels(tmp_path / "a.npy", (2, 2), classes=classes)
     assert (found.index == 255).tolist() == [["lost" not in classes, False], [True, False]]
-    assert len(found.notes) == ("lost" not in classes)
+    assert any("negative" in note for note in found.notes) == ("lost" not in classes)
 
 
 @pytest.mark.parametrize(
