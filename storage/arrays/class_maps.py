@@ -48,6 +48,15 @@ class ClassNames:
         return self.values or tuple(range(len(self.names)))
 
     @property
+    def titles(self) -> tuple[str, ...]:
+        """Return the names for legends, with the number of the label files if the name lacks it."""
+        pairs = zip(self.names, self.values or self.names, strict=True)
+        return tuple(
+            name if f"{number}" in (name, name.removeprefix("class_")) else f"{name} ({number})"
+            for name, number in pairs
+        )
+
+    @property
     def attributes(self) -> dict[str, Any]:
         """Return the attributes of a store, as `legend_of` reads them."""
         plain = {"class_names": list(self.names), "class_colours": np.asarray(self.colours).tolist()}

@@ -241,6 +241,13 @@ def test_write_class_tile_refuses_wrong_input(tmp_path: Path) -> None:
         class_maps.write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
 
 
+def test_legends_have_the_numbers_of_the_label_files() -> None:
+    """A name that has its number already, and maps that count from 0, need none."""
+    legend = class_maps.ClassNames(("weed", "class_9"), LEGEND.colours, (4, 9))
+    assert legend.titles == ("weed (4)", "class_9")
+    assert LEGEND.titles == LEGEND.names
+
+
 def test_blank_pixels_clears_only_the_chosen_pixels(tmp_path: Path) -> None:
     """The pixels may lie in any shard; if none is chosen, the files keep their bytes."""
     classes, confidence = _drawn()
