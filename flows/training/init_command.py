@@ -25,7 +25,7 @@ from spectralzoom.pipeline.errors import PipelineError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.readers import label_files
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.open_cubes import open_cube, split_variable
+from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 from spectralzoom.storage.whole_files import write_whole
 
@@ -208,7 +208,7 @@ def draft_scene(address: str | Path, before: SceneSettings = SceneSettings()) ->
     """
     path, _ = split_variable(address)
     found = label_files.find_files(path)
-    source = open_cube(address if found.images == (path,) else found.images[0])
+    source = open_cube_source(address if found.images == (path,) else found.images[0])
     known = SceneSettings(class_attribute=before.class_attribute, unlabelled=before.unlabelled)
     classes, unseen = _classes(found, source.shape[2], known)
     void = None if before.unlabelled is not None else _void(classes, before)
@@ -233,7 +233,7 @@ def _classes(found: label_files.MatchedFiles, bands: int, known: SceneSettings) 
     unseen: list[str] = []
     for image, label in found.labels.items():
         try:
-            source = open_cube(image)
+            source = open_cube_source(image)
             labels = label_files.read_labels(label, source.shape[:2], source.geobox, known)
         except PipelineError as error:
             unseen.append(str(error))

@@ -33,7 +33,8 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.image_files import bad_bands, rescaled
+from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
@@ -191,6 +192,8 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
+    if any("map info" in cube.header.fields for cube in opened.values()):
+        notes.append("the map info of its parts is not read: lines of a folder are on no map; name one file")
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
     listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
@@ -236,6 +239,9 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
+        for begin, part in parts.items():
+            if begin <= start < stop <= begin + len(part.values):
+                return part.values[start - begin : stop - begin].astype(native, order="C")
         block = np.zeros((stop - start, samples, count), native)
         for begin, part in parts.items():
             low, high = max(start, begin), min(stop, begin + len(part.values))
