@@ -20,6 +20,7 @@ from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_toml import ClassValue, Colour
 
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
+TURNED = "orientation tag"  # in a note of the reader of pictures
 MOST_LABEL = 2**53  # floats hold larger numbers with gaps
 MOST_FOUND_CLASSES = 64
 MIXED = (
@@ -82,10 +83,11 @@ def load_labels(
     read = load_codes(address, geobox, classes=classes.values())
     codes = read.values
     if codes.shape != shape:
-        turned = "; its sides are exchanged: turn it, or apply the orientation tag (Exif) of the picture that has one"
+        why = "; its sides are exchanged: turn the labels or the picture" * (codes.shape == shape[::-1])
+        why += "".join(f"; {note}" for note in read.notes if TURNED in note)
         raise SceneError(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
-            f"(y x x){turned * (codes.shape == shape[::-1])}; give labels on the scene's own pixels"
+            f"(y x x){why}; give labels on the scene's own pixels"
         )
     if by_colour and not read.of_colours:
         raise SceneError(
@@ -138,7 +140,7 @@ def load_codes(
     """
     source = open_cube_source(address, labels=True)
     codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address)
-    notes: list[str] = []
+    notes = [f"labels {address}: {note}" for note in source.notes if TURNED in note]
     if source.nodata is not None and source.nodata.is_integer():
         void = codes == int(source.nodata) * (0x010101 if of_colours else 1)
         if void.any() and codes[void][0] not in map(_code, classes):

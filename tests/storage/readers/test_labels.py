@@ -125,7 +125,10 @@ def test_negative_values_are_unlabelled_unless_stated(tmp_path: Path, classes: d
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        (np.zeros((3, 2)), "are 3 x 2 px, the scene is 2 x 3 px .*its sides are exchanged: turn it"),
+        (
+            np.zeros((3, 2)),
+            "are 3 x 2 px, the scene is 2 x 3 px .*its sides are exchanged: turn the labels or the picture",
+        ),
         (np.zeros((3, 3)), r"are 3 x 3 px, the scene is 2 x 3 px \(y x x\); give labels"),
         (np.full((2, 3), np.inf), "huge numbers"),
         (np.full((2, 3), 1e20), "huge numbers"),
@@ -136,6 +139,17 @@ def test_labels_that_do_not_fit_are_refused(tmp_path: Path, values: Any, words: 
     np.save(tmp_path / "a.npy", values)
     with pytest.raises(SceneError, match=words):
         load_labels(tmp_path / "a.npy", (2, 3), classes={})
+
+
+def test_the_orientation_tag_of_labels_is_named(tmp_path: Path) -> None:
+    """Labels are turned as pictures are: a note says so, and the refusal of their size."""
+    (exif := Image.Exif())[274] = 6
+    Image.fromarray(np.array([[1, 2, 3], [1, 2, 3]], np.uint8)).save(tmp_path / "a.png", exif=exif)
+    found = load_labels(tmp_path / "a.png", (3, 2), classes={})
+    assert found.index.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert "its orientation tag 6" in found.notes[0]
+    with pytest.raises(SceneError, match="sides are exchanged.*orientation tag 6"):
+        load_labels(tmp_path / "a.png", (2, 3), classes={})
 
 
 @pytest.mark.parametrize(
