@@ -25,6 +25,7 @@ from shapely.geometry.base import BaseGeometry
 from spectralzoom.pipeline.errors import PipelineError, SceneError, ZoneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture
+from spectralzoom.pipeline.ground.georeference import WGS84
 from spectralzoom.pipeline.ground.zones import on_field
 from spectralzoom.storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
@@ -39,7 +40,8 @@ SHAPEFILE_MAGIC, SQLITE_MAGIC = b"\0\0\x27\x0a", b"SQLite format 3\0"
 GEOPACKAGE_ID = b"GP"  # at byte 68
 VIRTUAL = re.compile(r"(?:\s|/\*.*?\*/|--.*?\n)*create(?:\s|/\*.*?\*/|--.*?\n)+virtual\b", re.IGNORECASE | re.DOTALL)
 INDEX = re.compile(r'create virtual table (?:"[^"]+"|\w+) using (?:rtree|fts)\w*\s*\(', re.IGNORECASE)
-OF_LIBRARIES = (sqlite3.Error, pyproj.exceptions.CRSError, shapely.errors.GEOSException)
+OF_LIBRARIES = (sqlite3.Error, pyproj.exceptions.ProjError, shapely.errors.GEOSException)
+GRID_FILE = re.compile(r'(?:PARAMETERFILE\["[^"]*","|grids=|file=)([^" ]*[/\\:][^" ]*)')  # beyond PROJ's own folder
 MOST_DEG, MOST_M = (720.0, 90.1), (1e9, 1e9)  # of x and y
 USUAL_NAMES = ("name", "plot", "plot_name", "plot_id", "plotid", "id", "label")
 _OF_CROPS = ("crop", "crop_type", "species", "category", "land_cover", "landcover", "type", "code", "name")
@@ -114,10 +116,14 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
 
 
 def _check_coordinates(table: geopandas.GeoDataFrame) -> None:
-    """Raise ValueError for a CRS that is no map's, and for places that are none in it."""
+    """Raise ValueError for a CRS that is no map's or names a file, and for places that are none in it."""
     crs = table.crs
     if crs is not None and not (crs.is_geographic or crs.is_projected):
         raise ValueError(f"its CRS {crs.name} is neither geographic nor projected")
+    if crs is not None and (named := GRID_FILE.search(crs.to_wkt())):
+        raise ValueError(f"its CRS {crs.name} names the grid file {named[1]}; give one of EPSG")
+    if crs is not None:
+        pyproj.Transformer.from_crs(crs, WGS84)  # fails where PROJ lacks a grid
     degrees = crs is not None and crs.is_geographic
     places = shapely.get_coordinates(table.geometry)
     wrong = ~(np.abs(places) <= (MOST_DEG if degrees else MOST_M)).all(axis=1)

@@ -148,7 +148,7 @@ def test_the_orientation_tag_of_labels_is_named(tmp_path: Path) -> None:
     found = load_labels(tmp_path / "a.png", (3, 2), classes={})
     assert found.index.tolist() == [[0, 0], [1, 1], [2, 2]]
     assert "its orientation tag 6" in found.notes[0]
-    with pytest.raises(SceneError, match="sides are exchanged.*orientation tag 6"):
+    with pytest.raises(SceneError, match=r"sides are exchanged.*orientation tag 6"):
         load_labels(tmp_path / "a.png", (2, 3), classes={})
 
 

@@ -150,6 +150,19 @@ def test_a_table_without_shapes_is_no_layer(tmp_path: Path) -> None:
     assert list(read_zones(path).shapes) == ["1"]
 
 
+@pytest.mark.parametrize("grid", ["/data/a.gsb", "http://127.0.0.1:9/a.gsb", "../a.gsb"])
+def test_a_crs_names_no_file(grid: str, tmp_path: Path) -> None:
+    """The .prj file of a shapefile may name grids of PROJ alone."""
+    path = written(tmp_path / "z.shp", [SQUARE], crs=f"+proj=utm +zone=32 +ellps=bessel +nadgrids={grid}")
+    with pytest.raises(ZoneError, match=f"names the grid file {grid}; give one of EPSG"):
+        read_zones(path)
+    path = written(tmp_path / "y.shp", [SQUARE], crs="+proj=utm +zone=32 +ellps=bessel +nadgrids=none.gsb")
+    with pytest.raises(ZoneError, match="cannot read"):
+        read_zones(path)
+    path = written(tmp_path / "x.shp", [SQUARE], crs="+proj=utm +zone=32 +ellps=bessel +nadgrids=@null")
+    assert len(read_zones(path).shapes) == 1
+
+
 @pytest.mark.parametrize("part", [".dbf", ".shx", ".prj", ".cpg"])
 def test_parts_of_a_shapefile_lie_in_its_folder(part: str, tmp_path: Path) -> None:
     """A link out of the folder is refused, and one within is followed."""
