@@ -294,7 +294,9 @@ def _labelled(
             f"labels {address} lack {wanted}; they have {', '.join(fields) or 'no attribute'}; write"
             f' class_attribute = "..." into a {SETTINGS_NAME} beside the scene'
         )
-    return table, found, [word_of(value) for value in table[found]], notes
+    words = [word_of(value) for value in table[found]]
+    plain = [str(int(word)) if word.isdecimal() and word not in settings.classes else word for word in words]
+    return table, found, plain, notes
 
 
 def _word_of_none(settings: SceneSettings) -> str:
