@@ -174,13 +174,7 @@ def _assumed(draft: SceneDraft, before: SceneSettings) -> Iterator[str]:
 
 def _missing(draft: SceneDraft) -> Iterator[str]:
     """Yield the missing or inconsistent properties."""
-    found = draft.files
-    if not found.labels:
-        yield "label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png"
-    elif found.bare:
-        yield f"labels of {counted(len(found.bare), 'image')}, left out: {label_files.listed_names(found.bare)}"
-    if found.alone:
-        yield f"the image of {counted(len(found.alone), 'label file')}: {label_files.listed_names(found.alone)}"
+    yield from draft.files.lacking
     if draft.cube.bands.wavelength_nm is None:
         yield f"the wavelengths of {draft.cube.shape[2]} bands"
     if len(draft.classes) == 1:

@@ -49,9 +49,13 @@ class MatchedFiles:
     alone: tuple[Path, ...]  # label files without an image
 
     @property
-    def bare(self) -> tuple[Path, ...]:
-        """Return the images without labels."""
-        return tuple(image for image in self.images if image not in self.labels)
+    def lacking(self) -> tuple[str, ...]:
+        """Return a line on each kind of file without a partner."""
+        bare = [image for image in self.images if image not in self.labels] if self.labels else []
+        none = "label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png"
+        left_out = f"labels of {len(bare)} image{'s' * (len(bare) > 1)}, left out: {listed_names(bare)}"
+        lone = f"the image of {len(self.alone)} label file{'s' * (len(self.alone) > 1)}: {listed_names(self.alone)}"
+        return tuple(line for line, there in ((none, not self.labels), (left_out, bare), (lone, self.alone)) if there)
 
 
 def read_labels(address: str | Path, shape: tuple[int, int], geobox: GeoBox | None, settings: SceneSettings) -> Labels:
