@@ -77,7 +77,9 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     read.
     """
     if not paths:
-        raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
+        raise SettingsError(
+            "give --weights FILE, the weights to judge; train some with: spectralzoom train DATASET -o FILE"
+        )
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
