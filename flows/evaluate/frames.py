@@ -78,7 +78,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """
     if not paths:
         raise SettingsError(
-            "give --weights FILE, the weights to judge; train some with: spectralzoom train DATASET -o FILE"
+            "give --weights FILE, the weights to judge; spectralzoom train DATASET -o FILE makes them"
         )
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
