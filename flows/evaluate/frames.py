@@ -77,9 +77,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     read.
     """
     if not paths:
-        raise SettingsError(
-            "give --weights FILE, the weights to judge; spectralzoom train DATASET -o FILE makes them"
-        )
+        raise SettingsError("give --weights FILE, the weights to judge; spectralzoom train DATASET -o FILE makes them")
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
