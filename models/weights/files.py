@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from spectralzoom.models.network.temporal_reader import TemporalReader
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/6"
+FORMAT = "spectralzoom-weights/7"
 ENCODER = "spectralzoom-encoder/1"
 COLOURS = "class_colours"
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
@@ -95,6 +95,11 @@ class Description:
     map_scores: MapScores | None = None  # None without validation scenes, and for a single exposure
     reader: ReaderPart | None = None
     about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # complete, with hashes
+
+    @property
+    def untaught(self) -> tuple[str, ...]:
+        """Return the names of the classes without a training pixel, which are never drawn."""
+        return tuple(self.class_names[number] for number in self.config.untaught)
 
 
 @dataclass(frozen=True)

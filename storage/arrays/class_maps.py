@@ -2,8 +2,8 @@
 
 Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture.
 Log-probabilities are packed by CF's rules into one byte of 0.05 nat; all classes less likely than 1 in 1100 have the
-same value. Ages and light are floats: each visit starts from those of the one before, and rounding would add up.
-Confidence is stored as floats in steps of 1/256.
+same value, and a class that is never drawn has the least one. Ages and light are floats: each visit starts from those
+of the one before, and rounding would add up. Confidence is stored as floats in steps of 1/256.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "vali
 CONFIDENCE_STEP = 1 / 256
 STEP = 0.05  # nats
 FAINTEST = -12.7  # nats
-NOTHING = 255  # unknown; 254 is certainty
+NOTHING, NEVER = 255, 0  # unknown, and of a class that is never drawn; 254 is certainty
 LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in a tenth of the bytes
 # values of the images in unknown pixels
 NOT_BELIEVED = {"log_probability": NOTHING, "age": np.nan, "light": 0}
@@ -201,12 +201,16 @@ def old_class_flags(legend: ClassNames) -> dict[str, Any]:
 
 
 def packed_probabilities(log_probability: Floats) -> NDArray[np.uint8]:
-    """Return (y, x, class) log-probabilities in stored bytes; NaN is unknown, values below `LEAST` are `UNLIKELY`."""
+    """Return (y, x, class) log-probabilities in stored bytes.
+
+    NaN is unknown, minus infinity is `NEVER`, other values below `LEAST` are `UNLIKELY`.
+    """
     packed = np.empty(log_probability.shape, np.uint8)
     for rows in cuts(len(packed), layout.SHARD_ROWS):  # so that temporary floats are few
         part = log_probability[rows]
         steps = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
         packed[rows] = np.where(np.isnan(part), NOTHING, np.minimum(steps, NOTHING - 1))
+        packed[rows][np.isneginf(part)] = NEVER
     return packed
 
 
@@ -251,10 +255,12 @@ class ProbabilityStore:
     def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
         """Return log-probabilities (y, x, class), ages in days (y, x) and light (y, x).
 
-        The exponentials of the log-probabilities sum to 1. Unknown pixels are NaN; without light, light is 0.
+        The exponentials of the log-probabilities sum to 1; a class that is never drawn has minus infinity. Unknown
+        pixels are NaN; without light, light is 0.
         """
         packed = layout.read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
+        values[packed == NEVER] = -np.inf
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
         age, light = (layout.read_array(self._group, name, np.s_[rows, columns]) for name in ("age", "light"))
