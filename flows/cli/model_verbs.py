@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,9 @@ from spectralzoom.flows.evaluate.command import run_evaluate
 from spectralzoom.flows.settings.flags import AsJson, OutFile
 from spectralzoom.flows.settings.model_flags import NO_EVALUATE_FLAGS, NO_TRAIN_FLAGS, EvaluateFlags, TrainFlags
 from spectralzoom.flows.terminal.progress import print_json, stderr
-from spectralzoom.flows.training.train import check_counts, run_train
+from spectralzoom.flows.training.train import run_train
 from spectralzoom.flows.training.train_scenes import TrainRequest
-from spectralzoom.flows.training.train_temporal import LANDS, TemporalRequest, run_remember
-from spectralzoom.models.training.temporal import TemporalTraining
-from spectralzoom.pipeline.errors import SettingsError
-
-OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed")  # flags of --train-temporal
+from spectralzoom.flows.training.train_temporal import run_remember
 
 
 def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_json: AsJson = False) -> int:
@@ -50,17 +45,8 @@ def _command() -> str:
 
 def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, console: Console) -> dict[str, Any]:
     """Train weights, or only the temporal reader of given ones; return the record."""
-    request = TrainRequest(dataset, out, flags, command)
-    if flags.train_temporal is None:
-        return run_train(request, console)
-    check_counts(flags)
-    for one in fields(flags):
-        if one.name not in OF_TEMPORAL and getattr(flags, one.name) != one.default:
-            raise SettingsError(f"--{one.name.replace('_', '-')} is not for --train-temporal; leave it out")
-    how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
-    lands = LANDS if flags.scenes is None else flags.scenes
-    reader = TemporalRequest(dataset, flags.train_temporal, out, lands, settings=how, command=command)
-    return run_remember(reader, console)
+    run = run_train if flags.train_temporal is None else run_remember
+    return run(TrainRequest(dataset, out, flags, command), console)
 
 
 def evaluate(dataset: str, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json: AsJson = False) -> int:
@@ -71,7 +57,5 @@ def evaluate(dataset: str, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json:
     dataset
         `farm`, `scouting`, a folder of labelled scenes, or one scene file.
     """
-    if not flags.weights:
-        raise SettingsError(f"evaluate {dataset}: give --weights FILE, the weights to judge on this data set")
     run_evaluate(dataset, flags, stderr, as_json=as_json)
     return 0

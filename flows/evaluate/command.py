@@ -105,8 +105,8 @@ def _judge_frames(
             show("judging frames", (number + at / len(judges)) / len(frames), f"{name}, {one.path.name}")
             if index not in loaded:
                 loaded[index] = load_weights(one.path).on(device)
-            observed = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
-            runs[index][name] = judge_frame(observed, loaded[index], flags.parts, flags.seed)
+            frame = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
+            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], flags.parts, flags.seed)
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 

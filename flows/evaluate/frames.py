@@ -24,7 +24,6 @@ from spectralzoom.flows.training.data import (
     open_training_data,
     untaught_note,
 )
-from spectralzoom.models.network.spectral import patches_of
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
@@ -71,16 +70,6 @@ class Candidate:
         return scene.clear_key in self.split.get("validation", {}).values()
 
 
-@dataclass(frozen=True)
-class ObservedFrame:
-    """One frame in the spectral features of some weights, with their coarse prediction."""
-
-    seen: CoarsePrediction
-    fine: NDArray[np.float32]  # (patch, p, p, column) normalised, every patch of the padded grid
-    labels: NDArray[np.uint8]  # (y, x) in the weights' classes
-    bands: int
-
-
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """Read the descriptions of the weights.
 
@@ -88,7 +77,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     read.
     """
     if not paths:
-        raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
+        raise SettingsError("give --weights FILE, the weights to judge; spectralzoom train DATASET -o FILE makes them")
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
@@ -121,8 +110,13 @@ def open_frames(
     return replace(data, train=names, validation=(), held_out=())
 
 
-def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ObservedFrame:
-    """Image a frame by the camera of the training; the noise depends on the seed and the frame's name."""
+def observe_frame(
+    scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int
+) -> tuple[CoarsePrediction, NDArray[np.uint8]]:
+    """Image a frame by the camera of the training; return its coarse prediction and labels in the weights' classes.
+
+    The noise depends on the seed and the frame's name.
+    """
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
@@ -130,9 +124,7 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     example = normalised(observe_scene(scene, camera, grid, weights.basis, rng), weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
-    seen = coarse_prediction_of_columns(weights, example.columns, grid)
-    fine = patches_of(example.columns, config.patch).astype(np.float32)
-    return ObservedFrame(seen, fine, labels, len(scene.wavelength_nm))
+    return coarse_prediction_of_columns(weights, example.columns, grid), labels
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
     CASCADE,
+    CLASS_VALUES,
     TRAINED_ON,
     TrainedOn,
     Weights,
@@ -93,6 +94,7 @@ def train_weights(
     about = {
         "command": request.command,
         "data": data.law,
+        **({CLASS_VALUES: list(scenes.common.values)} if scenes.common.values else {}),
         TRAINED_ON: asdict(_trained_on(data, scenes, settings.darkest_ms)),
         "split": scenes.split | {"held_out": list(data.held_out)},
         "settings": asdict(settings),

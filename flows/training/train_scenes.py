@@ -49,6 +49,7 @@ class Common:
     colours: NDArray[np.uint8]
     patch: int
     wavelength_nm: NDArray[np.float64]
+    values: tuple[int, ...] = ()  # numbers of the classes in the label files, where maps can have them
 
     def check(self, scene: RasterScene) -> None:
         """Raise SceneError where a scene has other classes or bands."""
@@ -156,7 +157,7 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
     built_in = bool(built_in_laws(request.dataset))
     basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[built_in])
     patch = request.flags.patch or suggested_patch(scene.shape, built_in=built_in)
-    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
+    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
     network_config(request.flags, common)  # raises for invalid sizes before the first scene is imaged
     return common
 

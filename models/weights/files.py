@@ -35,6 +35,7 @@ COLOURS = "class_colours"
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
 CALIBRATION = "calibration"  # of a record: calibration error and temperature
 READER = "memory"  # entry in the description, prefix of tensor names
+CLASS_VALUES = "class_values"  # of a record
 TRAINED_ON = "trained_on"  # entry in a record
 MAP_SCORES = "map_scores"  # entry in the description: corrections of expected scores
 MOST_WIDTH = 1024
@@ -116,6 +117,11 @@ class Weights:
     def config(self) -> SegmenterConfig:
         """Return the sizes of the network."""
         return self.segmenter.config
+
+    @property
+    def class_values(self) -> tuple[int, ...]:
+        """Return the number of each class in the label files of the training, by the record; empty if unknown."""
+        return tuple(self.record.get(CLASS_VALUES) or ())
 
     @property
     def temperature(self) -> float:

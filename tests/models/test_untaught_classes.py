@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,16 +29,8 @@ from spectralzoom.models.reading.prior_map import (
 )
 from spectralzoom.models.training.examples import Example
 from spectralzoom.models.training.objective import map_loss, pixel_losses
-from spectralzoom.models.training.train import (
-    LabelledPixels,
-    TrainingSettings,
-    continued,
-    halfway,
-    linear_classifier,
-    train,
-    with_linear,
-)
-from spectralzoom.models.weights.files import Weights, load_weights, save_weights, with_record
+from spectralzoom.models.training.train import LabelledPixels, continued, halfway, linear_classifier, with_linear
+from spectralzoom.models.weights.files import Weights, with_record
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.storage.arrays.class_maps import (
     ClassNames,
@@ -48,7 +39,7 @@ from spectralzoom.storage.arrays.class_maps import (
     packed_probabilities,
     write_probabilities_tile,
 )
-from tests.models.conftest import block_example, make_network, make_weights, scene_columns
+from tests.models.conftest import make_network, make_weights, scene_columns
 
 CLASSES = 4
 NEVER = st.sets(st.integers(0, CLASSES - 1), min_size=1, max_size=CLASSES - 1).map(sorted).map(tuple)
@@ -170,17 +161,6 @@ def test_temperature_ignores_labels_of_untaught_classes() -> None:
     assert 0 < judge_confidence([more], 0)["expected_error"] < 1
 
 
-def test_untaught_classes_learn_nothing_and_disturb_nothing() -> None:
-    """Training keeps finite weights, and draws the taught classes of two separable ones."""
-    scene = block_example()
-    scene = replace(scene, labels=2 * scene.labels)  # classes 0 and 2 of 4
-    config = SegmenterConfig(CLASSES, 2, patch=8, width=4, dim=16, layers=1, heads=2)
-    model, summary = train(config, [scene], np.zeros(2, np.float32), TrainingSettings(steps=3, batch=2, crop=16))
-    assert (summary["skipped_steps"], model.config.untaught) == (0, (1, 3))
-    assert all(torch.isfinite(one).all() for one in model.parameters())
-    assert not model.full_classes.weight[[1, 3]].any()
-
-
 def test_crops_without_a_label_have_no_loss_of_untaught_classes() -> None:
     """Minus infinity times 0 would be NaN."""
     labels, logits = torch.full((1, 8, 8), 255), torch.randn(1, 3, 8, 8).requires_grad_()
@@ -209,13 +189,6 @@ def test_a_class_of_one_pixel_among_many_is_taught() -> None:
     pixels = LabelledPixels.drawn([example], np.random.default_rng(1))
     assert {*np.unique(pixels.labels)} == {0, 1, 2}
     assert linear_classifier(pixels, 3)["spectral.weight"][2].any()
-
-
-def test_weights_keep_which_classes_were_taught(tmp_path: Path) -> None:
-    """The file has them."""
-    path = tmp_path / "w.safetensors"
-    save_weights(make_weights(untaught=(1,)), path)
-    assert load_weights(path).config.untaught == (1,)
 
 
 @pytest.mark.parametrize("untaught", [(3,), (-1,), (0, 1, 2)])

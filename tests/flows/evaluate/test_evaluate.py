@@ -160,8 +160,8 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     row = run_evaluate(str(data), flags, Console(stderr=True))["rows"][0]
     assert kept == [True]
     loaded = load_weights(weights[0])
-    scan_pass = observe_frame(scene_at(data), "001", loaded, LineCamera(), 0)
-    (counts,) = judge_frame(scan_pass, loaded, (), 0)[NONE].counts
+    frame = observe_frame(scene_at(data), "001", loaded, LineCamera(), 0)
+    (counts,) = judge_frame(*frame, 3, loaded, (), 0)[NONE].counts
     assert row["pixel_accuracy"] == overall_accuracy(counts)
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
