@@ -27,7 +27,7 @@ from spectralzoom.flows.training.data import (
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
-from spectralzoom.models.weights.files import Description, Weights, describe_weights
+from spectralzoom.models.weights.files import CAPTURED, Description, Weights, describe_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -113,7 +113,7 @@ def open_frames(
 def observe_frame(
     scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int
 ) -> tuple[CoarsePrediction, NDArray[np.uint8]]:
-    """Image a frame by the camera of the training; return its coarse prediction and labels in the weights' classes.
+    """Image a frame as those of the training; return its coarse prediction and labels in the weights' classes.
 
     The noise depends on the seed and the frame's name.
     """
@@ -121,7 +121,9 @@ def observe_frame(
     grid = SceneGrid(*scene.shape, config.patch)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
     _, reached = weights.basis.matrix(scene.wavelength_nm)
-    example = normalised(observe_scene(scene, camera, grid, weights.basis, rng), weights.normalisation, reached)
+    captured = bool(weights.record.get(CAPTURED, True))
+    seen = observe_scene(scene, camera, grid, weights.basis, rng, captured=captured)
+    example = normalised(seen, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
     return coarse_prediction_of_columns(weights, example.columns, grid), labels

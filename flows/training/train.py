@@ -42,6 +42,7 @@ from spectralzoom.models.training.train import LabelledPixels, continued, halfwa
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
+    CAPTURED,
     CASCADE,
     CLASS_VALUES,
     TRAINED_ON,
@@ -89,8 +90,7 @@ def train_weights(
         check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    simulated = settings.darkest_ms < REFERENCE_MS
-    augmentation = CaptureAugmentation(normalisation, min_exposure_ms=settings.darkest_ms) if simulated else None
+    augmentation = CaptureAugmentation(normalisation, min_exposure_ms=settings.darkest_ms) if request.captured else None
     about = {
         "command": request.command,
         "data": data.law,
@@ -99,6 +99,7 @@ def train_weights(
         "split": scenes.split | {"held_out": list(data.held_out)},
         "settings": asdict(settings),
         "camera": asdict(CAMERA),
+        CAPTURED: request.captured,
         "device": device,
         **({} if begun is None else {"started_from": begun.record.get("command", "")}),
     }
@@ -314,10 +315,17 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     show_text(f"weights: {request.out} ({size_mb:.1f} MB), {record['training']['steps']} steps", console)
     if "candidates" in record:
         rows = [
-            [one["name"], f"{one['miou']:.1%}", f"{one['accuracy']:.1%}", f"{one['weight']:.2f}" if one["weight"] else "", f"{one['seconds']:.1f}"]
+            [
+                one["name"],
+                f"{one['miou']:.1%}",
+                f"{one['accuracy']:.1%}",
+                f"{one['weight']:.2f}",
+                f"{one['seconds']:.1f}",
+            ]
             for one in record["candidates"]
         ]
-        console.print(table(("classifier", "mIoU", "overall", "weight", "seconds"), rows, title="By cross-validation", left=1))
+        columns = ("classifier", "mIoU", "overall", "weight", "seconds")
+        console.print(table(columns, rows, title="By cross-validation"))
         show_text("cross-validation on these scenes is no forecast for other ground", console)
     if "corrections" in record:
         shown = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in record["corrections"].items())

@@ -15,6 +15,7 @@ from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, alike_note, filled, trained_pixels
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
+from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
 from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
 from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -24,7 +25,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
 COLUMNS = 24  # spectral features of built-in scenes
-LEAST_COLUMNS, MOST_COLUMNS = 48, 256  # of files: one a band, if the memory has room
+COLUMNS_OF_FILES = 48, 256  # least and most of files: one a band, if the memory has room
 COLUMN_BYTES = 1 << 30  # of all scenes
 CAMERA = LineCamera()
 UNFIT = "{validation scenes} left out, without a labelled pixel or with the image of a training scene: {names}"
@@ -38,6 +39,11 @@ class TrainRequest:
     out: Path
     flags: TrainFlags = NO_TRAIN_FLAGS
     command: str = ""
+
+    @property
+    def captured(self) -> bool:
+        """Whether scenes of files are captured by the simulated camera, in shorter exposures too."""
+        return self.flags.min_exposure_ms < REFERENCE_MS
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,7 @@ def _imaged(
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
     for number, name, scene in notes.scenes(data, names, what, report):
         mask = trained_pixels(scene)  # raises for a scene without labels
-        common = common or _common(request, scene)
+        common = common or _common(request, scene, len(names))
         common.check(scene)
         if trained is not None and (scene.key in trained.keys.values() or not mask.any()):
             notes[UNFIT].append(name)
@@ -142,20 +148,25 @@ def _imaged(
         notes.add(name, scene)
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.flags.seed, stream, number])
-        found.examples.append(observe_scene(scene, CAMERA, grid, common.basis, rng))
+        found.examples.append(observe_scene(scene, CAMERA, grid, common.basis, rng, captured=request.captured))
     for note in notes.texts:
         tell(note)
     return common, found
 
 
-def _common(request: TrainRequest, scene: RasterScene) -> Common:
+def _common(request: TrainRequest, scene: RasterScene, scenes: int) -> Common:
     if not scene.class_names:
         raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
     if len(scene.class_names) < 2:
         note = filled(alike_note(scene.class_names[0]), [scene.name])
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     built_in = bool(built_in_laws(request.dataset))
-    basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[built_in])
+    most = (
+        COLUMNS
+        if built_in
+        else int(np.clip(COLUMN_BYTES / (2 * scenes * scene.planes[..., 0].size), *COLUMNS_OF_FILES))
+    )
+    basis = SpectralBasis.spanning(scene.wavelength_nm, most)
     patch = request.flags.patch or suggested_patch(scene.shape, built_in=built_in)
     common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
     network_config(request.flags, common)  # raises for invalid sizes before the first scene is imaged

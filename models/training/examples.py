@@ -78,11 +78,34 @@ def untaught_classes(examples: Sequence[Example], classes: int) -> tuple[int, ..
 
 
 def observe_scene(
-    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
+    scene: RasterScene,
+    camera: LineCamera,
+    grid: SceneGrid,
+    basis: SpectralBasis,
+    rng: np.random.Generator,
+    *,
+    captured: bool = True,
 ) -> Example:
-    """Image a labelled scene on the basis, with noise by ``rng``. Raises SceneError: a gap."""
-    built_in = scene.key.partition("/")[0] in LAWS
-    return (observe_farm if built_in else observe)(scene, camera, grid, basis, rng)
+    """Image a labelled scene on the basis, with noise by ``rng``; a file that is not ``captured`` stays as it is.
+
+    Raises SceneError: a gap.
+    """
+    if scene.key.partition("/")[0] in LAWS:
+        return observe_farm(scene, camera, grid, basis, rng)
+    return observe(scene, camera, grid, basis, rng) if captured else as_it_is(scene, camera, grid, basis)
+
+
+def as_it_is(scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis) -> Example:
+    """Project the pixels of a file onto the basis, as a survey of a raster does."""
+    matrix, _ = basis.matrix(scene.wavelength_nm)
+    scale = (scene.white_reference / scene.white_reference_electrons).astype(np.float32)
+    per_exposure = np.float32(DEFAULT_EXPOSURE_MS / camera.exposure_ms)
+    columns = np.empty((*scene.shape, basis.columns), np.float32)
+    for top in range(0, scene.shape[0], STRIP_ROWS):
+        values = electrons_of(scene, scene.planes[top : top + STRIP_ROWS], camera) * (scale * per_exposure)
+        columns[top : top + STRIP_ROWS] = project(values, matrix)
+    noise = ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
+    return _example(scene, grid, np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32), noise)
 
 
 def observe(

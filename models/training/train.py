@@ -125,7 +125,7 @@ class Trainer:
 
     @property
     def done(self) -> float:
-        """Progress of the run, 0..1, by steps or by time, whichever is further: of the processor, or by an accelerator."""
+        """Progress of the run, 0..1, by steps or time, whichever is further: the processor's, or an accelerator's."""
         if self.model.device.type == PROCESSOR:
             seconds = self.course.processor_seconds + time.process_time() - self._worked
         else:
