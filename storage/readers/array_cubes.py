@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.arrays.georeference import find_geobox
+from spectralzoom.storage.readers.band_facts import Bands, bands_of_numbers, is_spectral
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     MOST_RATIO,
-    Bands,
     CubeSource,
     Guard,
     check_claim,
@@ -39,7 +38,6 @@ WAVELENGTHS = (
     *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
     *("wl", "lambda", "nm"),
 )
-METRES = {"m", "meter", "meters", "metre", "metres"}
 
 UNNAMED = "dims have no names, read as y, x, band"
 _SHOWN = 5  # arrays in a note
@@ -151,6 +149,7 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
             return np.where(out, np.float32(np.nan), values) if checked else values
         return np.where(out, stored.type(np.nan if fill is None else fill), native) if out.any() else native
 
+    bands = _bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1)
     dims = cube.dims[order[0]], cube.dims[order[1]]
     geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
     return CubeSource(
@@ -159,11 +158,11 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
         dtype=stored if plain else np.dtype(np.float32),
         read=read_by_chunks(read, sizes[0], array.chunks[order[0]]),
         files=(path,),
-        bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
+        bands=bands,
         nodata=fill if plain else None,
         geobox=geobox,
         scaling=f"{stored} without {missing}, {low} to {high}" if unsigned or checked else "",
-        notes=(*cube.notes, *notes),
+        notes=(*cube.notes, *notes, *bands.notes),
     )
 
 
@@ -176,24 +175,17 @@ def place_or_note(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tup
 
 
 def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
-    """Return wavelengths and widths in nm; none if their unit is no length."""
+    """Return wavelengths and widths by the array of their name, or of the bands' axis."""
     axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
     found = _vector(arrays, WAVELENGTHS, count)
-    if found is None and _is_line(arrays, axis, count) and _is_spectral(arrays[axis]):
+    if found is None and _is_line(arrays, axis, count) and is_spectral(arrays[axis].attrs):
         found = axis
     if found is None:
         return Bands()
-    centres = np.asarray(arrays[found][...], np.float64).ravel()
-    unit = _unit(arrays[found].attrs)
-    known = {**dict.fromkeys(NANOMETRES, 1.0), **dict.fromkeys(MICROMETRES, 1000.0), **dict.fromkeys(METRES, 1e9)}
-    scale = (1000.0 if centres.max() <= 20 else 1.0) if unit in UNSAID else known.get(unit)  # [nm]
-    if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
-        return Bands()
-    source = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
     beside = _vector(arrays, ("fwhm",), count)
-    widths = None if beside is None else np.asarray(arrays[beside][...], np.float64).ravel() * scale
-    widths = None if widths is None or not (widths > 0).all() else widths
-    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {source}")
+    widths = () if beside is None else (arrays[beside][...], _unit(arrays[beside].attrs))
+    origin = f"wavelengths from the array {found}"
+    return bands_of_numbers(arrays[found][...], _unit(arrays[found].attrs), origin, *widths)
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
@@ -240,17 +232,10 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple
         return tuple(range(array.ndim)), (UNNAMED,)
     words = [_word(dim) for dim in named]
     found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
-    found[2] = found[2] or [at for at, dim in enumerate(named) if _is_spectral(arrays.get(dim))]
+    found[2] = found[2] or [at for at, dim in enumerate(named) if dim in arrays and is_spectral(arrays[dim].attrs)]
     if any(len(places) != 1 for places in found[: array.ndim]) or (array.ndim == 2 and found[2]):
         raise SceneError(f"{path} has dims {', '.join(named)}; expected y, x, band (or band, y, x); rename them")
     return tuple(places[0] for places in found[: array.ndim]), ()
-
-
-def _is_spectral(coordinate: FileArray | None) -> bool:
-    """Return whether a coordinate has wavelengths, by its standard name or unit."""
-    if coordinate is None or coordinate.ndim != 1:
-        return False
-    return coordinate.attrs.get("standard_name") in WAVELENGTHS or _unit(coordinate.attrs) in NANOMETRES | MICROMETRES
 
 
 def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:

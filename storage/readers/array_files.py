@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_cubes import Arrays, FileArray
+from spectralzoom.storage.readers.band_facts import GOOD_BANDS, bad_bands, letters
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO
 
 ARRAY_ENDINGS = (".npy", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
-GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
 MOST_UNEVEN = 16  # times that a picture is longer than wide
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
@@ -176,6 +176,6 @@ def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
 def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:
     """Return the bands (from 0) that a list of good bands marks by 0."""
     for name, array in arrays.items():
-        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
-            return tuple(np.flatnonzero(array[...] == 0).tolist())
+        if letters(name.rpartition("/")[2]) in GOOD_BANDS and array.shape == (count,):
+            return bad_bands(array[...], count)[0]
     return ()

@@ -21,6 +21,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.pipeline.source import References
+from spectralzoom.storage.readers.band_facts import Bands
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
@@ -85,15 +86,6 @@ class LineFacts:
     valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
     exposure_ms: NDArray[np.float64] | None = None  # (line,)
-
-
-@dataclass(frozen=True)
-class Bands:
-    """Facts of the bands; None if not known."""
-
-    wavelength_nm: NDArray[np.float64] | None = None  # (band,)
-    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
-    origin: str = ""  # one sentence
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,9 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     place_parts,
     times_of_lines,
 )
-from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts
+from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
+from spectralzoom.storage.readers.image_files import place_of_envi, rescaled
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
@@ -210,6 +211,12 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     )
 
 
+def bands_of_header(header: EnviHeader, where: str) -> Bands:
+    """Return (band,) wavelengths and widths of a header, of a library (sample,), or the notes on why there are none."""
+    count = header.samples if "spectral library" in header.kind.lower() else header.bands
+    return bands_of_texts(header.fields, [None] * count, where)
+
+
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
     """Return files by their first lines as one cube; lines that are in no file are 0 and not valid."""
     cubes = list(parts.values())
@@ -228,11 +235,10 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         if known is not None and known > 0:
             exposure = np.full(height, np.nan) if exposure is None else exposure
             exposure[start : start + len(part.values)] = known
-    with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
-    bands = Bands()
-    if with_bands is not None:
-        header = with_bands.header
-        bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
+    of_parts = [bands_of_header(one.header, one.header_path.name) for one in cubes]
+    bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
+    bad, doubts = bad_bands_of_texts(cubes[0].header.fields, count)
+    notes += [*bands.notes, *doubts]
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -252,7 +258,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         lines=LineFacts(valid, exposure_ms=exposure),
         bands=bands,
         nodata=cubes[0].header.nodata,
-        bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
+        bad_bands=bad,
         notes=tuple(notes),
     )
 

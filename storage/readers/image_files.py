@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,13 +22,12 @@ import pyproj
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.envi_headers import finite_number, wavelengths_nm
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
     MOST_RATIO,
-    Bands,
     CubeSource,
     check_claim,
     check_memory,
@@ -50,15 +48,6 @@ ALPHA_NOTE = (
     "its alpha channel says where there are pixels, and is no band; if it is one, write so into the file"
     " (gdal_edit.py -colorinterp_4 undefined)"
 )
-RGB_NM = (640.0, 550.0, 460.0)
-NEAR_INFRARED_NM = 800.0
-GREY_NM = 550.0
-_COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
-    ("gray",): (GREY_NM,),
-    ("red", "green", "blue"): RGB_NM,
-    ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
-    ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
-}
 
 
 def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
@@ -84,12 +73,16 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
+        of_all = _bands_of(file, range(file.count), kinds, path).wavelength_nm
+        if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
+            alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
-        known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path)
-        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
+        known = _bands_of(file, keep, kinds, path)
+        bad, doubts = bad_bands_of_texts(_tags_of(file, keep), len(keep))
+        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
@@ -99,7 +92,6 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
                 planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
             return np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
 
-        bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
             shape=(height, width, len(keep)),
@@ -109,7 +101,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             bands=known,
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
-            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad),
+            bad_bands=bad,
             void=_void(file, alpha),
             notes=tuple(notes),
         )
@@ -218,59 +210,18 @@ def place_of_envi(
     return (None if found is None else odc_geobox.GeoBox(shape, found.affine, found.crs)), notes
 
 
-_UNIT = "wavelength_units"
-_LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
-_DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)  # Band 12 (660.5 Nanometers)
+def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
+    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own."""
+    tags: dict[str, str | Sequence[str]] = {}
+    for name, value in (file.tags() | file.tags(ns="ENVI")).items():
+        words = split_list(value, file.count)
+        tags[name] = value if words is None else [words[band] for band in bands]
+    of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
+    names = dict.fromkeys(name for own in of_bands for name in own)
+    return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
 
 
-def _of_colours(colours_nm: Sequence[float]) -> Bands:
-    listed = ", ".join(f"{nm:g}" for nm in colours_nm)
-    return Bands(np.array(colours_nm), None, f"wavelengths assumed from the file's colours: {listed} nm")
-
-
-def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
-    """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
-    notes: list[str] = []
-    of_file = _file_tags(file)
-    of_bands = []
-    for band in keep:  # counted from 0; GDAL's own tags take precedence
-        tags = _lower(file.tags(band + 1))
-        imagery = file.tags(band + 1, ns="IMAGERY")
-        if "CENTRAL_WAVELENGTH_UM" in imagery:
-            tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
-            tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
-        of_bands.append(tags)
-    fields = {"wavelength units": next(iter(of_bands), {}).get(_UNIT) or of_file.get(_UNIT, "")}
-    for key in ("wavelength", "fwhm"):
-        values = [tags.get(key, "") for tags in of_bands]
-        if all(values):
-            fields[key] = ", ".join(values)
-        elif key in of_file:
-            words = [word for word in re.split(r"[,\s{}]+", of_file[key]) if word]
-            fields[key] = ", ".join([words[band] for band in keep] if len(words) == file.count else words)
-    centres, scale = wavelengths_nm(fields, len(keep), notes)
-    if centres is not None:
-        widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
-        known = len(widths) == len(keep) and all(width is not None and width > 0 for width in widths)
-        fwhm = np.array(widths, np.float64) * scale if known else None
-        return Bands(centres, fwhm, f"wavelengths from the tags of {path}"), tuple(notes)
-    named = [_DESCRIBED.search(file.descriptions[band] or "") for band in keep]
-    if named and None not in named:
-        nm = [float(one[1]) * (1.0 if one[2].lower().startswith("n") else 1000.0) for one in named if one is not None]
-        return Bands(np.array(nm), None, f"wavelengths from the band names of {path}"), tuple(notes)
-    colours_nm = _COLOURS_NM.get(tuple(kinds))
-    return Bands() if colours_nm is None else _of_colours(colours_nm), tuple(notes)
-
-
-def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
-    """Return the bands (from 0) that a list of ``count`` flags marks by 0, such as ``{1, 1, 0}``."""
-    flags = [finite_number(word) for word in re.split(r"[,\s{}]+", listed or "") if word]
-    return tuple(band for band, flag in enumerate(flags) if flag == 0) if len(flags) == count else ()
-
-
-def _file_tags(file: Any) -> dict[str, str]:
-    return _lower(file.tags()) | _lower(file.tags(ns="ENVI"))
-
-
-def _lower(tags: Mapping[str, str]) -> dict[str, str]:
-    return {"_".join(name.lower().split()): value for name, value in tags.items()}
+def _bands_of(file: Any, bands: Sequence[int], kinds: Sequence[str], path: Path) -> Bands:
+    """Return wavelengths and widths of some bands (from 0) of an open file by its tags, band names or colours."""
+    names, colours = ([of_file[band] for band in bands] for of_file in (file.descriptions, kinds))
+    return bands_of_texts(_tags_of(file, bands), names, str(path), colours)

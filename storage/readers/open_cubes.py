@@ -23,7 +23,8 @@ from spectralzoom.storage.readers.array_files import (
     load_npy,
     marked_bands,
 )
-from spectralzoom.storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
+from spectralzoom.storage.readers.band_facts import Bands
+from spectralzoom.storage.readers.cube_sources import CubeSource, check_cube_source, reading
 from spectralzoom.storage.readers.envi_files import (
     DATA_ENDINGS,
     find_envi_pair,

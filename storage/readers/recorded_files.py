@@ -26,16 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.capture.straight_scans import angles_to_positions
-from spectralzoom.pipeline.envi_headers import listed_numbers
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.signal.calibrate import Floats, find_bad_elements, full_scale_notes
 from spectralzoom.pipeline.source import References
+from spectralzoom.storage.readers.band_facts import bands_text, numbers_of_list, why_unknown
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
 from spectralzoom.storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
-from spectralzoom.storage.readers.scene_files import bands_text
 from spectralzoom.storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
@@ -103,9 +102,11 @@ def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> Recor
         source = with_wavelengths(source, path, wavelengths)
     if source.bands.wavelength_nm is None:
         raise WavelengthError(
-            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm"
+            f"{path} has {source.shape[2]} bands and {why_unknown(source.bands)}; give --wavelengths in nm"
             + (", or write a list 'wavelength' into its header" if reader_of(path) == "envi" else "")
         )
+    if without := bands_text(source.bands.unknown):
+        raise WavelengthError(f"{path} gives no wavelength of bands {without} (from 0); give --wavelengths in nm")
     return RecordedFile(_stem(path), path, source)
 
 
@@ -212,7 +213,7 @@ def find_references(
         )
     file = files["white"]
     fields = load_envi_header(find_envi_pair(file)[0]).fields if file is not None and reader_of(file) == "envi" else {}
-    listed = listed_numbers(fields, "white_reference", bands, [])
+    listed = numbers_of_list(fields.get("white_reference", ""), bands)
     white_reference = white_reference if listed is None else listed.astype(np.float32)
     by_mirror = fields.get("mirror at rest", "0").strip() == "1"
     marked = _marked(source)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,14 +19,8 @@ from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
-from spectralzoom.storage.readers.cube_sources import (
-    BLOCK_LINES,
-    Bands,
-    CubeSource,
-    check_memory,
-    scene_lines,
-    unpacked,
-)
+from spectralzoom.storage.readers.band_facts import Bands, bands_text
+from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, check_memory, scene_lines, unpacked
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
 from spectralzoom.storage.readers.open_cubes import open_cube, split_variable
@@ -97,7 +92,9 @@ def open_scene_file(
     source = open_cube(address)
     settings = find_scene_settings(file)
     height, width, count = source.shape
-    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
+    stated = wavelengths is not None or settings.wavelengths_nm is not None or settings.wavelengths_file is not None
+    known = [band for band in range(count) if stated or band not in source.bands.unknown]
+    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands, known)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
@@ -167,16 +164,21 @@ def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
 
 
 def _chosen_bands(
-    bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
+    bands: Sequence[int] | None,
+    settings: SceneSettings,
+    count: int,
+    path: Path,
+    bad: Sequence[int],
+    known: Sequence[int],
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Return the chosen bands, else all that the file does not mark as bad, and a note."""
+    """Return the chosen bands, else those of known wavelength that the file does not mark as bad, and a note."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
-        good = [band for band in range(count) if band not in set(bad)]
-        if len(good) == count or not good:
-            return list(range(count)), ()
-        everything, left_out = bands_text(range(count)), bands_text(sorted(bad))
+        good = [band for band in known if band not in set(bad)]
+        if not bad or not good:
+            return list(known), ("every band is marked as bad: the marks are ignored",) if bad else ()
+        everything, left_out = bands_text(known), bands_text(sorted(bad))
         return good, (f"bands {left_out} are left out: the file marks them as bad; --bands {everything} takes all",)
     wrong = [band for band in chosen if not 0 <= band < count]
     if wrong or not chosen:
@@ -184,8 +186,8 @@ def _chosen_bands(
             f"{where}: {f'band {wrong[0]}' if wrong else 'an empty list'}, but {path} has bands 0..{count - 1} "
             f"(counted from 0); correct it"
         )
-    if len(set(chosen)) < len(chosen):
-        raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
+    if twice := sorted(band for band, times in Counter(chosen).items() if times > 1):
+        raise SceneError(f"{where} names bands {bands_text(twice)} twice; name each once")
     return [int(band) for band in chosen], ()
 
 
@@ -340,17 +342,25 @@ def _find_gaps(
         without, rest = (
             [int(band) for band, there in zip(chosen, seen, strict=True) if there == wanted] for wanted in (False, True)
         )
-        take = f"take the others: bands = {rest} in a scene.toml beside it, or survey --bands {bands_text(rest)}"
-        raise SceneError(f"{path} has no value anywhere in bands {bands_text(without)} (from 0); {take}")
+        take = f'take the others: bands = "{bands_text(rest)}" in a {SETTINGS_NAME} beside it, or survey --bands'
+        raise SceneError(
+            f"{path} has no value anywhere in bands {bands_text(without)} (from 0); {take} {bands_text(rest)}"
+        )
     if absent:
         notes.append(f"missing samples: {absent} of {missing.size * len(chosen)}")
     return missing, filled_px, void, tuple(notes)
 
 
-def bands_text(bands: Sequence[int]) -> str:
-    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
-    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+def empty_bands(source: CubeSource, settings: SceneSettings) -> tuple[int, ...]:
+    """Return the bands (from 0) without a value anywhere; reading ends where each band has had one (SceneError)."""
+    height, _, count = source.shape
+    values = FileValues.of(source, list(range(count)), settings)
+    empty = np.ones(count, np.bool_)
+    for rows in cuts(height, BLOCK_LINES):
+        if not empty.any():
+            break
+        empty &= ~np.isfinite(values.converted(rows.start, rows.stop)[1]).any(axis=(0, 1))
+    return tuple(np.flatnonzero(empty).tolist())
 
 
 @dataclass(frozen=True)
