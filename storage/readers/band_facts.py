@@ -42,8 +42,8 @@ _BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE) 
 _UNIT_KEY = re.compile("units?$")
 _KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
 _CENTRE_KEY = re.compile(
-    rf"(?:(?:band|cent(?:er|re)|central|peak|nominal|mean|radiation)*wavelengths?(?:cent(?:er|re)|value|list)?s?"
-    rf"|(?:band|spectral)cent(?:er|re)s?|wls?|lambdas?){_KEY_UNIT}"
+    rf"(?:(?:band|cent(?:er|re)|central|peak|nominal|mean|radiation)*wavelengths?(?:cent(?:er|re)|value|list|d)?s?"
+    rf"|(?:band|spectral)cent(?:er|re)s?|wls?|lambdas?|(?=nm)){_KEY_UNIT}"
 )
 _WIDTH_KEY = re.compile(
     rf"(?:(?:band|wavelength)?fwhms?|fullwidth(?:at)?halfmax(?:imum)?|bandwidths?|spectralwidths?){_KEY_UNIT}"
@@ -120,6 +120,18 @@ def is_spectral(attrs: Mapping[str, Any]) -> bool:
     unit = _plain_text(attrs.get("units", attrs.get("unit")))
     short = scale_nm(unit)
     return "wavelength" in str(attrs.get("standard_name", "")) or (short is not None and short <= 1000)
+
+
+def wavelength_unit(name: str) -> str | None:
+    """Return the unit in the name of a list of wavelengths, "" without one; None for names of other lists."""
+    found = _CENTRE_KEY.fullmatch(letters(name))
+    return None if found is None else found[1] or ""
+
+
+def width_unit(name: str) -> str | None:
+    """Return the unit in the name of a list of widths, "" without one; None for names of other lists."""
+    found = _WIDTH_KEY.fullmatch(letters(name))
+    return None if found is None else found[1] or ""
 
 
 def bands_of_numbers(

@@ -35,6 +35,7 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
+from spectralzoom.storage.readers.orientation import orientation_of, upright
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
@@ -115,7 +116,8 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
                 void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
             ),
         )
-    return source if not scaled or ((scale == 1).all() and (offset == 0).all()) else rescaled(source, scale, offset)
+    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
+    return upright(source if plain else rescaled(source, scale, offset), orientation_of(path))
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:

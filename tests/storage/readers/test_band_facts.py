@@ -27,7 +27,7 @@ from spectralzoom.storage.readers.band_facts import (
     bands_text,
     numbers_of_list,
 )
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.recorded_files import open_recorded_cube
 from spectralzoom.storage.readers.scene_files import empty_bands, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SceneSettings
@@ -315,7 +315,7 @@ def test_wavelengths_and_bad_bands_are_those_of_spy(tmp_path: Path) -> None:
         warnings.simplefilter("ignore")
         spectral.envi.save_image(str(tmp_path / "a.hdr"), VALUES.transpose(1, 2, 0), metadata=marks, ext="img")
         second = spectral.open_image(str(tmp_path / "a.hdr"))
-    source = open_cube(tmp_path / "a.hdr")
+    source = open_cube_source(tmp_path / "a.hdr")
     assert source.bands.wavelength_nm.tolist() == second.bands.centers
     assert source.bands.fwhm_nm.tolist() == second.bands.bandwidths
     assert source.bad_bands == (1,)
@@ -358,7 +358,7 @@ def test_scene_toml_takes_ranges_of_bands(tmp_path: Path, stated: str) -> None:
     advice = re.escape('bands 2 (from 0); take the others: bands = "0-1,3" in a scene.toml')
     with pytest.raises(SceneError, match=advice):
         load_scene_file(tmp_path / "a.npy", wavelengths=NM)
-    assert empty_bands(open_cube(tmp_path / "a.npy"), SceneSettings()) == (2,)
+    assert empty_bands(open_cube_source(tmp_path / "a.npy"), SceneSettings()) == (2,)
     (tmp_path / "scene.toml").write_text(f"wavelengths_nm = {NM}\nbands = {stated}")
     assert load_scene_file(tmp_path / "a.npy").wavelength_nm.tolist() == [450, 550, 800]
 
