@@ -23,8 +23,10 @@ from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.readers import label_files
+from spectralzoom.storage.readers.band_facts import bands_text
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable, with_wavelengths
+from spectralzoom.storage.readers.scene_files import empty_bands
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 from spectralzoom.storage.whole_files import write_whole
 
@@ -100,7 +102,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "images": len(files.images),
         "labelled": len(files.labels),
         "shape": list(cube.shape),
-        "wavelengths_nm": None if nm is None else nm.tolist(),
+        "wavelengths_nm": None if nm is None else [None if np.isnan(one) else one for one in nm.tolist()],
         "classes": [asdict(one) for one in draft.classes],
         "notes": list(cube.notes),
         "unseen": [*_missing(draft), *draft.unseen],
@@ -152,7 +154,12 @@ def _value_lines(cube: CubeSource) -> Iterator[str]:
     elif "assumed" in cube.bands.origin:
         yield f"# wavelengths_nm = {nm.tolist()}   # assumed from the colours; remove the first # to change them"
     else:
-        yield f"# {bands} bands, {nm.min():g}-{nm.max():g} nm: {as_toml(cube.bands.origin)}"
+        yield f"# {bands} bands, {np.nanmin(nm):g}-{np.nanmax(nm):g} nm: {as_toml(cube.bands.origin)}"
+    left_out = {*cube.bad_bands, *cube.bands.unknown}
+    empty = set(empty_bands(cube, SceneSettings()))
+    if empty - left_out and len(empty) < bands:
+        used = bands_text([band for band in range(bands) if band not in left_out | empty])
+        yield f'bands = "{used}"   # the others have no value, or the file marks them as bad'
     if cube.nodata is None:
         yield "# nodata = 0   # if that value means no data: remove the first #"
     if cube.dtype.itemsize == 2:

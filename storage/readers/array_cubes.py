@@ -24,6 +24,7 @@ from spectralzoom.storage.readers.array_files import Arrays, FileArray
 from spectralzoom.storage.readers.band_facts import (
     GOOD_BANDS,
     Bands,
+    are_wavelengths,
     bad_bands,
     bad_bands_of_texts,
     bands_of_numbers,
@@ -246,11 +247,20 @@ def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
         if found.wavelength_nm is not None:
             return found
         notes += found.notes
-    usable = {
-        key: one for key, one in cube.array.attrs.items() if isinstance(one, str) or np.asarray(one).dtype.kind in "iuf"
-    }
-    found = bands_of_texts(usable, [None] * count, cube.name)
+    if not named and _is_line(arrays, axis, count) and are_wavelengths(centres := np.asarray(arrays[axis][...], float)):
+        return bands_of_numbers(centres, "", f"wavelengths from the array {axis}")
+    about = cube.array.attrs.items()
+    usable = {key: one for key, one in about if isinstance(one, str) or np.asarray(one).dtype.kind in "iuf"}
+    found = bands_of_texts(usable, _names_of(arrays, (axis, "band_names", "band_name"), count), cube.name)
     return replace(found, notes=(*notes, *found.notes))
+
+
+def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | None]:
+    """Return the texts, one a band, of the first array of texts that has one of the names; None each without one."""
+    listed = [arrays[name] for name in names if name in arrays]
+    texts = next((one for one in listed if one.shape == (count,) and one.dtype.kind in "SOUT"), None)
+    each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
+    return [None if one is None else np.asarray(one).astype(str).item() for one in each]
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:

@@ -229,11 +229,11 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
             return np.asarray(file[name][part])
 
     def visit(name: str, item: Any) -> None:
-        """Add an array of numbers, or a single text such as GDAL's grid mapping."""
+        """Add an array of numbers, a single text such as GDAL's grid mapping, or a list of texts such as band names."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
         about = _plain(item.attrs)
-        is_text = item.dtype.kind in "SO" and not item.ndim
+        is_text = item.dtype.kind in "SO" and item.ndim < 2
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
             dims = tuple(dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims)
             chunks = item.chunks or (1,) * item.ndim

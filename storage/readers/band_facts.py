@@ -340,7 +340,7 @@ def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[st
         return bands_of_numbers(centres, "nm", origin, None if np.isnan(widths).all() else widths)
     plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
     numbers = np.array([_to_number(one[1]) if one else np.nan for one in plain])
-    if _are_wavelengths(numbers):
+    if are_wavelengths(numbers):
         return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
     return _bands_of_colours(names, texts, where, colours)
 
@@ -375,7 +375,7 @@ def _ends(span: re.Match[str]) -> tuple[tuple[str, str], tuple[str, str]]:
     return (span[1], span[2] or span[4]), (span[3], span[4])
 
 
-def _are_wavelengths(numbers: NDArray[np.float64]) -> bool:
+def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
     """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
     if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
         return False
@@ -435,7 +435,7 @@ def bad_bands_of_texts(
         key = letters(name)
         if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
             words = re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value)) if isinstance(value, str) else value
-            flags = np.array([_TRUTH.get(_plain_text(word), _to_number(word)) for word in words])
+            flags = np.array([_TRUTH.get(_plain_text(word), _to_number(str(word))) for word in words])
             marked, doubts = bad_bands(flags if key in GOOD_BANDS else ~(flags > 0), count, name)
             bad |= set(marked)
             notes += doubts

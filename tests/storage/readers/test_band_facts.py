@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import rasterio
 import spectral
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.enums import ColorInterp
+from rich.console import Console
 
+from spectralzoom.flows.training.init_command import run_init
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.setting_fields import numbers_of
 from spectralzoom.storage.readers.band_facts import (
@@ -361,6 +364,45 @@ def test_scene_toml_takes_ranges_of_bands(tmp_path: Path, stated: str) -> None:
     assert empty_bands(open_cube_source(tmp_path / "a.npy"), SceneSettings()) == (2,)
     (tmp_path / "scene.toml").write_text(f"wavelengths_nm = {NM}\nbands = {stated}")
     assert load_scene_file(tmp_path / "a.npy").wavelength_nm.tolist() == [450, 550, 800]
+
+
+def test_init_leaves_out_bands_without_values(tmp_path: Path) -> None:
+    """Its next command does not end in an error on them; bands that the file marks as bad are not named again."""
+    values = VALUES.astype(np.float32)
+    values[1], values[2] = np.nan, -9999
+    with write(tmp_path / "a.tif", values) as file:
+        say_in_names(file)
+        file.update_tags(2, bbl="0")
+    run_init(str(tmp_path / "a.tif"), Console(quiet=True))
+    assert 'bands = "0,3"   # the others' in (tmp_path / "scene.toml").read_text()
+    assert load_scene_file(tmp_path / "a.tif").wavelength_nm.tolist() == [450, 800]
+
+
+COORDINATES: dict[str, Any] = {
+    "Angstrom": {"wavelength": ("band", [4500.0, 5500], {"units": "Angstrom"})},
+    "a name with a unit": {"center_wavelength_um": ("band", [0.45, 0.55])},
+    "the axis": {"band": ("band", [450.0, 550.0])},
+    "names": {"band": ("band", ["430 - 470 nm", "550 nm"])},
+}
+
+
+@pytest.mark.parametrize("case", COORDINATES)
+def test_arrays_follow_the_same_rules(tmp_path: Path, case: str) -> None:
+    """Coordinates and names of bands, as xarray writes them."""
+    cube = xr.Dataset({"r": (("y", "x", "band"), np.ones((3, 4, 2)))}, COORDINATES[case])
+    cube.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    assert load_scene_file(tmp_path / "a.nc").wavelength_nm.tolist() == pytest.approx([450, 550])
+
+
+def test_attributes_of_an_array_list_wavelengths_and_bad_bands(tmp_path: Path) -> None:
+    """As lists or as text; an array that does not fit is among the reasons of a refusal."""
+    about: dict[str, Any] = {"wavelength": [0.45, 0.55], "wavelength_units": "um", "bbl": "1, 0"}
+    axes = ("y", "x", "band"), np.ones((3, 4, 2))
+    xr.Dataset({"r": (*axes, about)}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    assert load_scene_file(tmp_path / "a.nc").wavelength_nm.tolist() == pytest.approx([450])
+    xr.Dataset({"r": axes, "wavelength": ("all", [1.0, 2, 3])}).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    with pytest.raises(WavelengthError, match=r"array wavelength is left out: it has shape \(3,\) for 2 bands"):
+        load_scene_file(tmp_path / "b.nc")
 
 
 @pytest.mark.parametrize("stated", ['"0-x"', '"3-1"', '["a"]', '""'])
