@@ -394,24 +394,27 @@ def _colour(text: str) -> set[float]:
 
 def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
     """Return bands by the colours in their names, else by the file's; a band without a name has that of the file."""
-    default = tuple(colours[:3]) == ("red", "green", "blue")  # GDAL writes them unless told otherwise
+    default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
     flags = [_colour(colour) for colour in colours] or [set() for _ in names]
     if default and tuple(colours[3:]) == ("undefined",) and not texts[3].strip():
         flags[3] = {NEAR_INFRARED_NM}
     named = [_colour(text) for text in texts]
     given = named if any(named) else flags
     nm = [one or (set() if text.strip() else flag) for one, text, flag in zip(given, texts, flags, strict=True)]
-    shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
-    centres = [one.pop() if len(one) == 1 else np.nan for one in map(set, nm)]
+    centres = [min(one) if len(one) == 1 else np.nan for one in nm]
     if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
+        shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
         doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
         return Bands(notes=(doubt,) if any(text.strip() for text in texts) else ())
-    for name, mine, flag, colour in zip(names, centres, flags, colours or texts, strict=True):
-        if any(named) and not default and flag and colour != "gray" and flag != {mine}:
-            return Bands(notes=(f"the band name {name!r} contradicts its colour in the file, {colour}",))
-    listed = ", ".join(f"{one:g}" for one in centres)
+    others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
+    if others and not default:
+        said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
+        return Bands(notes=(said,))
+    notes = ("the band names say other colours than the file's flags of red, green and blue: the names count",)
     source = f"the colours in the band names of {where}" if any(named) else "the file's colours"
-    return Bands(np.array(centres), None, f"wavelengths assumed from {source}: {listed} nm")
+    listed = ", ".join(f"{one:g}" for one in centres)
+    origin = f"wavelengths assumed from {source}: {listed} nm"
+    return Bands(np.array(centres), None, origin, notes if others else ())
 
 
 def bad_bands(flags: object, count: int, name: str = "bbl") -> tuple[tuple[int, ...], tuple[str, ...]]:

@@ -146,7 +146,8 @@ def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where:
     outside = values[(values < RANGE_NM[0]) | (values > RANGE_NM[1])]
     if outside.size:
         raise WavelengthError(
-            f"{where}: wavelengths {_listed(outside)} lie outside {RANGE_NM[0]:g}-{RANGE_NM[1]:g} nm; write nm"
+            f"{where}: wavelengths {_listed(outside)} lie outside {RANGE_NM[0]:g}-{RANGE_NM[1]:g} nm; write nm, or"
+            " leave these bands out"
         )
     return values
 
@@ -234,7 +235,9 @@ def _table(path: Path) -> NDArray[np.float64]:
         raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
     rows: list[list[float]] = []
     for line in lines:
-        fields = line.replace(",", " ").replace(";", " ").split()[:2]
+        cells = re.split(r"[;\t]" if re.search(r"[;\t]", line) else r"\s+", line.strip())
+        commas = len(cells) > 1 and all(re.fullmatch(r"\s*\d+,\d+\s*", cell) for cell in cells[:2])  # 450,5 10,2
+        fields = re.sub("[,;]", " ", line.replace(",", ".") if commas else line).split()[:2]
         for count in range(len(fields), 0, -1):
             with suppress(ValueError):
                 rows.append([float(field) for field in fields[:count]])

@@ -117,6 +117,7 @@ RGB = ("red", "green", "blue")
         ((None,) * 4, COLOURS, [460, 550, 640, 800]),
         (("a", "b", "c", "thermal"), (*RGB, "undefined"), "'thermal' do not give each band"),
         (("blue", "green", "red"), ("blue", "red", "green"), "'green' contradicts its colour in the file, red"),
+        (COLOURS, (*RGB, "nir"), "'blue' contradicts its colour in the file, red"),
         (("nir", "red", "foo"), RGB, "'foo' do not give each band"),
     ],
 )
@@ -364,6 +365,15 @@ def test_scene_toml_takes_ranges_of_bands(tmp_path: Path, stated: str) -> None:
     assert empty_bands(open_cube_source(tmp_path / "a.npy"), SceneSettings()) == (2,)
     (tmp_path / "scene.toml").write_text(f"wavelengths_nm = {NM}\nbands = {stated}")
     assert load_scene_file(tmp_path / "a.npy").wavelength_nm.tolist() == [450, 550, 800]
+
+
+def test_a_table_of_wavelengths_may_have_decimal_commas(tmp_path: Path) -> None:
+    """Where semicolons, tabs or spaces separate its columns; commas alone separate them."""
+    np.save(tmp_path / "a.npy", np.moveaxis(VALUES, 0, -1))
+    (tmp_path / "scene.toml").write_text('wavelengths_file = "w.txt"')
+    (tmp_path / "w.txt").write_text("nm fwhm\n450,5;6,5\n550,5\t6,5\n660,5 6,5\n800,6\n")
+    scene = load_scene_file(tmp_path / "a.npy")
+    assert (scene.wavelength_nm.tolist(), scene.fwhm_nm.tolist()) == ([450.5, 550.5, 660.5, 800], [6.5, 6.5, 6.5, 6])
 
 
 def test_init_leaves_out_bands_without_values(tmp_path: Path) -> None:
