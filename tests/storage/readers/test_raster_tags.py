@@ -6,15 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import odc.geo.xr  # noqa: F401 - registers the accessor
 import pytest
 import rasterio
-from affine import Affine
 from PIL import Image
 
 from spectralzoom.storage.readers.scene_files import load_scene_file
 
-PLACE = Affine(0.5, 0, 400_000, 0, -0.5, 5_700_000)
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
 NM = [450.0, 550.0, 660.5, 800.0]
 
