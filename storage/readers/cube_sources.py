@@ -23,6 +23,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.band_facts import Bands
@@ -106,6 +107,8 @@ class CubeSource:
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
+    white_ms: float | None = None  # exposure of the white frame at the gain of the lines; None: that of every line
+    taken: Taken = field(default_factory=Taken)
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
@@ -227,8 +230,10 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
             return raw
         values = raw.astype(np.float32)
     else:
-        references = References(source.dark, source.white, np.ones(source.shape[2], np.float32))
-        values, usable = calibrate(raw, references, saturated_dn=np.inf)
+        white_reference = np.ones(source.shape[2], np.float32)
+        references = References(source.dark, source.white, white_reference, exposure_ms=source.white_ms)
+        exposure_ms = np.ones(len(raw)) if source.lines.exposure_ms is None else source.lines.exposure_ms[start:stop]
+        values, usable = calibrate(raw, references, saturated_dn=np.inf, exposure_ms=exposure_ms)
         values[~usable] = np.nan
         if source.nodata is not None:
             values[raw == source.nodata] = np.nan

@@ -31,7 +31,7 @@ from spectralzoom.storage.readers.band_facts import (
     numbers_of_list,
 )
 from spectralzoom.storage.readers.open_cubes import open_cube_source
-from spectralzoom.storage.readers.recorded_files import open_recorded_cube
+from spectralzoom.storage.readers.recorded_files import open_file_cube
 from spectralzoom.storage.readers.scene_files import empty_bands, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SceneSettings
 from tests.storage.readers.test_envi_cubes import write_envi
@@ -332,7 +332,7 @@ REASONS = {
 }
 
 
-@pytest.mark.parametrize("opened", [load_scene_file, lambda path: open_recorded_cube(path, None)])
+@pytest.mark.parametrize("opened", [load_scene_file, lambda path: open_file_cube(path, None, {})])
 def test_a_refusal_repeats_every_reason(tmp_path: Path, opened: Any) -> None:
     """Of a scene and of a recording."""
     fields = {key.replace(" ", "_"): value for key, (value, _) in REASONS.items()}
@@ -348,7 +348,7 @@ def test_an_unknown_band_is_refused_where_it_is_needed(tmp_path: Path) -> None:
     with pytest.raises(WavelengthError, match=r"gives no wavelength of bands 1 \(from 0\); write"):
         load_scene_file(path, bands=[0, 1])
     with pytest.raises(WavelengthError, match=r"gives no wavelength of bands 1 \(from 0\); give"):
-        open_recorded_cube(path, None)
+        open_file_cube(path, None, {})
     (tmp_path / "scene.toml").write_text("wavelengths_nm = [450, 550, 650]")
     assert load_scene_file(path).wavelength_nm.tolist() == [450, 550, 650]
 
