@@ -330,7 +330,7 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
     """Return whether an array has ``count`` numbers along one of its axes."""
     shape = arrays[name].shape if name in arrays else ()
-    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
+    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "buif"
 
 
 def _word(name: str) -> str:
@@ -368,6 +368,6 @@ def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
 def marked_bands(cube: ArrayCube, arrays: Arrays, count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the bands (from 0) that an array or an attribute of good bands marks by 0, and notes."""
     for name, array in arrays.items():
-        if letters(_word(name)) in GOOD_BANDS and array.shape == (count,) and array.dtype.kind in "buif":
+        if letters(_word(name)) in GOOD_BANDS and _is_line(arrays, name, count):
             return bad_bands(array[...], count, name)
     return bad_bands_of_texts(cube.array.attrs, count)

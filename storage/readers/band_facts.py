@@ -154,7 +154,8 @@ def bands_of_numbers(
         notes.append(f"the file gives no wavelength of bands {bands_text(np.flatnonzero(~known).tolist())} (from 0)")
     if widths is None:
         return Bands(centres * scale, None, origin, tuple(notes))
-    fwhm = _above_zero(widths) * (scale_nm(width_unit) or scale)
+    width_scale = scale if _plain_text(width_unit) in _UNSAID else scale_nm(width_unit) or np.nan
+    fwhm = _above_zero(widths) * width_scale
     fits = fwhm.shape == centres.shape and bool(((fwhm >= LEAST_WIDTH_NM) & (fwhm < centres * scale))[known].all())
     notes += [] if fits else ["the widths (fwhm) are left out: not every band has one that fits its wavelength"]
     return Bands(centres * scale, fwhm if fits else None, origin, tuple(notes))

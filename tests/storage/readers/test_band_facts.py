@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import scipy.io
 import spectral
 import xarray as xr
 from hypothesis import given
@@ -402,6 +403,14 @@ def test_arrays_follow_the_same_rules(tmp_path: Path, case: str) -> None:
     cube = xr.Dataset({"r": (("y", "x", "band"), np.ones((3, 4, 2)))}, COORDINATES[case])
     cube.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
     assert load_scene_file(tmp_path / "a.nc").wavelength_nm.tolist() == pytest.approx([450, 550])
+
+
+def test_vectors_of_matlab_are_wavelengths_widths_and_bad_bands(tmp_path: Path) -> None:
+    """They have two axes there."""
+    beside = {"Wavelengths": [[450.0, 550, 660]], "FWHM": [[6.0], [6], [6]], "bbl": [[True, False, True]]}
+    scipy.io.savemat(tmp_path / "a.mat", {"cube": np.ones((4, 5, 3)), **beside})
+    scene = load_scene_file(tmp_path / "a.mat")
+    assert (scene.wavelength_nm.tolist(), scene.fwhm_nm.tolist()) == ([450, 660], [6, 6])
 
 
 def test_attributes_of_an_array_list_wavelengths_and_bad_bands(tmp_path: Path) -> None:
