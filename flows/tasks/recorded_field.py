@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from odc.geo.geobox import GeoBox
 
+from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
 from spectralzoom.flows.tasks.scene import FieldSource, unlit_scene
 from spectralzoom.pipeline.capture.recorded import RecordedSource
@@ -73,6 +74,7 @@ class OpenedRecording:
             class_names=() if found is None else found.names,
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
             geobox=self.geobox,
+            acquired=self.recording.acquired,
         )
         return scene, (*self.notes, *notes)
 
@@ -102,6 +104,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         camera = replace(camera, exposure_ms=float(run.settings["camera"]["exposure_ms"]))
         if camera.exposure_ms != settings.camera.exposure_ms:
             raise SettingsError("camera.exposure_ms is for a camera, and recorded lines have their own: leave it out")
+        recording = replace(recording, acquired=time_of_visit(run))
         geobox = place if of_run == shape and settings.pose is None else None
     settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.as_taken:

@@ -160,6 +160,7 @@ def _with_notes(
     ``became`` says what became of pixels without a value in some bands.
     """
     notes = file.provenance
+    scene = replace(scene, acquired=file.acquired)
     if scene.geobox is not None and settings.pose is not None:
         scene = replace(scene, geobox=None)
         notes = (*notes, POSE_WINS)

@@ -113,6 +113,7 @@ class CubeSource:
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
+    acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     notes: tuple[str, ...] = ()
 
@@ -143,6 +144,7 @@ class CubeSource:
             "wavelengths_from": self.bands.origin,
         }
         about |= {} if self.nodata is None else {"_FillValue": self.nodata}
+        about |= {} if self.acquired is None else {"acquired": self.acquired}
         lines = indexing.LazilyIndexedArray(_Lines(self))
         return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=self.name, attrs=about)
 

@@ -33,6 +33,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     place_parts,
     times_of_lines,
 )
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import rescaled
@@ -239,6 +240,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     bad, doubts = bad_bands_of_texts(cubes[0].header.fields, count)
     notes += [*bands.notes, *doubts]
 
+    acquired = acquired_of({**cubes[0].header.settings, **cubes[0].header.fields})
+
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
         for begin, part in parts.items():
@@ -262,7 +265,8 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         bands=bands,
         nodata=cubes[0].header.nodata,
         bad_bands=bad,
-        notes=tuple(notes),
+        acquired=acquired.text,
+        notes=(*notes, *acquired.notes),
     )
 
 

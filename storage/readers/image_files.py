@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -80,7 +81,8 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         geobox, where = place_of_file(file)
         known = _bands_of(file, keep, kinds, path)
         bad, doubts = bad_bands_of_texts(_tags_of(file, keep), len(keep))
-        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts]
+        acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
+        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
@@ -101,6 +103,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             geobox=geobox,
             bad_bands=bad,
             void=_void(file, alpha),
+            acquired=acquired.text,
             notes=tuple(notes),
         )
     read = source.read

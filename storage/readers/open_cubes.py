@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text, taken_with
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.array_cubes import (
     UNNAMED,
     check_picture,
@@ -23,7 +25,7 @@ from spectralzoom.storage.readers.array_cubes import (
     in_scope,
     marked_bands,
 )
-from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store, list_arrays
+from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, FileArray, find_zarr_store, list_arrays
 from spectralzoom.storage.readers.band_facts import Bands
 from spectralzoom.storage.readers.cube_sources import CubeSource, check_cube_source, reading
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_source, open_headwall_cube
@@ -76,8 +78,8 @@ def open_cube(address: str | Path) -> xr.DataArray:
     them: ``wavelength`` and ``fwhm`` [nm] and ``bad_band`` along band; ``x``, ``y`` and ``spatial_ref`` of the place;
     ``valid``, ``time_s`` and ``exposure_ms`` of each line; ``void`` of transparent and masked pixels; the frames
     ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out, ``files``,
-    ``wavelengths_from`` and ``_FillValue``. Raises SceneError: there is no such file, it is damaged, or its kind or
-    shape cannot be used.
+    ``wavelengths_from``, ``acquired`` (a day or a moment in UTC, ISO 8601) and ``_FillValue``. Raises SceneError: there
+    is no such file, it is damaged, or its kind or shape cannot be used.
     """
     source = open_cube_source(address)
     return with_wavelengths(source, address, None).data_array()
@@ -152,9 +154,11 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
         notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
+        acquired = acquired_of({**about, **cube.array.attrs, **_time_of(near)})
+        notes += acquired.notes
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
         bad, doubts = marked_bands(cube, near, source.shape[2])
-        source = replace(source, bad_bands=bad, notes=(*notes, *plain, *doubts))
+        source = replace(source, bad_bands=bad, acquired=acquired.text, notes=(*notes, *plain, *doubts))
         taken = taken_with(path.name, about, cube.array.attrs)
         if taken.exposure_ms is not None:
             exposure_ms = np.full(source.shape[0], taken.exposure_ms)
@@ -163,6 +167,16 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         if path.is_dir():
             source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
         return source
+
+
+def _time_of(near: Mapping[str, FileArray]) -> dict[str, Any]:
+    """Return the value of a coordinate ``time`` with one element, by its units; empty where there is none."""
+    found = near.get("time")
+    if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
+        return {}
+    about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
+    time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
+    return {"time": xr.decode_cf(time)["time"].values}
 
 
 def load_labels_array(address: str | Path) -> NDArray[Any]:

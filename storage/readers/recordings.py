@@ -79,6 +79,7 @@ class Recording:
     camera: LineCamera
     notes: tuple[str, ...]
     light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
+    acquired: str | None = None  # when the first lines were captured, by files: a day or a moment in UTC, ISO 8601
 
     def key(self) -> dict[str, Any]:
         """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
@@ -215,7 +216,8 @@ def _recording_of(
         notes += more
     light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
     unique = tuple(dict.fromkeys(notes))
-    return Recording(address, tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light)
+    acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
+    return Recording(address, tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light, acquired)
 
 
 def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -> FileCube:
