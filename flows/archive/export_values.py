@@ -43,14 +43,15 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     ``estimated_fraction`` and ``standard_error`` follow from the labels.
     """
     classes, confidence = (open_image(run.path(run.map_product), name) for name in ("classes", "confidence"))
-    names = tuple(classes.about["class_names"])
+    legend = legend_of(classes.group)
+    names, numbers = legend.names, list(legend.numbers)
     counts, sure_pixels, sums = np.zeros((3, 256))
     for (_, drawn), (_, sure) in zip(classes.rows(), confidence.rows(), strict=True):
         known = np.isfinite(sure)
         counts += np.bincount(drawn.ravel(), minlength=256)
         sure_pixels += np.bincount(drawn[known], minlength=256)
         sums += np.bincount(drawn[known], sure[known], 256)
-    pixels = counts[: len(names)].astype(int)
+    pixels = counts[numbers].astype(int)
     unknown = np.full(len(names), np.nan)
     areas = (run.receipt.get("areas") or {}).get("ha")
     hectares = unknown if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
@@ -60,10 +61,11 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     estimate, error = (unknown, unknown) if confusion is None else stratified_fractions(fraction, confusion)
     columns = {
         "class": names,
+        "value": numbers,
         "pixels": pixels,
         "hectares": hectares,
         "fraction": fraction,
-        "mean_confidence": np.divide(sums, sure_pixels, np.full(256, np.nan), where=sure_pixels > 0)[: len(names)],
+        "mean_confidence": np.divide(sums, sure_pixels, np.full(256, np.nan), where=sure_pixels > 0)[numbers],
         "estimated_fraction": estimate,
         "standard_error": error,
     }
@@ -199,11 +201,12 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     place = geobox_of(stored).affine
     found = list(rasterio_features.shapes(classes, mask=classes != UNLABELLED, transform=place))
     numbers = [int(number) for _, number in found]
-    names = [legend.names[number] for number in numbers]
+    index = [legend.numbers.index(number) for number in numbers]
+    names = [legend.names[one] for one in index]
     columns = {
         "class": numbers,
         "name": names,
-        "colour": [f"#{bytes(legend.colours[number].tolist()).hex()}" for number in numbers],
+        "colour": [f"#{bytes(legend.colours[one].tolist()).hex()}" for one in index],
     }
     crs = None if run.geobox is None else str(run.geobox.crs)
     outlines = [shapely.geometry.shape(outline) for outline, _ in found]

@@ -166,7 +166,7 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
         class_map=found.classes,
-        class_names=found.names,
+        class_names=found.legend.titles,
         class_colours=found.colours,
         confidence=np.ascontiguousarray(found.confidence[thin]),
         chosen=chosen,

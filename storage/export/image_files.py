@@ -76,8 +76,9 @@ def _check_same(plain: Path, made: Path, path: Path) -> None:
 def _write_categories(path: Path, legend: ClassNames) -> None:
     root = ElementTree.Element("PAMDataset")
     names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
-    for name in legend.names:
-        ElementTree.SubElement(names, "Category").text = name
+    named = dict(zip(legend.numbers, legend.names, strict=True))
+    for number in range(max(named) + 1):  # the place of a name is its number
+        ElementTree.SubElement(names, "Category").text = named.get(number, "")
     ElementTree.ElementTree(root).write(path, encoding="utf-8")
 
 
@@ -95,11 +96,11 @@ def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
             names = image.legend.names
             file.update_tags(
                 1,
-                **{f"CLASS_{number}": name for number, name in enumerate(names)},
-                flag_values=", ".join(str(number) for number in range(len(names))),
+                **{f"CLASS_{number}": name for number, name in zip(image.legend.numbers, names, strict=True)},
+                flag_values=", ".join(map(str, image.legend.numbers)),
                 flag_meanings=" ".join("_".join(name.split()) for name in names),
             )
-            colours = enumerate(image.legend.colours.tolist())
+            colours = zip(image.legend.numbers, image.legend.colours.tolist(), strict=True)
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
         for first, values in blocks:
             planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)

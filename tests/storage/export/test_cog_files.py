@@ -102,18 +102,20 @@ def test_overviews_of_confidence_ignore_nan(tmp_path: Path) -> None:
         assert (file.read(1) == 0.25).all()
 
 
-def test_classes_have_colours_and_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize("numbers", [(0, 1, 2), (4, 1, 2)])
+def test_classes_have_colours_and_names(tmp_path: Path, numbers: tuple[int, ...]) -> None:
     """The file has a colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
-    write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), rows_of(classes_of(FEW)))
+    image = replace(class_image(on_map(FEW)), legend=replace(LEGEND, values=numbers))
+    write_cog(tmp_path / "a.tif", image, rows_of(classes_of(FEW)))
     with rasterio.open(tmp_path / "a.tif") as file:
         table = file.colormap(1)
         tags = file.tags(1)
-    assert [table[number][:3] for number in range(3)] == [tuple(colour) for colour in LEGEND.colours.tolist()]
-    assert [tags[f"CLASS_{number}"] for number in range(3)] == list(LEGEND.names)
+    assert [table[number][:3] for number in numbers] == [tuple(colour) for colour in LEGEND.colours.tolist()]
+    assert [tags[f"CLASS_{number}"] for number in numbers] == list(LEGEND.names)
     assert tags["flag_meanings"] == "sugar_beet soil_&_stones maïs"
     rasterio.shutil.copy(str(tmp_path / "a.tif"), str(tmp_path / "a.vrt"), driver="VRT")
     names = ElementTree.parse(tmp_path / "a.vrt").getroot().findall(".//CategoryNames/Category")
-    assert [name.text for name in names] == list(LEGEND.names)
+    assert [names[number].text for number in numbers] == list(LEGEND.names)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
