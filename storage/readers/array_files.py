@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_cubes import Arrays, FileArray
+from spectralzoom.storage.readers.checked_chunks import read_hdf5
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO
 
 ARRAY_ENDINGS = (".npy", ".mat")
@@ -143,7 +144,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
 def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
     with h5py.File(path, "r") as file:
-        return np.asarray(file[name][part])
+        return read_hdf5(file[name], part)
 
 
 def _plain(attributes: Any) -> dict[str, Any]:

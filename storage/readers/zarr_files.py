@@ -7,27 +7,21 @@ refused, so that reading never runs code of the store.
 from __future__ import annotations
 
 import base64
-import json
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zarr
+from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_cubes import FileArray
+from spectralzoom.storage.readers.checked_chunks import CheckedStore
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
-CODECS = {
-    *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),  # checksums
-    *("blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zfpy", "packbits"),  # packers
-    *("bytes", "transpose", "sharding_indexed", "shuffle"),  # orders
-    *("delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"),  # of numbers
-}
 
 
 def find_zarr_store(path: Path) -> Path | None:
@@ -44,12 +38,7 @@ def zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     Raises SceneError: the store has a codec that is not allowed, links out of it, or is a survey's own product.
     """
     _check_store(path)
-    # consolidated metadata of a group are not used: only those of its members were checked
-    is_group = (path / ".zgroup").is_file() or (
-        (path / "zarr.json").is_file() and _read_json(path / "zarr.json").get("node_type") == "group"
-    )
-    options: dict[str, Any] = {"use_consolidated": False} if is_group else {}
-    node = zarr.open(path, mode="r", **options)
+    node = zarr.open(CheckedStore(LocalStore(path, read_only=True)), mode="r")
     if not isinstance(node, zarr.Group):
         return {"": _file_array(path, node)}, {}
     if "sweep" in node.attrs:
@@ -90,7 +79,7 @@ def _file_array(path: Path, array: zarr.Array[Any]) -> FileArray:
 
 
 def _check_store(path: Path) -> None:
-    """Refuse links out of the store, special files, and unknown codecs (SceneError)."""
+    """Refuse links out of the store and special files (SceneError)."""
     home = path.resolve()
     for place, folders, files in os.walk(path):
         for entry in (Path(place, name) for name in (*folders, *files)):
@@ -98,28 +87,3 @@ def _check_store(path: Path) -> None:
                 raise SceneError(f"{entry} is a link out of the store, which is not followed; copy what it leads to")
             if entry.name in files and not entry.is_file():  # reading a pipe may never end
                 raise SceneError(f"{entry} is no file; take it out of the store")
-    for folder in (path, *(entry for entry in sorted(path.iterdir()) if entry.is_dir())):
-        for file in (folder / "zarr.json", folder / ".zarray"):
-            for codec in _codecs(_read_json(file)) if file.is_file() else ():
-                if codec.lower().removeprefix("numcodecs.") not in CODECS:
-                    raise SceneError(
-                        f"{file} asks for the codec {codec!r}, which is not read; store plain numbers with blosc, zstd "
-                        "or gzip"
-                    )
-
-
-def _read_json(path: Path) -> Mapping[str, Any]:
-    content = json.loads(path.read_bytes())
-    if not isinstance(content, dict):
-        raise SceneError(f"{path} holds no table; copy the store again")
-    return content
-
-
-def _codecs(content: object) -> Iterator[str]:
-    """Yield the names of all codecs in an array's metadata, nested ones too."""
-    if isinstance(content, dict):
-        for key in ("codecs", "index_codecs", "filters", "compressor", "compressors"):
-            listed = content.get(key) or []
-            for codec in listed if isinstance(listed, list) else [listed]:
-                yield str(codec.get("name", codec.get("id"))) if isinstance(codec, dict) else str(codec)
-                yield from _codecs(codec.get("configuration") if isinstance(codec, dict) else None)

@@ -1,0 +1,242 @@
+"""Decode chunks of Zarr stores and HDF5 files to at most the bytes that their headers declare.
+
+Decoders of zarr and HDF5 write as many bytes as a chunk says: 1.5 MB can become gigabytes. Here sizes in headers are
+checked first, and streams without one are decoded up to the limit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import bz2
+import json
+import math
+import zlib
+from dataclasses import dataclass
+from typing import Any, Self
+
+import h5py
+import numcodecs
+import numpy as np
+from numpy.typing import NDArray
+from zarr.abc.codec import BytesBytesCodec
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.array_spec import ArraySpec
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.registry import register_codec
+from zarr.storage import WrapperStore
+
+from spectralzoom.pipeline.errors import SceneError
+
+_NAME = "spectralzoom.checked"  # of the codec that stands for a packer in metadata
+SPARE_BYTES = 1024  # of checksums within a chunk
+HARMLESS_BYTES = 256 << 10  # of a deflated chunk, which makes 270 MB of them at most
+WIDEST = 8  # bytes of a number: filters may store it in another type
+PACKERS = ("blosc", "zstd", "gzip", "zlib", "bz2", "lz4")
+PLAIN_CODECS = {
+    *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),  # checksums
+    *("bytes", "transpose", "sharding_indexed", "shuffle"),  # orders
+    *("delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"),  # of numbers
+}
+
+
+def unpack(packer: str, data: Any, most: int) -> bytes:
+    """Return the decoded bytes of a chunk (ValueError: they are more than ``most``, or the chunk is damaged)."""
+    data = memoryview(np.asarray(data).view(np.uint8)) if isinstance(data, np.ndarray) else memoryview(data)
+    if packer in ("gzip", "zlib", "bz2"):
+        return _unpack_stream(packer, data, most)
+    size = zstd_size(data) if packer == "zstd" else _number(data[4:8] if packer == "blosc" else data[:4])
+    _check(packer, size or 0, most)
+    decode = numcodecs.get_codec({"id": packer}).decode
+    if size is None:  # numcodecs demands that it fills all of the array
+        return bytes(decode(data, np.empty(most, np.uint8)))
+    return bytes(decode(data))
+
+
+def _unpack_stream(packer: str, data: Any, most: int) -> bytes:
+    """Return the bytes of all members of a stream whose size no header states."""
+    parts: list[bytes] = []
+    while data:
+        one: Any = bz2.BZ2Decompressor() if packer == "bz2" else zlib.decompressobj(31 if packer == "gzip" else 15)
+        parts.append(one.decompress(data, most + 1 - sum(map(len, parts))))
+        _check(packer, sum(map(len, parts)), most)
+        if not one.eof:
+            raise ValueError(f"a chunk packed by {packer} is cut off")
+        data = one.unused_data if packer != "zlib" else b""
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def zstd_size(data: memoryview) -> int | None:
+    """Return how many bytes all frames of a chunk hold by their headers; None if one does not say it."""
+    total = at = 0
+    while at < len(data):
+        if data[at + 1 : at + 4] == b"\x2a\x4d\x18":  # a frame to be skipped
+            at += 8 + _number(data[at + 4 : at + 8])
+            continue
+        flags = data[at + 4] if at + 4 < len(data) else 0
+        single = flags >> 5 & 1
+        width = (single, 2, 4, 8)[flags >> 6]
+        at += 6 - single + (0, 1, 2, 4)[flags & 3]
+        if not width:
+            return None
+        total += _number(data[at : at + width]) + 256 * (width == 2)
+        at += width
+        last = 0
+        while not last and at < len(data):
+            block = _number(data[at : at + 3])
+            last = block & 1
+            at += 3 + (1 if block >> 1 & 3 == 1 else block >> 3)
+        at += 4 * (flags >> 2 & 1)
+    return total
+
+
+def _number(data: memoryview) -> int:
+    return int.from_bytes(data, "little")
+
+
+def _check(packer: str, size: int, most: int) -> None:
+    if size > most:
+        raise ValueError(f"a chunk packed by {packer} unpacks to more than the {most} bytes that its header declares")
+
+
+@dataclass(frozen=True)
+class CheckedCodec(BytesBytesCodec):
+    """Stand for a packer in metadata of Zarr v3; zarr says the size of each chunk."""
+
+    packer: str
+    is_fixed_size = False
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        return cls(data["configuration"]["packer"])
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"name": _NAME, "configuration": {"packer": self.packer}}
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
+        raise NotImplementedError
+
+    async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> Buffer:
+        most = math.prod(chunk_spec.shape) * chunk_spec.dtype.to_native_dtype().itemsize + SPARE_BYTES
+        plain = await asyncio.to_thread(unpack, self.packer, chunk_data.as_numpy_array(), most)
+        return chunk_spec.prototype.buffer.from_bytes(plain)
+
+
+class CheckedPacker(numcodecs.abc.Codec):  # type: ignore[misc]
+    """Stand for a packer in metadata of Zarr v2, with the size of a chunk."""
+
+    codec_id = _NAME
+
+    def __init__(self, packer: str, most: int) -> None:
+        self.packer, self.most = packer, most
+
+    def encode(self, buf: Any) -> Any:
+        raise NotImplementedError
+
+    def decode(self, buf: Any, out: Any = None) -> Any:
+        return numcodecs.compat.ndarray_copy(unpack(self.packer, buf, self.most), out)
+
+
+register_codec(_NAME, CheckedCodec)
+numcodecs.register_codec(CheckedPacker)
+
+
+class CheckedStore(WrapperStore[Store]):
+    """A store of any kind whose chunks give at most what their array declares.
+
+    Raises SceneError on a codec that is not allowed. Consolidated metadata are left out: each array's own are read.
+    """
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        """Return the bytes of a key; metadata name a checked codec for each packer."""
+        name = key.rpartition("/")[2]
+        found = None if name == ".zmetadata" else await super().get(key, prototype, byte_range)
+        if found is None or name not in ("zarr.json", ".zarray"):
+            return found
+        about = json.loads(found.to_bytes())
+        where = f"{str(self).partition('://')[2]}/{key}"
+        if not isinstance(about, dict):
+            raise SceneError(f"{where} holds no table; copy the store again")
+        about.pop("consolidated_metadata", None)
+        for listed in ("compressor", "filters", "codecs"):
+            if about.get(listed):
+                about[listed] = _checked(about[listed], where, about)
+        return prototype.buffer.from_bytes(json.dumps(about).encode())
+
+
+def _checked(codecs: Any, where: str, about: dict[str, Any]) -> Any:
+    """Return codecs of metadata with each packer replaced (SceneError: one is not allowed)."""
+    if isinstance(codecs, list):
+        return [_checked(codec, where, about) for codec in codecs]
+    given = codecs if isinstance(codecs, dict) else {"name": codecs}
+    name = str(given.get("name", given.get("id")))
+    kind = name.lower().removeprefix("numcodecs.")
+    if kind in PACKERS:
+        if "id" not in given:
+            return {"name": _NAME, "configuration": {"packer": kind}}
+        width = WIDEST if about.get("filters") else np.dtype(about["dtype"]).itemsize
+        return {"id": _NAME, "packer": kind, "most": math.prod(about["chunks"]) * width + SPARE_BYTES}
+    if kind not in PLAIN_CODECS:
+        raise SceneError(
+            f"{where} asks for the codec {name!r}, which is not read; store plain numbers with {', '.join(PACKERS)}"
+        )
+    inner = given.get("configuration")
+    if kind == "sharding_indexed" and isinstance(inner, dict):
+        lists = {key: _checked(inner[key], where, about) for key in ("codecs", "index_codecs") if key in inner}
+        return given | {"configuration": inner | lists}
+    return codecs
+
+
+_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = (
+    h5py.h5z.FILTER_DEFLATE,
+    h5py.h5z.FILTER_SHUFFLE,
+    h5py.h5z.FILTER_FLETCHER32,
+    h5py.h5z.FILTER_LZF,
+)
+
+
+def read_hdf5(dataset: h5py.Dataset, part: Any) -> NDArray[Any]:
+    """Return a part of an HDF5 array: ``...``, or one slice without a step for each axis.
+
+    Deflated chunks are decoded here; HDF5's own decoder knows no limit. Raises SceneError: a filter is not allowed;
+    ValueError: a chunk holds more than its array declares, or is damaged.
+    """
+    plist = dataset.id.get_create_plist()
+    filters = [(found[0], found[2]) for found in map(plist.get_filter, range(plist.get_nfilters()))]
+    codes = {code for code, _ in filters}
+    allowed = {_SHUFFLE, _FLETCHER32, _DEFLATE if _DEFLATE in codes else _LZF}
+    if unknown := codes - allowed:
+        raise SceneError(
+            f"{dataset.file.filename}:{dataset.name} is packed by the HDF5 filter {min(unknown)}, which is not read; "
+            "write it with deflate (h5repack -f GZIP=4)"
+        )
+    stored: dict[tuple[int, ...], int] = {}
+    if _DEFLATE in codes:
+        dataset.id.chunk_iter(lambda one: stored.update({one.chunk_offset: one.size}))
+    if max(stored.values(), default=0) <= HARMLESS_BYTES:
+        return np.asarray(dataset[part])
+    part = (slice(None),) * dataset.ndim if part is ... else part
+    start, stop = zip(*(one.indices(size)[:2] for one, size in zip(part, dataset.shape, strict=True)), strict=True)
+    out = np.full([max(b - a, 0) for a, b in zip(start, stop, strict=True)], dataset.fillvalue, dataset.dtype)
+    for inside in dataset.iter_chunks(part):
+        origin = tuple(one.start // chunk * chunk for one, chunk in zip(inside, dataset.chunks, strict=True))
+        if not stored.get(origin):
+            continue  # never written
+        mask, data = dataset.id.read_direct_chunk(origin)
+        chunk = _unfiltered(data, [one for number, one in enumerate(filters) if not mask >> number & 1], dataset)
+        here = tuple(slice(one.start - a, one.stop - a) for one, a in zip(inside, start, strict=True))
+        there = tuple(slice(one.start - a, one.stop - a) for one, a in zip(inside, origin, strict=True))
+        out[here] = chunk[there]
+    return out
+
+
+def _unfiltered(data: bytes, filters: list[tuple[int, tuple[int, ...]]], dataset: h5py.Dataset) -> NDArray[Any]:
+    """Return the numbers of one chunk, of which ``filters`` (code, values) were applied in their order."""
+    most = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    for code, values in reversed(filters):
+        if code == _DEFLATE:
+            data = unpack("zlib", data, most + SPARE_BYTES)
+        elif code == _FLETCHER32:
+            data = numcodecs.Fletcher32().decode(data)
+        else:
+            data = numcodecs.Shuffle(values[0]).decode(data)
+    return np.frombuffer(data, dataset.dtype).reshape(dataset.chunks)
