@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_cubes import Arrays, FileArray
-from spectralzoom.storage.readers.checked_chunks import read_hdf5
+from spectralzoom.storage.readers.checked_chunks import outside_links, read_hdf5
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO
 
 ARRAY_ENDINGS = (".npy", ".mat")
@@ -139,6 +139,8 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone
+        if not any(one.ndim > 1 for one in arrays.values()) and (led := outside_links(file)):
+            raise SceneError(f"{path}: {led[0]}, which is not followed; copy what it leads to into the file (h5copy)")
         return arrays, _plain(file.attrs)
 
 

@@ -41,7 +41,8 @@ PLAIN_CODECS = {
 
 def unpack(packer: str, data: Any, most: int) -> bytes:
     """Return the decoded bytes of a chunk (ValueError: they are more than ``most``, or the chunk is damaged)."""
-    data = memoryview(np.asarray(data).view(np.uint8)) if isinstance(data, np.ndarray) else memoryview(data)
+    plain: Any = data.view(np.uint8) if isinstance(data, np.ndarray) else data
+    data = memoryview(plain)
     if packer in ("gzip", "zlib", "bz2"):
         return _unpack_stream(packer, data, most)
     size = zstd_size(data) if packer == "zstd" else _number(data[4:8] if packer == "blosc" else data[:4])
@@ -69,7 +70,7 @@ def zstd_size(data: memoryview) -> int | None:
     """Return how many bytes all frames of a chunk hold by their headers; None if one does not say it."""
     total = at = 0
     while at < len(data):
-        if data[at + 1 : at + 4] == b"\x2a\x4d\x18":  # a frame to be skipped
+        if data[at + 1 : at + 4].tobytes() == b"\x2a\x4d\x18":  # a frame to be skipped
             at += 8 + _number(data[at + 4 : at + 8])
             continue
         flags = data[at + 4] if at + 4 < len(data) else 0
@@ -240,3 +241,21 @@ def _unfiltered(data: bytes, filters: list[tuple[int, tuple[int, ...]]], dataset
         else:
             data = numcodecs.Shuffle(values[0]).decode(data)
     return np.frombuffer(data, dataset.dtype).reshape(dataset.chunks)
+
+
+def outside_links(file: h5py.File) -> list[str]:
+    """Return a sentence for each link, external array and virtual array of a file, which may lead to any other file."""
+    found: list[str] = []
+
+    def visit_link(name: str, link: Any) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            found.append(f"{name} is a link to {link.filename}:{link.path}")
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+            others = [one[0] for one in item.external or ()] or [one.file_name for one in item.virtual_sources()]
+            found.append(f"{name} takes its numbers from {', '.join(others[:1]) or 'no file'}")
+
+    file.visititems_links(visit_link)
+    file.visititems(visit)
+    return found

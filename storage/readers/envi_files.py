@@ -34,6 +34,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
 )
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.own_files import within
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
@@ -105,13 +106,13 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
             raise SceneError(
                 f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
             )
-        return path, data
+        return path, within(path, data)
     names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
     header = next((file for file in map(path.with_name, names) if file.is_file()), None)
     if header is None:
         wanted = " or ".join(dict.fromkeys(names[:2]))
         raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
-    return header, path
+    return within(path, header), path
 
 
 def load_envi_header(path: Path) -> EnviHeader:
@@ -178,7 +179,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     notes: list[str] = []
     opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        data = find_envi_pair(header)[1]
+        data = find_envi_pair(within(folder, header))[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
@@ -201,7 +202,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         if number not in indices:
             notes.append(f"there is no frame index for {cube.path.name}")
             continue
-        index = load_frame_index(indices[number])
+        index = load_frame_index(within(folder, indices[number]))
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
@@ -272,7 +273,7 @@ def find_reference(folder: Path, kind: str) -> Path | None:
     if len(found) > 1:
         names = ", ".join(entry.name for entry in found)
         raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
-    return found[0] if found else None
+    return within(folder, found[0]) if found else None
 
 
 def load_frame_index(path: Path) -> FrameIndex:

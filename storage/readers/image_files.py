@@ -37,6 +37,7 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
+from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
@@ -70,7 +71,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     driver = _DRIVERS[path.suffix.lower()]
+    check_sidecars(path)
     with _opened(path) as file:
+        check_overviews(file, path)
         if len(file.subdatasets) > 1:
             raise SceneError(
                 f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
@@ -208,6 +211,7 @@ def place_of_envi(
     if "map info" not in header:
         return None, ()
     rasterio = importlib.import_module("rasterio")
+    check_sidecars(data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)

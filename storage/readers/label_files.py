@@ -18,6 +18,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.readers.polygons import (
     POLYGON_ENDINGS,
     is_polygon_file,
@@ -94,7 +95,7 @@ def scene_entries(folder: Path) -> list[Path]:
 def image_folder(folder: Path) -> Path:
     """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
-    return min(inner, key=lambda entry: entry.name != "images", default=folder)
+    return within(folder, min(inner, key=lambda entry: entry.name != "images", default=folder))
 
 
 def match_folder(folder: Path) -> MatchedFiles:
@@ -121,6 +122,8 @@ def match_folder(folder: Path) -> MatchedFiles:
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
         owner[label] = image
+    for entry in (*images, *labels.values()):
+        within(folder, entry, _home(folder))
     return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in set(labels.values())))
 
 
@@ -131,9 +134,15 @@ def find_label(scene: Path) -> Path | None:
     try:
         beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
         found = _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
-        return found or _label_of(scene, _polygons_near(scene.parent))
+        found = found or _label_of(scene, _polygons_near(scene.parent))
+        return None if found is None else within(scene, found, _home(scene.parent))
     except PermissionError:  # the folder cannot be listed
         return None
+
+
+def _home(folder: Path) -> Path:
+    """Return the folder that images and labels share."""
+    return folder.parent if is_image_folder(folder) else folder
 
 
 def is_label_name(path: Path) -> bool:
@@ -208,7 +217,7 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
     if not settings.labels:
         return None, ""
     name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
-    address = settings.path.parent / name
+    address = stated_file(settings.path.parent, name, f"{settings.path}: labels")
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""

@@ -35,6 +35,7 @@ from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
 from spectralzoom.storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_files import bands_text
 from spectralzoom.storage.readers.zarr_files import find_zarr_store
 
@@ -80,7 +81,7 @@ def find_cubes(path: Path) -> list[Path]:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     if cubes and stores:
         raise SceneError(f"{path} holds ENVI cubes and the Zarr store {stores[0].name}; name one, or move either kind")
-    return cubes or stores
+    return [within(path, one) for one in cubes or stores]
 
 
 def _stem(path: Path) -> str:
@@ -152,7 +153,7 @@ def reference_files(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, 
         beside = [stem.with_name(f"{stem.name}.{kind}{ending}") for ending in (".hdr", ".npy")]
         if (file := stated.get(kind)) is not None and not file.exists():
             raise SceneError(f"there is no file {file}; check the name (seen from {Path.cwd()})")
-        file = file or next((one for one in beside if one.is_file()), None)
+        file = file or next((within(stem.parent, one) for one in beside if one.is_file()), None)
         files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
     return files
 
@@ -418,4 +419,4 @@ def _csv_cells(path: Path) -> tuple[list[str], dict[int, list[str]]]:
 def find_pointing(folder: Path, stem: str) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)

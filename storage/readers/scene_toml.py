@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, Validat
 
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.storage.readers.cube_sources import Bands
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.whole_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
@@ -76,8 +77,11 @@ def find_scene_settings(scene: Path) -> SceneSettings:
     Raises SceneError: the file is no TOML, or has an unknown key or a wrong value.
     """
     folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
-    found = next((path for folder in folders if (path := folder / SETTINGS_NAME).is_file()), None)
-    return SceneSettings() if found is None else load_scene_settings(found)
+    home = next((folder for folder in folders if (folder / SETTINGS_NAME).is_file()), None)
+    if home is None:
+        return SceneSettings()
+    beside = None if scene.name == SETTINGS_NAME else scene.resolve().parent
+    return load_scene_settings(within(home, home / SETTINGS_NAME, beside))
 
 
 def is_image_folder(folder: Path) -> bool:
@@ -154,7 +158,11 @@ def settle_wavelengths(
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
         return _from_file(
-            settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands, path
+            stated_file(settings.path.parent, settings.wavelengths_file, f"{settings.path}: wavelengths_file"),
+            settings.dropped_bands,
+            chosen,
+            file_bands,
+            path,
         )
     if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
         centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
