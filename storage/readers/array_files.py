@@ -8,13 +8,17 @@ good bands, which lie in a group of their own.
 from __future__ import annotations
 
 import importlib
+import io
+import math
 import mmap
+import struct
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -22,7 +26,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_cubes import Arrays, FileArray
-from spectralzoom.storage.readers.checked_chunks import outside_links, read_hdf5
+from spectralzoom.storage.readers.checked_chunks import WIDEST, outside_links, read_hdf5, unpack
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO
 
 ARRAY_ENDINGS = (".npy", ".mat")
@@ -32,6 +36,8 @@ MOST_UNEVEN = 16  # times that a picture is longer than wide
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
+_MAT_MATRIX, _MAT_PACKED = 14, 15  # kinds of elements
+_MAT_HEAD = 4096  # bytes for sizes and name of an array
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -76,23 +82,48 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str, kind: str) -> NDArray[Any]:
+    def load(name: str, number: int, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
+        most = 2 * WIDEST * math.prod(shape) + _MAT_HEAD  # complex numbers are two
         with _mapped(path) as content:
-            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
+            values = np.asarray(scipy_io.loadmat(_plain_mat(content, most, number), variable_names=[name])[name])
         if np.iscomplexobj(values):
             raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
         return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
-        listed = scipy_io.whosmat(content)
+        listed = scipy_io.whosmat(_plain_mat(content, _MAT_HEAD))
     size = path.stat().st_size
-    ratio = 8 * DEFLATE_RATIO  # a double may be one byte
-    return {
-        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, ratio)
-        for name, shape, kind in listed
-        if kind in _MATLAB
-    }
+    found: dict[str, FileArray] = {}
+    for number, (name, shape, kind) in enumerate(listed):
+        if kind in _MATLAB:
+            read = partial(load, name, number, shape, kind)
+            ratio = 8 * DEFLATE_RATIO  # a double may be one byte
+            found[name] = _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), read, size, ratio)
+    return found
+
+
+def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> IO[bytes]:
+    """Return a .mat file without packing: the first ``most`` bytes of each element, or all of the ``wanted`` one.
+
+    ValueError: the wanted element has more of them.
+    """
+    if 0 in content[:4]:  # version 4 packs nothing
+        return io.BytesIO(content)
+    parts = [content[:128]]
+    order = "<II" if content[126:128] == b"IM" else ">II"
+    at, number = 128, 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack(order, content[at : at + 8])
+        if wanted in (None, number):
+            body = content[at + 8 : at + 8 + (size if kind == _MAT_PACKED else min(size, most))]
+            if kind == _MAT_PACKED:
+                plain = zlib.decompressobj().decompress(body, most) if wanted is None else unpack("zlib", body, most)
+                kind, body = _MAT_MATRIX, plain[8:]
+            parts += [struct.pack(order, kind, len(body)), body]
+        at += 8 + size
+        number += 1
+    return io.BytesIO(b"".join(parts))
 
 
 @contextmanager
