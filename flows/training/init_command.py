@@ -24,7 +24,7 @@ from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsErro
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.readers import label_files
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
+from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable, with_wavelengths
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 from spectralzoom.storage.whole_files import write_whole
 
@@ -221,7 +221,7 @@ def draft_scene(address: str | Path, known: SceneSettings = SceneSettings()) -> 
             way = f"give a folder of images, or with images/ in it{label_files.folders_within(path)}"
             raise SceneError(f"{path} holds no image that is read; {way}")
         first = found.images[0]
-    source = with_wavelengths(open_cube(first), first, None)
+    source = with_wavelengths(open_cube_source(first), first, None)
     classes, unseen = _classes(found, source.shape[2], known)
     return SceneDraft(found, source, classes, unseen)
 
@@ -235,7 +235,7 @@ def _classes(
     unseen: list[str] = []
     for image, label in found.labels.items():
         try:
-            source = open_cube(image)
+            source = open_cube_source(image)
             labels = label_files.read_labels(label, source.shape[:2], source.geobox, settings)
         except PipelineError as error:
             unseen.append(str(error))

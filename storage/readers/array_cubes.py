@@ -1,93 +1,44 @@
 """Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy and .mat.
 
-Axes are found by their names; without names they are y, x and band. Values follow from scale, offset and fill value,
-the place on the earth from a grid mapping.
+Axes are found by their names; without names they are y, x and band. xarray decodes scale, offset, fill value and
+unsigned numbers; the valid range, which it leaves out, is applied here.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.arrays.georeference import find_geobox
-from spectralzoom.storage.readers.cube_sources import (
-    BLOCK_LINES,
-    MOST_RATIO,
-    Bands,
-    CubeSource,
-    Guard,
-    check_claim,
-    check_memory,
-    read_by_chunks,
-    unpacked,
-)
+from spectralzoom.storage.readers.array_files import Arrays, FileArray
+from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, Guard, read_by_chunks
 
-ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
-_ACROSS = ("crosstrack", "across_track")
+_ALONG = ("downtrack", "along_track", "number_of_lines")
+_ACROSS = ("crosstrack", "across_track", "pixels_per_line")
+ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", *_ALONG)
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
-BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
+BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel", "channels", "spectral")
 WAVELENGTHS = (
     *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
-    *("wl", "lambda", "nm"),
+    *("wl", "lambda", "nm", "wavelength_3d"),
 )
 METRES = {"m", "meter", "meters", "metre", "metres"}
 
 UNNAMED = "dims have no names, read as y, x, band"
+GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
+MOST_UNEVEN = 16  # times that a picture is longer than wide
 _SHOWN = 5  # arrays in a note
-
-
-@dataclass(frozen=True)
-class FileArray:
-    """One array of a file: its axes, attributes, and the function that reads a part of it.
-
-    ``_ARRAY_DIMENSIONS`` in its attributes are the names of its axes, if they have names.
-    """
-
-    where: str  # address, for messages
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    attrs: Mapping[str, Any]
-    get: Callable[[Any], NDArray[Any]] = field(repr=False)
-    chunks: tuple[int, ...]  # numbers along each axis that are read at a time
-    stored: int  # bytes on the disk that it may take
-    ratio: int = MOST_RATIO  # bytes of numbers that one of them can be
-    lost: str = ""  # note on parts without a file
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    @property
-    def dims(self) -> list[str]:
-        """Return the names of the axes; empty if there are none."""
-        named = self.attrs.get("_ARRAY_DIMENSIONS")
-        return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
-
-    def __getitem__(self, part: Any) -> NDArray[Any]:
-        if part is ...:
-            self.check(self.shape)
-        return self.get(part)
-
-    def check(self, part: Sequence[int]) -> None:
-        """Refuse an array that its file, or a ``part`` of it that the memory, cannot hold (SceneError)."""
-        claimed = max(math.prod(self.shape), math.prod(self.chunks)) * self.dtype.itemsize
-        check_claim(self.where, claimed, self.stored, self.ratio)
-        needed = self.dtype.itemsize
-        for size, chunk, wanted in zip(self.shape, self.chunks, part, strict=True):
-            needed *= min(-(-wanted // chunk) + 1, -(-size // chunk)) * chunk
-        check_memory(self.where, needed)
-
-
-Arrays = Mapping[str, FileArray]  # by name, or by path within a file
 
 
 @dataclass(frozen=True)
@@ -100,9 +51,9 @@ class ArrayCube:
     notes: tuple[str, ...] = ()
 
     @property
-    def dims(self) -> list[str]:
+    def dims(self) -> Sequence[str]:
         """Return names of all axes, or those of their order if they have none."""
-        return self.array.dims or ["y", "x", "band"]
+        return self.array.dims or ("y", "x", "band")
 
 
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
@@ -119,22 +70,13 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool 
 def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any], guard: Guard) -> CubeSource:
     """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
 
-    Lines of an array with scale or offset are float32, NaN where there is no value. So are whole numbers with a valid
-    range but no fill value. Raises SceneError: the cube claims more than its file or the memory can hold.
+    Packed lines are float32, NaN where there is no value. Whole numbers with one fill value and no valid range stay
+    whole. Raises SceneError: the cube claims more than its file or the memory can hold.
     """
     array, order = cube.array, cube.order
     array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
-    scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
-    unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
-    stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
-    given = [np.ravel(array.attrs[name]) for name in ("_FillValue", "missing_value") if name in array.attrs]
-    given = [one for one in given if one.dtype.kind in "iuf"]
-    missing = list(dict.fromkeys(float(number) for one in given for number in _as_stored(one, stored)))
-    fill = missing[0] if missing else None
-    low, high = _valid_range(array.attrs, stored)
-    checked = len(missing) > 1 or (low, high) != (-np.inf, np.inf)
-    plain = scale in (None, 1.0) and offset in (None, 0.0)
-    plain = plain and (stored.kind == "f" or fill is not None or not checked)  # whole numbers have no NaN
+    about = _packing_of(array.attrs)
+    values = _Values.of(about, array.dtype.newbyteorder("="))
     sizes = [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
@@ -143,28 +85,130 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
         selection[order[0]] = slice(start, stop)
         with guard():
             block = np.transpose(np.asarray(array[tuple(selection)]), order)
-        native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
-        native = (native[..., None] if native.ndim == 2 else native).view(stored)
-        out = (native < low) | (native > high) | np.isin(native, missing[1:]) if checked else np.False_
-        if not plain:
-            values = unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
-            return np.where(out, np.float32(np.nan), values) if checked else values
-        return np.where(out, stored.type(np.nan if fill is None else fill), native) if out.any() else native
+            native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
+            native = native[..., None] if native.ndim == 2 else native
+            return values.of_numbers(native)
 
     dims = cube.dims[order[0]], cube.dims[order[1]]
     geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
     return CubeSource(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
-        dtype=stored if plain else np.dtype(np.float32),
+        dtype=values.dtype,
         read=read_by_chunks(read, sizes[0], array.chunks[order[0]]),
         files=(path,),
         bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
-        nodata=fill if plain else None,
+        nodata=values.nodata,
         geobox=geobox,
-        scaling=f"{stored} without {missing}, {low} to {high}" if unsigned or checked else "",
-        notes=(*cube.notes, *notes),
+        scaling="" if values.plain else json.dumps({key: np.ravel(one).tolist() for key, one in sorted(about.items())}),
+        notes=(*array.notes, *cube.notes, *notes),
     )
+
+
+_CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
+_FILLS = ("_FillValue", "missing_value")
+_ENDS = ("valid_range", "valid_min", "valid_max")
+
+
+def _packing_of(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of packing that can be used: numbers, and _Unsigned."""
+    known = {name: attributes[name] for name in (*_FILLS, *_ENDS) if name in attributes}
+    known = {name: value for name, value in known.items() if np.asarray(value).dtype.kind in "iuf"}
+    factors = {name: np.ravel(attributes[name]) for name in _CODED[:2] if name in attributes}
+    known |= {name: np.float64(one[0]) for name, one in factors.items() if one.size == 1 and one.dtype.kind in "iuf"}
+    if "_Unsigned" in attributes:
+        known["_Unsigned"] = str(attributes["_Unsigned"]).lower()
+    return known
+
+
+@dataclass(frozen=True)
+class _Values:
+    """How the numbers of a file become values."""
+
+    stored: np.dtype[Any]
+    coded: Mapping[str, Any]
+    fills: tuple[float, ...]  # as values
+    low: float | None
+    high: float | None
+
+    @classmethod
+    def of(cls, about: Mapping[str, Any], stored: np.dtype[Any]) -> _Values:
+        """Return the rule by the attributes of an array."""
+        coded = {name: about[name] for name in _CODED if name in about}
+        if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
+            coded = {name: value for name, value in coded.items() if name == "_Unsigned"}
+        listed = [number for name in _FILLS for number in np.ravel(about.get(name, ()))]
+        fills = [_as_value(number, coded, stored) for number in listed]
+        pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
+        pair = pair if np.size(pair) == 2 else (None, None)
+        ends = [None if end is None else _end_as_value(end, coded, stored) for end in pair]
+        low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
+        return cls(stored, coded, tuple(dict.fromkeys(one for one in fills if one is not None)), low, high)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the numbers are the values, with one no-data value at most."""
+        return not self.coded and len(self.fills) < 2 and self.low is None and self.high is None
+
+    @property
+    def whole(self) -> bool:
+        """Whether values are whole numbers; without a no-data value those out of the valid range would be lost."""
+        has_nodata = bool(self.fills) or (self.low is None and self.high is None)
+        return self.stored.kind in "biu" and not set(self.coded) - {"_Unsigned"} and has_nodata
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        as_stored = self.plain or self.whole
+        return _decoded(np.zeros(1, self.stored), self.coded).dtype if as_stored else np.dtype(np.float32)
+
+    @property
+    def nodata(self) -> float | None:
+        """Return the no-data value; None where NaN stands for it."""
+        return self.fills[0] if self.fills and (self.plain or self.whole) else None
+
+    def of_numbers(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return values of `dtype`; the no-data value, or NaN without one, where a number is no value."""
+        if self.plain:
+            return numbers
+        values = _decoded(numbers, self.coded)
+        with np.errstate(invalid="ignore"):
+            out = np.isin(values, self.fills[1:] if self.whole else self.fills)
+            out |= False if self.low is None else values < self.low
+            out |= False if self.high is None else values > self.high
+        values = values.astype(self.dtype, copy=False)
+        void = np.nan if self.nodata is None else self.nodata
+        return np.where(out, values.dtype.type(void), values) if out.any() else values
+
+
+def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
+    """Return numbers of a file as values, decoded by xarray."""
+    packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
+    return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
+
+
+def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
+    """Return a number of an attribute as the value that it stands for; None where the file cannot hold it."""
+    if stored.kind == "f":
+        return float(number)
+    if not np.isfinite(number) or int(number) != number:
+        return None
+    held, limits = int(number), np.iinfo(stored)
+    if "_Unsigned" in coded and not limits.min <= held <= limits.max:  # written with the other sign
+        held = (held - int(limits.min)) % 2 ** (8 * stored.itemsize) + int(limits.min)
+    if not limits.min <= held <= limits.max:
+        return None
+    return float(_decoded(np.array([held], stored), coded)[0])
+
+
+def _end_as_value(end: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
+    """Return an end of the valid range as a value; None if it leaves nothing out.
+
+    Floating ends of whole numbers with a scale are values, others are packed as the numbers are (NetCDF Users Guide,
+    Attribute Conventions).
+    """
+    if stored.kind in "biu" and np.asarray(end).dtype.kind == "f" and set(coded) - {"_Unsigned"}:
+        return float(end)
+    return _as_value(end, coded, stored)
 
 
 def place_or_note(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[str, ...]]:
@@ -269,23 +313,37 @@ def _word(name: str) -> str:
     return name.rpartition("/")[2].lower()
 
 
-def _valid_range(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[float, float]:
-    """Return the smallest and largest valid number of an array, before scale and offset."""
-    pair = attributes.get("valid_range", (attributes.get("valid_min"), attributes.get("valid_max")))
-    ends = [None if one is None else np.ravel(one) for one in pair] if np.size(pair) == 2 else [None, None]
-    low, high = (None if one is None or one.dtype.kind not in "iuf" else _as_stored(one, stored)[0] for one in ends)
-    return -np.inf if low is None else float(low), np.inf if high is None else float(high)
-
-
-def _as_stored(numbers: NDArray[Any], stored: np.dtype[Any]) -> NDArray[Any]:
-    """Return numbers of an attribute as those of an unsigned array that is stored with a sign."""
-    signed = stored.kind == "u" and numbers.dtype.kind == "i" and (numbers < 0).any()
-    return numbers % 2 ** (8 * stored.itemsize) if signed else numbers
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
 def _unit(attributes: Mapping[str, Any]) -> str:
     return str(attributes.get("units", attributes.get("unit", ""))).strip().lower()
+
+
+def check_picture(shape: tuple[int, ...], where: object) -> None:
+    """Refuse a scene of one band that is a table of spectra (SceneError)."""
+    if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
+        return
+    turned = ".T" if shape[0] < shape[1] else ""
+    raise SceneError(
+        f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
+        f" If its {'columns' if turned else 'rows'} are spectra, store a cube: numpy.reshape(values{turned}, "
+        f"(height, width, {min(shape)}), order='F'), or order='C' if pixels go along the rows"
+    )
+
+
+def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
+    """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
+    groups = name.split("/")[:-1]
+    heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
+    return {
+        path.removeprefix(head): array
+        for head in heads
+        for path, array in arrays.items()
+        if path.startswith(head) and "/" not in path.removeprefix(head)
+    } | {path: array for path, array in arrays.items() if "/" in path}
+
+
+def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:
+    """Return the bands (from 0) that a list of good bands marks by 0."""
+    for name, array in arrays.items():
+        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
+            return tuple(np.flatnonzero(array[...] == 0).tolist())
+    return ()

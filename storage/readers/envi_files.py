@@ -237,6 +237,9 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
+        for begin, part in parts.items():
+            if begin <= start < stop <= begin + len(part.values):
+                return part.values[start - begin : stop - begin].astype(native, order="C")
         block = np.zeros((stop - start, samples, count), native)
         for begin, part in parts.items():
             low, high = max(start, begin), min(stop, begin + len(part.values))

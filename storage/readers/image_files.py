@@ -37,6 +37,7 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
+from spectralzoom.storage.readers.orientation import orientation_of, upright
 from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
@@ -126,7 +127,8 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
                 void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
             ),
         )
-    return source if not scaled or ((scale == 1).all() and (offset == 0).all()) else rescaled(source, scale, offset)
+    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
+    return upright(source if plain else rescaled(source, scale, offset), orientation_of(path))
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:

@@ -16,7 +16,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_toml import ClassValue, Colour
 
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
@@ -139,7 +139,7 @@ def load_codes(
     A file with a place is resampled to ``geobox`` by nearest neighbour. Raises SceneError: the file cannot be read,
     holds fractions, or lies beside the geobox.
     """
-    source = open_cube(address, labels=True)
+    source = open_cube_source(address, labels=True)
     codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address)
     notes: list[str] = []
     if source.nodata is not None and source.nodata.is_integer():

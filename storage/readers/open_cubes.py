@@ -10,19 +10,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
-from spectralzoom.storage.readers.array_files import (
-    ARRAY_ENDINGS,
-    HDF_ENDINGS,
+from spectralzoom.storage.readers.array_cubes import (
+    UNNAMED,
     check_picture,
+    cube_source,
+    find_cube,
     in_scope,
-    list_arrays,
-    load_npy,
     marked_bands,
 )
+from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store, list_arrays, load_npy
 from spectralzoom.storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
 from spectralzoom.storage.readers.envi_files import (
     DATA_ENDINGS,
@@ -34,7 +34,6 @@ from spectralzoom.storage.readers.envi_files import (
 )
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
-from spectralzoom.storage.readers.zarr_files import find_zarr_store, zarr_arrays
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
@@ -73,7 +72,22 @@ def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image
     return "envi" if of_envi else "none"
 
 
-def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
+def open_cube(address: str | Path) -> xr.DataArray:
+    """Open a cube (y, x, band); values are read when they are needed.
+
+    ``address`` is an image, .npy, .mat, ENVI, NetCDF or HDF5 file, a Zarr store or the folder of a Headwall camera; it
+    may name an array: ``FILE.mat:ARRAY``. Scale and offset of the file are applied. Coordinates, where the file has
+    them: ``wavelength`` and ``fwhm`` [nm] and ``bad_band`` along band; ``x``, ``y`` and ``spatial_ref`` of the place;
+    ``valid``, ``time_s`` and ``exposure_ms`` of each line; ``void`` of transparent and masked pixels; the frames
+    ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out, ``files``,
+    ``wavelengths_from`` and ``_FillValue``. Raises SceneError: there is no such file, it is damaged, or its kind or
+    shape cannot be used.
+    """
+    source = open_cube_source(address)
+    return with_wavelengths(source, address, None).data_array()
+
+
+def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource:
     """Open a cube; only headers, and coordinates of arrays, are read.
 
     ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
@@ -123,13 +137,12 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
     ending = path.suffix.lower()
     guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
     with guard():
-        arrays, about = zarr_arrays(path) if path.is_dir() else list_arrays(path)
+        arrays, about = list_arrays(path)
         cube = find_cube(arrays, variable, path, labels=labels)
         near = in_scope(arrays, cube.name)
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
         notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
-        notes += [f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else []
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
         source = replace(source, bad_bands=marked_bands(near, source.shape[2]), notes=(*notes, *plain))
         if path.is_dir():
@@ -139,7 +152,7 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
 
 def load_labels_array(address: str | Path) -> NDArray[Any]:
     """Read a file of labels or a mask without its scale, (y, x, band) (SceneError)."""
-    source = open_cube(address, labels=True)
+    source = open_cube_source(address, labels=True)
     return source.read(0, source.shape[0])
 
 
@@ -160,7 +173,7 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
         files = find_envi_pair(path)
         values = open_envi_cube(path).values
     else:
-        source = open_cube(address)
+        source = open_cube_source(address)
         values = source.read(0, source.shape[0])
     values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
     if values.dtype.kind not in "uif":

@@ -32,12 +32,12 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.signal.calibrate import Floats, find_bad_elements, full_scale_notes
 from spectralzoom.pipeline.source import References
+from spectralzoom.storage.readers.array_files import find_zarr_store
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, find_reference, load_envi_header
-from spectralzoom.storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
+from spectralzoom.storage.readers.open_cubes import load_frame, open_cube_source, reader_of, with_wavelengths
 from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_files import bands_text
-from spectralzoom.storage.readers.zarr_files import find_zarr_store
 
 FRAMES = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
 SAMPLED_LINES = 64  # for bits
@@ -93,7 +93,7 @@ def _stem(path: Path) -> str:
 
 def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
     """Open one cube of whole numbers with wavelengths."""
-    source = open_cube(path)
+    source = open_cube_source(path)
     if source.dtype not in (np.uint8, np.uint16, np.int16):
         raise SceneError(
             f"{path} holds {source.dtype}{' by the scale or offset in its header' if source.scaling else ''}, expected "

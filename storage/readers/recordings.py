@@ -35,6 +35,7 @@ from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, scan_positi
 from spectralzoom.pipeline.ground.georeference import geobox_of_record
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
+from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import find_envi_pair, load_envi_header
 from spectralzoom.storage.readers.open_cubes import reader_of
@@ -51,7 +52,6 @@ from spectralzoom.storage.readers.recorded_files import (
     open_recorded_cube,
     with_bits,
 )
-from spectralzoom.storage.readers.zarr_files import lost_chunks
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256

@@ -28,7 +28,7 @@ from spectralzoom.storage.readers.cube_sources import (
 )
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
-from spectralzoom.storage.readers.open_cubes import open_cube, split_variable
+from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
 from spectralzoom.storage.readers.scene_toml import (
     SETTINGS_NAME,
     ClassValue,
@@ -94,7 +94,7 @@ def open_scene_file(
     WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(address)
-    source = open_cube(address)
+    source = open_cube_source(address)
     settings = find_scene_settings(file)
     height, width, count = source.shape
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
@@ -105,7 +105,7 @@ def open_scene_file(
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
     missing, filled_px, void, gaps = _find_gaps(file, values, kept)
-    found, label_note = _labels_of(file, source.shape[:2], source.geobox, labels, settings, classes or {})
+    found, label_note = _labels_of(file, source, labels, settings, classes or {})
     content = _content_hash(file, source.files)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     how, of_mask = values.notes(settings.path)
@@ -191,8 +191,7 @@ def _chosen_bands(
 
 def _labels_of(
     scene: Path,
-    shape: tuple[int, int],
-    geobox: GeoBox | None,
+    source: CubeSource,
     stated: str | Path | None,
     settings: SceneSettings,
     classes: Mapping[str, ClassValue],
@@ -202,21 +201,31 @@ def _labels_of(
     address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
     if address is None:
         return None, (why_none,) if why_none else ()
-    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
     try:
-        found = read_labels(address, shape, geobox, known)
+        found, notes = _read(address, source.shape[:2], source.geobox, settings, classes)
     except SceneError as error:
-        raise SceneError(f"{error}{FOUND}" if by_name else str(error)) from error
+        turned = "".join(f"; {note}" for note in source.notes if "orientation tag" in note)
+        raise SceneError(f"{error}{turned}{FOUND if by_name else ''}") from error
+    return found, ((f"{notes[0]}, found by its name" if by_name else notes[0]), *notes[1:])
+
+
+def _read(
+    address: str | Path,
+    shape: tuple[int, int],
+    geobox: GeoBox | None,
+    settings: SceneSettings,
+    classes: Mapping[str, ClassValue],
+) -> tuple[Labels, tuple[str, ...]]:
+    """Read labels, and return notes on where they and their classes come from (SceneError: they do not fit)."""
+    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
+    found = read_labels(address, shape, geobox, known)
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    return found, (f"labels from {address}{', found by its name' if by_name else ''}, {how}", *found.notes)
+    return found, (f"labels from {address}, {how}", *found.notes)
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
     """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
-    file, _ = split_variable(address)
-    found, notes = _labels_of(file, shape, None, address, find_scene_settings(file), {})
-    assert found is not None
-    return found, notes
+    return _read(address, shape, None, find_scene_settings(split_variable(address)[0]), {})
 
 
 def _digest(*parts: object) -> str:

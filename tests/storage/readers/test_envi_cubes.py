@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.envi_headers import parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.envi_files import load_envi_header, open_envi_cube
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
 AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
@@ -44,7 +44,7 @@ def test_truncated_cubes_keep_their_whole_lines(tmp_path: Path, interleave: str)
             with pytest.raises(SceneError, match=f"holds {there} bytes after an offset of 10, no whole line"):
                 open_envi_cube(path)
             continue
-        cube, source = open_envi_cube(path), open_cube(path)
+        cube, source = open_envi_cube(path), open_cube_source(path)
         assert (cube.lost_lines, (~source.valid).sum(), source.shape) == (5 - held, 5 - held, (5, 3, 2))
         assert cube.notes == ((f"a.img is cut off: {held} of 5 lines are whole",) if held < 5 else ())
         np.testing.assert_array_equal(cube.values, values[:held])
@@ -213,7 +213,7 @@ def test_huge_claims_are_refused_from_the_size_of_the_file(tmp_path: Path, text:
     (tmp_path / "a.bin").write_bytes(bytes(48))
     tracemalloc.start()
     with pytest.raises(SceneError, match="no whole line"):
-        open_cube(tmp_path / "a.hdr")
+        open_cube_source(tmp_path / "a.hdr")
     assert tracemalloc.get_traced_memory()[1] < 1 << 18
     tracemalloc.stop()
 
@@ -222,10 +222,10 @@ def test_lines_beyond_the_file_are_flagged_or_left_out(tmp_path: Path) -> None:
     """A few missing lines are flagged; of 10^12 claimed lines the missing ones are left out with a note."""
     (tmp_path / "a.bin").write_bytes(bytes(48))
     (tmp_path / "a.hdr").write_text(PLAIN.replace("lines = 3", "lines = 5"))
-    source = open_cube(tmp_path / "a.hdr")
+    source = open_cube_source(tmp_path / "a.hdr")
     assert (source.shape[0], (~source.valid).sum()) == (5, 2)
     (tmp_path / "a.hdr").write_text(PLAIN.replace("lines = 3", "lines = 1000000000000"))
-    source = open_cube(tmp_path / "a.hdr")
+    source = open_cube_source(tmp_path / "a.hdr")
     assert (source.shape[0], (~source.valid).sum()) == (3, 0)
     assert any("999999999997 lines that a.bin lacks are not filled up" in note for note in source.notes)
 
@@ -256,7 +256,7 @@ def test_gains_and_offsets_of_bands_are_applied(tmp_path: Path) -> None:
     header = path.with_suffix(".hdr")
     text = header.read_text()
     header.write_text(text + "data gain values = {0.5, 2}\ndata offset values = {1, 0}\n")
-    assert open_cube(path).read(0, 1).tolist() == [[[1, 2], [2, 6], [3, 10]]]
+    assert open_cube_source(path).read(0, 1).tolist() == [[[1, 2], [2, 6], [3, 10]]]
     header.write_text(text + "data gain values = {0.5}\n")
     with pytest.raises(SceneError, match="expected 2 numbers; correct the header"):
-        open_cube(path)
+        open_cube_source(path)
