@@ -216,9 +216,10 @@ def read_hdf5(dataset: h5py.Dataset, part: Any) -> NDArray[Any]:
     if max(stored.values(), default=0) <= HARMLESS_BYTES:
         return np.asarray(dataset[part])
     part = (slice(None),) * dataset.ndim if part is ... else part
-    start, stop = zip(*(one.indices(size)[:2] for one, size in zip(part, dataset.shape, strict=True)), strict=True)
-    out = np.full([max(b - a, 0) for a, b in zip(start, stop, strict=True)], dataset.fillvalue, dataset.dtype)
-    for inside in dataset.iter_chunks(part):
+    ends = [one.indices(size) for one, size in zip(part, dataset.shape, strict=True)]
+    start = [first for first, _, _ in ends]
+    out = np.full([max(stop - first, 0) for first, stop, _ in ends], dataset.fillvalue, dataset.dtype)
+    for inside in dataset.iter_chunks(tuple(slice(*one) for one in ends)) if out.size else ():
         origin = tuple(one.start // chunk * chunk for one, chunk in zip(inside, dataset.chunks, strict=True))
         if not stored.get(origin):
             continue  # never written
