@@ -203,12 +203,12 @@ def read_hdf5(dataset: h5py.Dataset, part: Any) -> NDArray[Any]:
     """
     plist = dataset.id.get_create_plist()
     filters = [(found[0], found[2]) for found in map(plist.get_filter, range(plist.get_nfilters()))]
-    codes = {code for code, _ in filters}
-    allowed = {_SHUFFLE, _FLETCHER32, _DEFLATE if _DEFLATE in codes else _LZF}
-    if unknown := codes - allowed:
+    codes = [code for code, _ in filters]
+    allowed = [_SHUFFLE, _FLETCHER32, _DEFLATE if _DEFLATE in codes else _LZF]  # each once
+    if any(code not in allowed or codes.count(code) > 1 for code in codes):
         raise SceneError(
-            f"{dataset.file.filename}:{dataset.name} is packed by the HDF5 filter {min(unknown)}, which is not read; "
-            "write it with deflate (h5repack -f GZIP=4)"
+            f"{dataset.file.filename}:{dataset.name} is packed by the HDF5 filters {codes}, of which one of deflate "
+            "and lzf, shuffle and fletcher32 are read, each once; write it with deflate (h5repack -f GZIP=4)"
         )
     stored: dict[tuple[int, ...], int] = {}
     if _DEFLATE in codes:
