@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import importlib
-import io
 import math
 import mmap
 import os
@@ -20,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -145,13 +144,13 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     return found
 
 
-def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> IO[bytes]:
+def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> mmap.mmap:
     """Return a .mat file without packing: the first ``most`` bytes of each element, or all of the ``wanted`` one.
 
     ValueError: the wanted element has more of them.
     """
     if 0 in content[:4]:  # version 4 packs nothing
-        return io.BytesIO(content)
+        return content
     parts = [content[:128]]
     order = "<II" if content[126:128] == b"IM" else ">II"
     at, number = 128, 0
@@ -162,10 +161,27 @@ def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> IO[b
             if kind == _MAT_PACKED:
                 plain = zlib.decompressobj().decompress(body, most) if wanted is None else unpack("zlib", body, most)
                 kind, body = _MAT_MATRIX, plain[8:]
+            _check_parts(body, order, 3 if wanted is None else 5)  # flags, sizes and name, and numbers
             parts += [struct.pack(order, kind, len(body)), body]
         at += 8 + size
         number += 1
-    return io.BytesIO(b"".join(parts))
+    whole = b"".join(parts)
+    plain_file = mmap.mmap(-1, len(whole))
+    plain_file.write(whole)
+    plain_file.seek(0)
+    return plain_file
+
+
+def _check_parts(body: bytes, order: str, count: int) -> None:
+    """Refuse an element of which one of the first parts claims more bytes than it has (ValueError)."""
+    at = 0
+    for _ in range(count):
+        if at + 8 <= len(body):
+            kind, size = struct.unpack(order, body[at : at + 8])
+            size = 0 if kind >> 16 else size  # up to four bytes lie within the eight
+            if size > len(body) - at - 8:
+                raise ValueError(f"a part of an array claims {size} bytes, and {len(body) - at - 8} are there")
+            at += 8 + -(-size // 8) * 8
 
 
 @contextmanager

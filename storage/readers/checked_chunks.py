@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import bz2
+import gzip
+import io
 import json
 import math
 import zlib
@@ -27,9 +29,10 @@ from zarr.storage import WrapperStore
 
 from spectralzoom.pipeline.errors import SceneError
 
+_ZSTD, _ZSTD_SKIPPED = 0xFD2FB528, 0x184D2A50  # with which frames begin
 _NAME = "spectralzoom.checked"  # of the codec that stands for a packer in metadata
 SPARE_BYTES = 1024  # of checksums within a chunk
-HARMLESS_BYTES = 256 << 10  # of a deflated chunk, which makes 270 MB of them at most
+HARMLESS_BYTES = 128 << 10  # of a deflated chunk, which makes 135 MB of them at most
 WIDEST = 8  # bytes of a number: filters may store it in another type
 PACKERS = ("blosc", "zstd", "gzip", "zlib", "bz2", "lz4")
 PLAIN_CODECS = {
@@ -39,46 +42,46 @@ PLAIN_CODECS = {
 }
 
 
-def unpack(packer: str, data: Any, most: int) -> bytes:
-    """Return the decoded bytes of a chunk (ValueError: they are more than ``most``, or the chunk is damaged)."""
-    plain: Any = data.view(np.uint8) if isinstance(data, np.ndarray) else data
-    data = memoryview(plain)
-    if packer in ("gzip", "zlib", "bz2"):
-        return _unpack_stream(packer, data, most)
-    size = zstd_size(data) if packer == "zstd" else _number(data[4:8] if packer == "blosc" else data[:4])
-    _check(packer, size or 0, most)
-    decode = numcodecs.get_codec({"id": packer}).decode
-    if size is None:  # numcodecs demands that it fills all of the array
-        return bytes(decode(data, np.empty(most, np.uint8)))
-    return bytes(decode(data))
-
-
-def _unpack_stream(packer: str, data: Any, most: int) -> bytes:
-    """Return the bytes of all members of a stream whose size no header states."""
-    parts: list[bytes] = []
-    while data:
-        one: Any = bz2.BZ2Decompressor() if packer == "bz2" else zlib.decompressobj(31 if packer == "gzip" else 15)
-        parts.append(one.decompress(data, most + 1 - sum(map(len, parts))))
-        _check(packer, sum(map(len, parts)), most)
-        if not one.eof:
-            raise ValueError(f"a chunk packed by {packer} is cut off")
-        data = one.unused_data if packer != "zlib" else b""
-    return parts[0] if len(parts) == 1 else b"".join(parts)
+def unpack(packer: str, data: Any, size: int) -> bytes:
+    """Return the decoded bytes of a chunk of ``size`` bytes (ValueError: there are more, or the chunk is damaged)."""
+    most = size + SPARE_BYTES
+    view: Any = data.view(np.uint8) if isinstance(data, np.ndarray) else data
+    packed = memoryview(view)
+    plain: Any = None
+    if packer == "zlib":
+        stream = zlib.decompressobj()
+        plain = stream.decompress(packed, most + 1)
+        if not stream.eof and len(plain) <= most:
+            raise ValueError("a chunk packed by zlib is cut off")
+    elif packer in ("gzip", "bz2"):
+        with gzip.open(io.BytesIO(packed)) if packer == "gzip" else bz2.open(io.BytesIO(packed)) as file:
+            plain = file.read(most + 1)
+    else:
+        stated = zstd_size(packed) if packer == "zstd" else _number(packed[4:8] if packer == "blosc" else packed[:4])
+        if stated is None or stated <= most:  # numcodecs fills all of an array, or gives as many bytes as are stated
+            whole = np.empty(size, np.uint8) if stated is None else None
+            return bytes(numcodecs.get_codec({"id": packer}).decode(packed, whole))
+    if plain is None or len(plain) > most:
+        raise ValueError(f"a chunk packed by {packer} unpacks to more than the {size} bytes that its header declares")
+    return bytes(plain)
 
 
 def zstd_size(data: memoryview) -> int | None:
     """Return how many bytes all frames of a chunk hold by their headers; None if one does not say it."""
     total = at = 0
     while at < len(data):
-        if data[at + 1 : at + 4].tobytes() == b"\x2a\x4d\x18":  # a frame to be skipped
+        magic = _number(data[at : at + 4])
+        if magic & ~15 == _ZSTD_SKIPPED:
             at += 8 + _number(data[at + 4 : at + 8])
             continue
-        flags = data[at + 4] if at + 4 < len(data) else 0
+        if magic != _ZSTD or at + 4 == len(data):
+            raise ValueError("a chunk packed by zstd is damaged")
+        flags = data[at + 4]
         single = flags >> 5 & 1
         width = (single, 2, 4, 8)[flags >> 6]
-        at += 6 - single + (0, 1, 2, 4)[flags & 3]
         if not width:
             return None
+        at += 6 - single + (0, 1, 2, 4)[flags & 3]
         total += _number(data[at : at + width]) + 256 * (width == 2)
         at += width
         last = 0
@@ -92,11 +95,6 @@ def zstd_size(data: memoryview) -> int | None:
 
 def _number(data: memoryview) -> int:
     return int.from_bytes(data, "little")
-
-
-def _check(packer: str, size: int, most: int) -> None:
-    if size > most:
-        raise ValueError(f"a chunk packed by {packer} unpacks to more than the {most} bytes that its header declares")
 
 
 @dataclass(frozen=True)
@@ -117,8 +115,8 @@ class CheckedCodec(BytesBytesCodec):
         raise NotImplementedError
 
     async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> Buffer:
-        most = math.prod(chunk_spec.shape) * chunk_spec.dtype.to_native_dtype().itemsize + SPARE_BYTES
-        plain = await asyncio.to_thread(unpack, self.packer, chunk_data.as_numpy_array(), most)
+        size = math.prod(chunk_spec.shape) * chunk_spec.dtype.to_native_dtype().itemsize
+        plain = await asyncio.to_thread(unpack, self.packer, chunk_data.as_numpy_array(), size)
         return chunk_spec.prototype.buffer.from_bytes(plain)
 
 
@@ -127,14 +125,14 @@ class CheckedPacker(numcodecs.abc.Codec):  # type: ignore[misc]
 
     codec_id = _NAME
 
-    def __init__(self, packer: str, most: int) -> None:
-        self.packer, self.most = packer, most
+    def __init__(self, packer: str, size: int) -> None:
+        self.packer, self.size = packer, size
 
     def encode(self, buf: Any) -> Any:
         raise NotImplementedError
 
     def decode(self, buf: Any, out: Any = None) -> Any:
-        return numcodecs.compat.ndarray_copy(unpack(self.packer, buf, self.most), out)
+        return numcodecs.compat.ndarray_copy(unpack(self.packer, buf, self.size), out)
 
 
 register_codec(_NAME, CheckedCodec)
@@ -174,8 +172,9 @@ def _checked(codecs: Any, where: str, about: dict[str, Any]) -> Any:
     if kind in PACKERS:
         if "id" not in given:
             return {"name": _NAME, "configuration": {"packer": kind}}
-        width = WIDEST if about.get("filters") else np.dtype(about["dtype"]).itemsize
-        return {"id": _NAME, "packer": kind, "most": math.prod(about["chunks"]) * width + SPARE_BYTES}
+        plain = isinstance(about["dtype"], str)  # structures are not read
+        width = WIDEST if about.get("filters") else np.dtype(about["dtype"]).itemsize if plain else 0
+        return {"id": _NAME, "packer": kind, "size": math.prod(about["chunks"]) * width}
     if kind not in PLAIN_CODECS:
         raise SceneError(
             f"{where} asks for the codec {name!r}, which is not read; store plain numbers with {', '.join(PACKERS)}"
@@ -187,12 +186,7 @@ def _checked(codecs: Any, where: str, about: dict[str, Any]) -> Any:
     return codecs
 
 
-_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = (
-    h5py.h5z.FILTER_DEFLATE,
-    h5py.h5z.FILTER_SHUFFLE,
-    h5py.h5z.FILTER_FLETCHER32,
-    h5py.h5z.FILTER_LZF,
-)
+_DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000  # filters of HDF5
 
 
 def read_hdf5(dataset: h5py.Dataset, part: Any) -> NDArray[Any]:
@@ -233,10 +227,10 @@ def read_hdf5(dataset: h5py.Dataset, part: Any) -> NDArray[Any]:
 
 def _unfiltered(data: bytes, filters: list[tuple[int, tuple[int, ...]]], dataset: h5py.Dataset) -> NDArray[Any]:
     """Return the numbers of one chunk, of which ``filters`` (code, values) were applied in their order."""
-    most = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    size = math.prod(dataset.chunks) * dataset.dtype.itemsize
     for code, values in reversed(filters):
         if code == _DEFLATE:
-            data = unpack("zlib", data, most + SPARE_BYTES)
+            data = unpack("zlib", data, size)
         elif code == _FLETCHER32:
             data = numcodecs.Fletcher32().decode(data)
         else:
@@ -248,15 +242,13 @@ def outside_links(file: h5py.File) -> list[str]:
     """Return a sentence for each link, external array and virtual array of a file, which may lead to any other file."""
     found: list[str] = []
 
-    def visit_link(name: str, link: Any) -> None:
-        if isinstance(link, h5py.ExternalLink):
-            found.append(f"{name} is a link to {link.filename}:{link.path}")
-
     def visit(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+        if isinstance(item, h5py.ExternalLink):
+            found.append(f"{name} is a link to {item.filename}:{item.path}")
+        elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
             others = [one[0] for one in item.external or ()] or [one.file_name for one in item.virtual_sources()]
             found.append(f"{name} takes its numbers from {', '.join(others[:1]) or 'no file'}")
 
-    file.visititems_links(visit_link)
+    file.visititems_links(visit)
     file.visititems(visit)
     return found

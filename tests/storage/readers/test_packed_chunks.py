@@ -10,6 +10,7 @@ import sys
 import zlib
 from bz2 import compress as bz2_compress
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import zarr
 from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.checked_chunks import PACKERS, CheckedStore, read_hdf5, unpack, zstd_size
+from spectralzoom.storage.readers.checked_chunks import PACKERS, CheckedStore, read_hdf5, zstd_size
 from spectralzoom.storage.readers.open_cubes import open_cube_source
 
 CUBE = np.arange(4 * 6 * 5, dtype=np.uint16).reshape(4, 6, 5)
@@ -48,6 +49,7 @@ def codec(packer: str) -> Any:
     return numcodecs.get_codec({"id": packer})
 
 
+@cache
 def zeros(packer: str) -> bytes:
     """Return hundreds of MB of zeros in one packed chunk."""
     piece = bytes(PIECE_BYTES)
@@ -162,9 +164,22 @@ def test_zstd_frames_are_counted() -> None:
         assert zstd_size(memoryview(one)) == 4 * size
         skipped = b"\x50\x2a\x4d\x18" + struct.pack("<I", 3) + b"abc"
         assert zstd_size(memoryview(one + skipped + one)) == 8 * size
-    unsized = b"\x28\xb5\x2f\xfd\x00\x58" + struct.pack("<I", 1 | 6 << 3)[:3] + b"ab" * 3
-    assert zstd_size(memoryview(unsized)) is None
-    assert unpack("zstd", unsized, 6) == b"ab" * 3
+    with pytest.raises(ValueError, match="zstd is damaged"):
+        zstd_size(memoryview(one + b"more"))
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_zstd_without_a_size_is_read(tmp_path: Path, lost: int) -> None:
+    """Writers of streams do not know it; the chunk must fill the array."""
+    zarr.create_array(tmp_path / "a.zarr", data=CUBE, chunks=CUBE.shape)
+    numbers = CUBE.tobytes()[lost:]
+    block = (1 | len(numbers) << 3).to_bytes(3, "little") + numbers
+    (tmp_path / "a.zarr/c/0/0/0").write_bytes(b"\x28\xb5\x2f\xfd\x00\x58" + block)
+    if lost:
+        with pytest.raises(SceneError, match="cannot be read as Zarr"):
+            open_cube_source(tmp_path / "a.zarr").read(0, 4)
+    else:
+        np.testing.assert_array_equal(open_cube_source(tmp_path / "a.zarr").read(0, 4), CUBE)
 
 
 @pytest.mark.parametrize("how", [{}, {"shuffle": True}, {"shuffle": True, "fletcher32": True}])
