@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.arrays.georeference import find_geobox
 from spectralzoom.storage.readers.array_files import Arrays, FileArray
 from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, Guard, read_by_chunks
+from spectralzoom.storage.readers.places import Place, place_of_dataset
 
 _ALONG = ("downtrack", "along_track", "number_of_lines")
 _ACROSS = ("crosstrack", "across_track", "pixels_per_line")
@@ -89,8 +88,8 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
             native = native[..., None] if native.ndim == 2 else native
             return values.of_numbers(native)
 
-    dims = cube.dims[order[0]], cube.dims[order[1]]
-    geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
+    with guard():
+        geobox, notes = _place_of(cube, arrays, attributes)
     return CubeSource(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
@@ -211,12 +210,25 @@ def _end_as_value(end: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> 
     return _as_value(end, coded, stored)
 
 
-def place_or_note(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return a place, or a note on why it cannot be read."""
-    try:
-        return find(), ()
-    except Exception as error:  # of PROJ, too
-        return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
+def _place_of(cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any]) -> Place:
+    """Return the place of a cube by the arrays beside it, of which only coordinates along its axes are read."""
+    dims = [dim or f"axis {at}" for at, dim in enumerate(cube.dims[: cube.array.ndim])]
+    sizes = dict(zip(dims, cube.array.shape, strict=True))
+    read: dict[str, xr.Variable] = {}
+    named: dict[str, xr.Variable] = {}
+    for name, one in arrays.items():
+        axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if name.lower() in words), None)
+        by_name = name if name in dims or axis is None else dims[cube.order[axis]]
+        own = one.dims or (by_name,) * one.ndim  # a scale of HDF5 is its own axis
+        fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
+        if one.ndim < 2 and fits and one.dtype.kind in "iuf":
+            plain = {key: value for key, value in one.attrs.items() if key not in (*_CODED, *_FILLS, *_ENDS)}
+            read[name] = xr.Variable(own, one[...], plain | _packing_of(one.attrs))
+        else:
+            own = tuple(dims) if name == cube.name else tuple(f"{name} {axis}" for axis in range(one.ndim))
+            named[name] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
+    dataset = xr.decode_cf(xr.Dataset(read, attrs=dict(attributes)), decode_times=False, decode_coords=False)
+    return place_of_dataset(dataset.assign(named), cube.name, (dims[cube.order[0]], dims[cube.order[1]]))
 
 
 def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:

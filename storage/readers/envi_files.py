@@ -33,8 +33,9 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.image_files import bad_bands, rescaled
 from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
@@ -192,6 +193,8 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
+    if any("map info" in cube.header.fields for cube in opened.values()):
+        notes.append("the map info of its parts is not read: lines of a folder are on no map; name one file")
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
     listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}

@@ -17,11 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import odc.geo.crs as odc_crs
-import odc.geo.geobox as odc_geobox
-import pyproj
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.envi_headers import finite_number, wavelengths_nm
 from spectralzoom.pipeline.errors import SceneError
@@ -39,6 +35,7 @@ from spectralzoom.storage.readers.cube_sources import (
 )
 from spectralzoom.storage.readers.orientation import orientation_of, upright
 from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
+from spectralzoom.storage.readers.places import place_of_file
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
@@ -183,45 +180,6 @@ def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
         parts.append(seen == 0)
     found = np.concatenate(parts)
     return found if found.any() else None
-
-
-def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid on the earth of an open rasterio file, or None with a note."""
-    if file.transform.is_identity:
-        other = " and ".join([*(["ground control points"] if file.gcps[0] else []), *(["RPCs"] if file.rpcs else [])])
-        if other:
-            return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",)
-        lacks = "it has a CRS and no transform (gdal_edit -a_ullr), so that its place on the earth is not known"
-        return None, () if file.crs is None else (lacks,)
-    if file.crs is None or not file.transform.determinant:
-        lacks = "a transform and no CRS (gdal_edit -a_srs)" if file.crs is None else "a transform that is no grid"
-        return None, (f"it has {lacks}, so that its place on the earth is not known",)
-    try:
-        crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
-    except Exception as error:  # of PROJ and of GDAL
-        return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
-    if not (crs.is_projected or crs.is_geographic):
-        return None, (f"its CRS, {crs.name!r}, is not geographic or projected; its place is not known",)
-    code = crs.to_epsg()
-    return odc_geobox.GeoBox(file.shape, file.transform, odc_crs.CRS(crs.to_wkt() if code is None else code)), ()
-
-
-def place_of_envi(
-    header: Mapping[str, str], data: Path, shape: tuple[int, int]
-) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid of an ENVI file with (line, sample) ``shape``, by its ``map info`` as GDAL reads it."""
-    if "map info" not in header:
-        return None, ()
-    rasterio = importlib.import_module("rasterio")
-    check_sidecars(data)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(data, driver="ENVI") as file:
-                found, notes = place_of_file(file)
-    except Exception as error:  # of GDAL and PROJ
-        return None, (f"its map info cannot be read: {error}",)
-    return (None if found is None else odc_geobox.GeoBox(shape, found.affine, found.crs)), notes
 
 
 _UNIT = "wavelength_units"

@@ -154,12 +154,13 @@ def test_coordinates_and_grid_mapping_follow_cf(tmp_path: Path) -> None:
         assert "spatial_ref" in content["height"].coords
 
 
-def test_a_geographic_crs_has_longitude_and_latitude(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("epsg", "unit"), [(4326, "degrees_north"), (4807, "grad")])
+def test_a_geographic_crs_has_longitude_and_latitude(tmp_path: Path, epsg: int, unit: str) -> None:
     """The axes have the standard names and units of CF, and the grid is read as it was written."""
-    geobox = GeoBox((20, 30), Affine(1e-5, 0, 7.5, 0, -1e-5, 52), "EPSG:4326")
+    geobox = GeoBox((20, 30), Affine(1e-5, 0, 7.5, 0, -1e-5, 52), f"EPSG:{epsg}")
     with xr.open_zarr(write(tmp_path / "a.zarr", geobox), consolidated=False) as content:
         assert content.x.attrs["standard_name"] == "longitude"
-        assert (content.y.attrs["standard_name"], content.y.attrs["units"]) == ("latitude", "degrees_north")
+        assert (content.y.attrs["standard_name"], content.y.attrs["units"]) == ("latitude", unit)
         assert content.odc.geobox == georeference.load_geobox(tmp_path / "a.zarr") == geobox
 
 

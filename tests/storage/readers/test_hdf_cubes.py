@@ -10,9 +10,6 @@ from unittest.mock import Mock
 import h5py
 import numpy as np
 import pytest
-import rasterio
-import rasterio.shutil
-import rasterio.transform
 import rioxarray  # noqa: F401 - registers the accessor that writes a place
 import xarray as xr
 from numpy.typing import NDArray
@@ -21,7 +18,6 @@ from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.storage.readers.cube_sources import read_by_chunks
 from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_files import load_scene_file
-from tests.storage.readers.test_raster_tags import write as write_bands
 
 RNG = np.random.default_rng(5)
 NM = np.array([450.0, 550.0, 660.0, 800.0, 900.0])
@@ -144,17 +140,6 @@ def test_unusable_hdf_files_raise_one_error(write: Any, words: str, tmp_path: Pa
     write(tmp_path / "bad.h5")
     with pytest.raises((SceneError, WavelengthError), match=words):
         load_scene_file(tmp_path / "bad.h5")
-
-
-def test_rows_from_south_to_north_have_gdals_position(tmp_path: Path) -> None:
-    """GDAL writes the southern row first, under the GeoTransform of the upright image."""
-    values = np.arange(12, dtype=np.float32).reshape(3, 4)
-    upright = rasterio.transform.from_origin(500_000, 5_000_030, 10, 10)
-    write_bands(tmp_path / "a.tif", values[None], crs="EPSG:32632", transform=upright).close()
-    rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT="NC4")
-    cube = open_cube_source(f"{tmp_path / 'a.nc'}:Band1")
-    assert cube.geobox.affine.to_gdal() == (500_000, 10, 0, 5_000_000, 0, 10)
-    assert np.array_equal(cube.read(0, 3)[::-1, :, 0], values)
 
 
 SCALED, NAN = {"scale_factor": 0.01}, float("nan")
