@@ -170,6 +170,8 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of old texts such as +init=epsg
                 by_cf = value is mapping
+                if re.search(r"init=(?!\w+:)", str(value)):
+                    raise ValueError("it names a file, which is not opened")
                 return CRS(CRS.from_cf(_in_metres(mapping, axes, notes)).to_wkt() if by_cf else value)
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error

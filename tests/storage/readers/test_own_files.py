@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.transform
+import xarray as xr
 from PIL import Image
 
 from spectralzoom.flows.training.data import load_data_set
@@ -174,6 +175,17 @@ def test_overviews_elsewhere_are_refused(tmp_path: Path, place: str) -> None:
             opened()
         with pytest.raises(TimeoutError):
             server.accept()
+
+
+def test_a_crs_in_another_file_is_not_opened(tmp_path: Path) -> None:
+    """PROJ reads definitions from any file that a CRS names."""
+    (tmp_path / "defs").write_text("<utm> +proj=utm +zone=32 +datum=WGS84 +units=m <>\n")
+    axes = {"y": 5e6 - np.arange(6.0), "x": 4e5 + np.arange(4.0)}
+    cube = xr.DataArray(CUBE, dims=("y", "x", "band"), coords=axes, attrs={"crs": f"+init={tmp_path}/defs:utm"})
+    cube.to_dataset(name="cube").to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    source = open_cube_source(tmp_path / "a.nc")
+    assert source.geobox is None
+    assert any("cannot be read from crs: it names a file, which is not opened" in note for note in source.notes)
 
 
 @pytest.mark.parametrize("name", ["a.tif.msk", "a.tif.ovr"])
