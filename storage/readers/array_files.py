@@ -307,7 +307,7 @@ def find_zarr_store(path: Path) -> Path | None:
     """Return the Zarr store at a path, or the ``cube.zarr`` in it."""
     for folder in (path, path / "cube.zarr"):
         if any((folder / name).is_file() for name in METADATA):
-            return folder
+            return within(path, folder)
     return None
 
 

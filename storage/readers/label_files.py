@@ -17,7 +17,7 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
-from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
 from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.readers.polygons import (
     POLYGON_ENDINGS,
@@ -217,7 +217,9 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
     if not settings.labels:
         return None, ""
     name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
-    address = stated_file(settings.path.parent, name, f"{settings.path}: labels")
+    address = settings.path.parent / name
+    file, _ = split_variable(split_layer(name)[0])
+    stated_file(settings.path.parent, str(file), f"{settings.path}: labels")
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""

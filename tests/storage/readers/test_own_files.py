@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.transform
+import scipy.io
 import xarray as xr
+import zarr
 from PIL import Image
 
 from spectralzoom.flows.training.data import load_data_set
@@ -75,6 +77,18 @@ def stated(here: Path) -> Opened:
     return lambda: open_scene_file(here / "a.png")
 
 
+def named_array(here: Path) -> Opened:
+    picture(here / "a.png")
+    scipy.io.savemat(here / "gt.mat", {"gt": np.ones((6, 8), np.uint8), "more": np.ones((3, 3))})
+    (here / "scene.toml").write_text('labels = "gt.mat:gt"\n')
+    return lambda: open_scene_file(here / "a.png")
+
+
+def store(here: Path) -> Opened:
+    zarr.create_array(here / "cube.zarr", data=CUBE)
+    return lambda: open_cube_source(here)
+
+
 def training(here: Path) -> Opened:
     for number in range(3):
         picture(here / "images" / f"{number}.png")
@@ -103,6 +117,8 @@ LAYOUTS: dict[Callable[[Path], Opened], tuple[str, ...]] = {
     recorded: ("a.hdr", "a.img", "a.dark.npy", "a.bad.npy", "a.white.hdr", "a.white.img", "a.pointing.csv"),
     labelled: ("labels/001.png", "labels", "scene.toml"),
     stated: ("more/a.png", "more", "nm.txt", "scene.toml"),
+    named_array: ("gt.mat",),
+    store: ("cube.zarr", "cube.zarr/zarr.json", "cube.zarr/c/0/0"),
     training: ("images/1.png", "images", "labels/1.png", "labels"),
     image: ("a.tif.msk", "a.tif.ovr", "a.tfw", "a.tif.aux.xml"),
 }
