@@ -23,6 +23,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.pipeline.source import References
 
@@ -114,10 +115,13 @@ class CubeSource:
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
+    white_ms: float | None = None  # exposure of the white frame at the gain of the lines; None: that of every line
+    taken: Taken = field(default_factory=Taken)
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
+    acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     notes: tuple[str, ...] = ()
 
@@ -148,6 +152,7 @@ class CubeSource:
             "wavelengths_from": self.bands.origin,
         }
         about |= {} if self.nodata is None else {"_FillValue": self.nodata}
+        about |= {} if self.acquired is None else {"acquired": self.acquired}
         lines = indexing.LazilyIndexedArray(_Lines(self))
         return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=self.name, attrs=about)
 
@@ -235,8 +240,10 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
             return raw
         values = raw.astype(np.float32)
     else:
-        references = References(source.dark, source.white, np.ones(source.shape[2], np.float32))
-        values, usable = calibrate(raw, references, saturated_dn=np.inf)
+        white_reference = np.ones(source.shape[2], np.float32)
+        references = References(source.dark, source.white, white_reference, exposure_ms=source.white_ms)
+        exposure_ms = np.ones(len(raw)) if source.lines.exposure_ms is None else source.lines.exposure_ms[start:stop]
+        values, usable = calibrate(raw, references, saturated_dn=np.inf, exposure_ms=exposure_ms)
         values[~usable] = np.nan
         if source.nodata is not None:
             values[raw == source.nodata] = np.nan

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
 from spectralzoom.pipeline.rig.camera.frame_indices import (
     FRAME_INDEX,
     LONGEST_LINE,
@@ -32,6 +33,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     place_parts,
     times_of_lines,
 )
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import bad_bands, rescaled
 from spectralzoom.storage.readers.own_files import within
@@ -40,7 +42,6 @@ from spectralzoom.storage.readers.places import place_of_envi
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
-_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 
 @dataclass(frozen=True)
@@ -225,18 +226,16 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     height = last + len(cube.values) + lost
     native = cubes[0].values.dtype.newbyteorder("=")
     valid = np.zeros(height, np.bool_)
-    exposure: NDArray[np.float64] | None = None
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
-        known = finite_number(part.header.settings.get(_EXPOSURE, ""))
-        if known is not None and known > 0:
-            exposure = np.full(height, np.nan) if exposure is None else exposure
-            exposure[start : start + len(part.values)] = known
+    taken, exposure_ms = _taken(parts, height, notes)
     with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
     bands = Bands()
     if with_bands is not None:
         header = with_bands.header
         bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
+
+    acquired = acquired_of({**cubes[0].header.settings, **cubes[0].header.fields})
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -256,12 +255,36 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         dtype=native,
         read=read,
         files=tuple(file for one in cubes for file in (one.header_path, one.path)),
-        lines=LineFacts(valid, exposure_ms=exposure),
+        lines=LineFacts(valid, exposure_ms=exposure_ms),
+        taken=taken,
         bands=bands,
         nodata=cubes[0].header.nodata,
         bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
-        notes=tuple(notes),
+        acquired=acquired.text,
+        notes=(*notes, *acquired.notes),
     )
+
+
+def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tuple[Taken, NDArray[np.float64] | None]:
+    """Return gain and binning of all parts, and (line,) exposures; those that no header states are the usual one.
+
+    Raises SceneError: parts were taken with another gain or binning.
+    """
+    every = {
+        start: taken_with(part.header_path.name, part.header.fields, part.header.settings)
+        for start, part in parts.items()
+    }
+    first = next(iter(every.values()))
+    exposure_ms = np.full(height, np.nan)
+    for start, one in every.items():
+        check_parts(one, first)
+        exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
+    if np.isnan(exposure_ms).all():
+        return first, None
+    usual = float(np.nanmedian(exposure_ms))
+    unknown = [one.where for one in every.values() if one.exposure_ms is None]
+    notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]
+    return first, np.nan_to_num(exposure_ms, nan=usual)
 
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
@@ -270,16 +293,6 @@ def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         return lines
     return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
-
-
-def find_reference(folder: Path, kind: str) -> Path | None:
-    """Return the header of the ``dark`` or ``white`` frame in a folder by its name (SceneError: there are several)."""
-    headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
-    found = [entry for entry in headers if entry.name.lower().startswith(kind)]
-    if len(found) > 1:
-        names = ", ".join(entry.name for entry in found)
-        raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
-    return within(folder, found[0]) if found else None
 
 
 def load_frame_index(path: Path) -> FrameIndex:

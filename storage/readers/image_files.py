@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import finite_number, wavelengths_nm
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -90,7 +91,8 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
         known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path)
-        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
+        acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
+        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
@@ -112,6 +114,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             geobox=geobox,
             bad_bands=tuple(place for place, band in enumerate(keep) if band in bad),
             void=_void(file, alpha),
+            acquired=acquired.text,
             notes=tuple(notes),
         )
     read = source.read

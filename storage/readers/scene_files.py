@@ -65,6 +65,7 @@ class SceneFile:
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     pixel_m: float | None = None  # side of a pixel on the ground, by scene.toml, if there is no geobox
+    acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     regridded: bool = False  # labels were resampled from another grid
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, if they were kept in memory
 
@@ -123,6 +124,7 @@ def open_scene_file(
         provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps, *label_note),
         geobox=source.geobox,
         pixel_m=None if source.geobox is not None else settings.pixel_m,
+        acquired=source.acquired,
         kept=kept,
     )
     if found is None:
