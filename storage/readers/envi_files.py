@@ -37,6 +37,7 @@ from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import rescaled
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
@@ -108,13 +109,13 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
             raise SceneError(
                 f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
             )
-        return path, data
+        return path, within(path, data)
     names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
     header = next((file for file in map(path.with_name, names) if file.is_file()), None)
     if header is None:
         wanted = " or ".join(dict.fromkeys(names[:2]))
         raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
-    return header, path
+    return within(path, header), path
 
 
 def load_envi_header(path: Path) -> EnviHeader:
@@ -181,7 +182,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     notes: list[str] = []
     opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        data = find_envi_pair(header)[1]
+        data = find_envi_pair(within(folder, header))[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
@@ -206,7 +207,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         if number not in indices:
             notes.append(f"there is no frame index for {cube.path.name}")
             continue
-        index = load_frame_index(indices[number])
+        index = load_frame_index(within(folder, indices[number]))
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))

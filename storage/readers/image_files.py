@@ -33,6 +33,7 @@ from spectralzoom.storage.readers.cube_sources import (
     unpacked,
 )
 from spectralzoom.storage.readers.orientation import orientation_of, upright
+from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 from spectralzoom.storage.readers.places import place_of_file
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
@@ -58,7 +59,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     driver = _DRIVERS[path.suffix.lower()]
+    check_sidecars(path)
     with _opened(path) as file:
+        check_overviews(file, path)
         if len(file.subdatasets) > 1:
             raise SceneError(
                 f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"

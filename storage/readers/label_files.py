@@ -17,7 +17,8 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
-from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.readers.polygons import (
     POLYGON_ENDINGS,
     is_polygon_file,
@@ -93,7 +94,7 @@ def scene_entries(folder: Path) -> list[Path]:
 def image_folder(folder: Path) -> Path:
     """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
-    return min(inner, key=lambda entry: entry.name != "images", default=folder)
+    return within(folder, min(inner, key=lambda entry: entry.name != "images", default=folder))
 
 
 def find_files(path: Path) -> MatchedFiles:
@@ -133,6 +134,8 @@ def match_folder(folder: Path) -> MatchedFiles:
                 f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
+    for entry in (*images, *labels.values()):
+        within(folder, entry, _home(folder))
     return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in owner))
 
 
@@ -144,7 +147,13 @@ def find_label(scene: Path) -> Path | None:
         pictures, polygons = _labels_near(scene.parent)
     except PermissionError:  # the folder cannot be listed
         return None
-    return _label_of(scene, [entry for entry in pictures if entry != scene]) or _label_of(scene, polygons)
+    found = _label_of(scene, [entry for entry in pictures if entry != scene]) or _label_of(scene, polygons)
+    return None if found is None else within(scene, found, _home(scene.parent))
+
+
+def _home(folder: Path) -> Path:
+    """Return the folder that images and labels share."""
+    return folder.parent if is_image_folder(folder) else folder
 
 
 def is_label_name(path: Path) -> bool:
@@ -212,6 +221,8 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
         return None, ""
     name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
     address = settings.path.parent / name
+    file, _ = split_variable(split_layer(name)[0])
+    stated_file(settings.path.parent, str(file), f"{settings.path}: labels")
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""

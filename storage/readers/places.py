@@ -30,6 +30,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
+from spectralzoom.storage.readers.own_files import check_sidecars
 
 Place = tuple[GeoBox | None, tuple[str, ...]]
 
@@ -169,6 +170,8 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of old texts such as +init=epsg
                 by_cf = value is mapping
+                if re.search(r"init=(?!\w+:)", str(value)):
+                    raise ValueError("it names a file, which is not opened")
                 return CRS(CRS.from_cf(_in_metres(mapping, axes, notes)).to_wkt() if by_cf else value)
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
@@ -390,6 +393,7 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     if not set(_ENVI_PLACES) & set(header):
         return None, ()
     rasterio = importlib.import_module("rasterio")
+    check_sidecars(data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)

@@ -27,6 +27,7 @@ from spectralzoom.pipeline.capture.straight_scans import angles_to_positions
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats
+from spectralzoom.storage.readers.own_files import within
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,7 +60,7 @@ class LinePointing:
 def find_pointing(folder: Path, stem: str) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = (f"{stem}.pointing{ending}" for ending in ENDINGS)
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
 
 
 def load_pointing(

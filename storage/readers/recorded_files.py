@@ -23,6 +23,7 @@ from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, load_envi_header
 from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, taken_of
 from spectralzoom.storage.readers.open_cubes import open_cube_source, reader_of, with_wavelengths
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import LinePointing
 
 SAMPLED_LINES = 64  # for bits
@@ -81,7 +82,7 @@ def find_cubes(path: Path) -> list[Path]:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     if cubes and stores:
         raise SceneError(f"{path} holds ENVI cubes and the Zarr store {stores[0].name}; name one, or move either kind")
-    return cubes or stores
+    return [within(path, one) for one in cubes or stores]
 
 
 def _stem(path: Path) -> str:

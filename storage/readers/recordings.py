@@ -38,6 +38,7 @@ from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import (
     ENDINGS,
     WITHOUT_MIRROR,
@@ -225,7 +226,7 @@ def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -
     if file is not None and file.is_dir():
         folder = file
         names = [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
-        file = next((folder / name for name in names if (folder / name).is_file()), None)
+        file = next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
         if file is None:
             raise SceneError(f"{folder} has no pointing for {cube.name}; add {names[0]}, or name one table for all")
     file = find_pointing(cube.folder, cube.name) if file is None else file
@@ -362,7 +363,9 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
         return None
-    found = [path] if _is_raw_cube(path) else sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one))
+    found = (
+        [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr") if _is_raw_cube(one))
+    )
     return found or None
 
 

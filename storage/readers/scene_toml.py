@@ -24,6 +24,7 @@ from pydantic import (
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.setting_fields import numbers_of
 from spectralzoom.storage.readers.band_facts import RANGE_NM, Bands, bands_text, why_unknown
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.whole_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
@@ -101,8 +102,11 @@ def find_scene_settings(scene: Path) -> SceneSettings:
     Raises SceneError: the file is no TOML, or has an unknown key or a wrong value.
     """
     folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
-    found = next((path for folder in folders if (path := folder / SETTINGS_NAME).is_file()), None)
-    return SceneSettings() if found is None else load_scene_settings(found)
+    home = next((folder for folder in folders if (folder / SETTINGS_NAME).is_file()), None)
+    if home is None:
+        return SceneSettings()
+    beside = None if scene.name == SETTINGS_NAME else scene.resolve().parent
+    return load_scene_settings(within(home, home / SETTINGS_NAME, beside))
 
 
 def is_image_folder(folder: Path) -> bool:
@@ -179,7 +183,11 @@ def settle_wavelengths(
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
         return _from_file(
-            settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands, path
+            stated_file(settings.path.parent, settings.wavelengths_file, f"{settings.path}: wavelengths_file"),
+            settings.dropped_bands,
+            chosen,
+            file_bands,
+            path,
         )
     advice = f"write wavelengths_nm or wavelengths_file into a {SETTINGS_NAME} beside it, or give survey --wavelengths"
     if known.wavelength_nm is None:
