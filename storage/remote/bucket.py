@@ -60,12 +60,18 @@ def push(archive: Archive, objects: Objects, report: Report) -> Copied:
     does not answer; IncompleteStoreError: a store or run is damaged; ArchiveError: the bucket ignores conditional puts.
     """
     with archive.in_use():
-        here = list(archive.manifests())
-        there = _published(objects.listing())
-        waiting = [uri for uri in here if there.get(uri) not in (MANIFEST, _manifest_name(archive.root / uri))]
-        if waiting:
-            _check_conditional_puts(objects)
-        return _copy(archive, objects, here, waiting, report, lambda uri: _send(archive.root / uri, uri, objects))
+        return send_stores(archive, objects, list(archive.manifests()), report)
+
+
+def send_stores(
+    archive: Archive, objects: Objects, uris: Collection[str], report: Report = lambda uri, done: None
+) -> Copied:
+    """Send these stores and runs, in this order, if the bucket lacks them. Raises as `push`."""
+    there = _published(objects.listing())
+    waiting = [uri for uri in uris if there.get(uri) not in (MANIFEST, _manifest_name(archive.root / uri))]
+    if waiting:
+        _check_conditional_puts(objects)
+    return _copy(archive, objects, uris, waiting, report, lambda uri: _send(archive.root / uri, uri, objects))
 
 
 def pull(objects: Objects, archive: Archive, report: Report, run: str | None = None) -> Copied:
@@ -81,7 +87,9 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
     with archive.in_use():
         wanted = _of_run(objects, run, there) if run is not None else sorted(there, key=lambda uri: uri[:4] == "runs")
         waiting = [uri for uri in wanted if not os.path.lexists(archive.root / uri)]
-        return _copy(archive, objects, wanted, waiting, report, lambda uri: _fetch(uri, there[uri], objects, archive))
+        return _copy(
+            archive, objects, wanted, waiting, report, lambda uri: fetch_store(uri, there[uri], objects, archive)
+        )
 
 
 def _copy(
@@ -123,7 +131,7 @@ def _send(folder: Path, uri: str, objects: Objects) -> int | None:
     return sum(size for size, _ in files.values()) if objects.create(f"{uri}/{kind}", text) == text else None
 
 
-def _fetch(uri: str, kind: str, objects: Objects, archive: Archive) -> int | None:
+def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int | None:
     """Fetch one store or run into the archive; return the bytes of its files, None where it is here or gone."""
     text = objects.read(f"{uri}/{kind}", parse_manifest)
     if text is None:  # another machine has removed it meanwhile
