@@ -22,16 +22,17 @@ from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError
 from spectralzoom.storage.store import (
     CAPTURED,
     LATEST,
-    MANIFEST,
     RESTS_ON,
     Archive,
     ancestors,
     descendants,
     file_problem,
     inputs_first,
+    is_known,
     is_name,
     lies_ahead,
     listed_bytes,
+    manifest_path,
     problems_of,
     try_manifest,
     uri_of,
@@ -213,13 +214,12 @@ def verify_everything(
         done += listed_bytes(manifest)
         with refusals(archive.root, "read the archive", every=True):
             problems = list(problems_of(archive.root / uri, every_byte=True))
-        if (archive.root / uri).exists() or uri in named:  # else gc has removed it since
+        if is_known(archive.root / uri) or uri in named:  # else gc has removed it since
             found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     what = "expected a folder with a manifest; take it out of the archive"
     found += [Finding(one.relative_to(archive.root).as_posix(), what, "stray") for one in archive.strays()]
-    there = known.keys() | archive.replaced()
     for uri, (by, why) in sorted((needed | named).items()):
-        if uri not in there and (archive.root / by).exists():  # else gc has removed both since
+        if uri not in known and is_known(archive.root / by):  # else gc has removed both since
             found.append(Finding(uri, f"is not there, but {by} {why}", "missing"))
     return found
 
@@ -274,8 +274,7 @@ def clear_up(
         gone: list[Removal] = []
         for number, removal in enumerate(plan.removals):
             progress(removal, number / len(plan.removals))
-            drop = archive.drop_leftover if removal.what == "leftover" else archive.discard
-            gone += [removal] if drop(removal.uri) else []  # else another process holds it
+            gone += [removal] if archive.discard(removal.uri) else []  # else another process holds it
         for lock in entries(archive.root / ".locks"):
             if "-" in lock.name:  # of stores and runs, which nothing makes meanwhile
                 lock.unlink(missing_ok=True)
@@ -306,7 +305,7 @@ def _unnamed(archive: Archive, keep_days: float, raw_too: bool) -> Clearance:
         if uri in named or uri.startswith("runs/"):
             continue
         with suppress(FileNotFoundError):  # published or copied here at this time
-            age_s = time.time() - (archive.root / uri / MANIFEST).stat().st_mtime
+            age_s = time.time() - manifest_path(archive.root / uri).stat().st_mtime
             if age_s < keep_days * DAY_S:
                 spared[uri] = f"no run names it, and it is younger than {keep_days:g} days"
             elif not raw_too and is_only_copy(known, uri):

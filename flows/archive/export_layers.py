@@ -29,7 +29,7 @@ from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
 from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
 from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import LATEST, Archive, Ref, uri_of
+from spectralzoom.storage.store import LATEST, Archive, Ref, is_cleared, read_manifest, uri_of
 
 
 @Parameter(name="*")
@@ -116,7 +116,7 @@ class ExportedRun:
         parts = (uri_of(uri) or "stages//").split("/")  # of a damaged receipt: no name, and an error
         stage, key = parts[1], parts[-1]
         ref = self.archive.find(stage, key)
-        if ref is None and self.archive.is_known(self.archive.ref(stage, key)):
+        if ref is None and is_cleared(self.archive.ref(stage, key).path):
             return None
         if ref is None:
             raise IncompleteStoreError(
@@ -223,7 +223,7 @@ def _gain_layer(run: ExportedRun) -> Layer:
     stored = open_image(run.path("attention"), "score")
     class_map = run.store("class_map")
     assert class_map is not None
-    patch = int(run.archive.manifest(class_map)["params"]["gains"]["frame"]["grid"]["patch"])
+    patch = int(read_manifest(class_map.path)["params"]["gains"]["frame"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     assert scene is not None
     shape = (stored.shape[0], stored.shape[1])

@@ -10,7 +10,6 @@ hash when it is sent, and after it is fetched.
 from __future__ import annotations
 
 import hashlib
-import os
 import secrets
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
@@ -20,20 +19,22 @@ from pathlib import Path
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.remote.objects import Objects, some_at_a_time
 from spectralzoom.storage.store import (
-    CLEARED,
     LATEST,
     MANIFEST,
     RESTS_ON,
     Archive,
     check_store,
     is_cleared,
+    is_known,
     lies_ahead,
+    manifest_bytes,
     parse_manifest,
     try_manifest,
     uri_of,
 )
 
 OF_CLEARED = "cleared.json"  # the manifest of a store without its files
+KINDS = (OF_CLEARED, MANIFEST)
 PROBE = ".conditional-put"
 Report = Callable[[str, float], None]  # address, and the fraction that is done
 
@@ -86,7 +87,7 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
     archive.reclaim()
     with archive.in_use():
         wanted = _of_run(objects, run, there) if run is not None else sorted(there, key=lambda uri: uri[:4] == "runs")
-        waiting = [uri for uri in wanted if not os.path.lexists(archive.root / uri)]
+        waiting = [uri for uri in wanted if not is_known(archive.root / uri)]
         return _copy(
             archive, objects, wanted, waiting, report, lambda uri: fetch_store(uri, there[uri], objects, archive)
         )
@@ -114,19 +115,19 @@ def _copy(
     others = [
         uri for uri, text in zip(both, texts, strict=True) if text != (archive.root / uri / MANIFEST).read_bytes()
     ]
-    missing = sorted(uri for uri in named if not os.path.lexists(archive.root / uri))
+    missing = sorted(uri for uri in named if not is_known(archive.root / uri))
     return Copied(copied, total, len(asked) - len(copied) - len(others), others, missing)
 
 
 def _send(folder: Path, uri: str, objects: Objects) -> int | None:
     """Send one store or run, its manifest last; return the bytes of its files, None where another writer was first."""
     check_store(folder)
-    kind, text = _manifest_name(folder), (folder / MANIFEST).read_bytes()
+    kind, text = _manifest_name(folder), manifest_bytes(folder)
     files = parse_manifest(text)["files"] if kind == MANIFEST else {}
     with suppress(FileNotFoundError):  # it is cleared meanwhile, or damaged
         some_at_a_time(lambda name: objects.write(_address(uri, text, name), folder / name), files)
     check_store(folder, every_byte=True)  # what was sent is what the manifest lists
-    if kind != _manifest_name(folder) or text != (folder / MANIFEST).read_bytes():  # cleared, or made again
+    if kind != _manifest_name(folder) or text != manifest_bytes(folder):  # cleared, or made again
         return _send(folder, uri, objects)
     return sum(size for size, _ in files.values()) if objects.create(f"{uri}/{kind}", text) == text else None
 
@@ -136,12 +137,12 @@ def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int 
     text = objects.read(f"{uri}/{kind}", parse_manifest)
     if text is None:  # another machine has removed it meanwhile
         return None
-    files = parse_manifest(text)["files"] if kind == MANIFEST else {}
+    if kind == OF_CLEARED:
+        return 0 if archive.adopt_cleared(uri, text) else None
+    files = parse_manifest(text)["files"]
 
     def fetch(part: Path) -> None:
         (part / MANIFEST).write_bytes(text)
-        if kind == OF_CLEARED:
-            (part / CLEARED).touch()
         some_at_a_time(lambda name: objects.fetch(_address(uri, text, name), part / name, files[name][1]), files)
 
     return sum(size for size, _ in files.values()) if archive.adopt(uri, fetch) else None
@@ -169,7 +170,7 @@ def _is_ahead(uri: str, objects: Objects) -> bool:
 def _published(listed: Iterable[str]) -> dict[str, str]:
     """Return the name of the manifest of each store and run in the bucket, by address."""
     ends = sorted(name.rpartition("/") for name in listed)  # cleared.json, then manifest.json, which wins
-    return {uri: kind for uri, _, kind in ends if kind in (MANIFEST, OF_CLEARED) and uri_of(uri) == uri}
+    return {uri: kind for uri, _, kind in ends if kind in KINDS[uri[:5] == "runs/" :] and uri_of(uri) == uri}
 
 
 def _manifest_name(folder: Path) -> str:
