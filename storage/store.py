@@ -169,7 +169,7 @@ _EMPTY: Mapping[str, Any] = {"files": {}, "params": {}, "inputs": [], RESTS_ON: 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     """Write the manifest of a folder, with sizes and hashes of its files beside ``facts``."""
     files = {name: [one.st_size, sha256(folder / name)] for name, one in sorted(files_in(folder).items())}
-    created = datetime.now(UTC).isoformat(timespec="milliseconds")
+    created = datetime.now(UTC).isoformat()  # to the microsecond: no two stores have one manifest
     (folder / MANIFEST).write_text(manifest_text({"created": created, **facts, "files": files}))
 
 
@@ -208,6 +208,11 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
 def is_cleared(folder: Path) -> bool:
     """Return whether a store's folder was deleted, and its manifest kept."""
     return not os.path.lexists(folder) and os.path.lexists(_beside(folder))
+
+
+def is_known(folder: Path) -> bool:
+    """Return whether something was published here, even if its folder was cleared away."""
+    return os.path.lexists(folder) or is_cleared(folder)
 
 
 def _beside(folder: Path) -> Path:
@@ -277,28 +282,14 @@ def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
     """
     found: list[str] = []
     for _ in range(MOST_LOOKS):
-        try:
-            descriptor = os.open(folder, os.O_DIRECTORY | os.O_NOFOLLOW)  # while it is open, its number is not reused
-        except OSError:
-            return _differences(folder, every_byte)
-        try:
-            found = _differences(folder, every_byte)
-            if not found or os.path.samestat(os.fstat(descriptor), folder.lstat()):
-                break
-        except FileNotFoundError:  # cleared meanwhile
-            continue
-        finally:
-            os.close(descriptor)
+        before = try_manifest(folder)
+        found = _differences(folder, *before, every_byte=every_byte)
+        if not found or (before == try_manifest(folder) and not is_cleared(folder)):
+            break
     return found
 
 
-def is_known(folder: Path) -> bool:
-    """Return whether something was published here, even if its folder was cleared away."""
-    return os.path.lexists(folder) or is_cleared(folder)
-
-
-def _differences(folder: Path, every_byte: bool) -> list[str]:
-    manifest, problem = try_manifest(folder)
+def _differences(folder: Path, manifest: Mapping[str, Any], problem: str | None, *, every_byte: bool) -> list[str]:
     if problem is not None or is_cleared(folder):
         return [problem] if problem is not None else []
     there, found = files_in(folder), []
@@ -464,19 +455,16 @@ class Archive:
             remove(self.root / "spool" / ref.key)
         return ref, built
 
-    def adopt(self, uri: str, fetch: Callable[[Path], None]) -> bool:
-        """Publish a copy that ``fetch`` writes with its manifest; return False where it is here already."""
+    def adopt(self, uri: str, copy: Callable[[Path], None] | bytes) -> bool:
+        """Publish what ``copy`` writes with its manifest, or the manifest of a cleared store; False if it is here."""
         final = self.root / uri
         with refusals(self.root, "write to the archive"), self._locked(_lock_name(final)):
-            return not is_known(final) and publish(final, fetch)
-
-    def adopt_cleared(self, uri: str, manifest: bytes) -> bool:
-        """Write the manifest of a store that was cleared elsewhere; return False where the store is here already."""
-        final = self.root / uri
-        with refusals(self.root, "write to the archive"), self._locked(_lock_name(final)):
-            if is_new := not is_known(final):
-                _write_beside(final, manifest)
-        return is_new
+            if is_known(final):
+                return False
+            if callable(copy):
+                return publish(final, copy)
+            _write_beside(final, copy)
+            return True
 
     def clear(self, ref: Ref, *, wait: bool = True) -> bool:
         """Keep the manifest of a store beside its folder, and delete the folder; a later request builds it again.

@@ -154,7 +154,10 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     refuses.
     """
     with refusals(folder, "write to"):
-        make_folder(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
         with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART, dir=folder) as aside:
             with _disk_errors(Path(aside)):
                 yield Path(aside)
@@ -179,14 +182,6 @@ def _disk_errors(folder: Path) -> Iterator[None]:
             with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(PROBE_BYTES))
         raise
-
-
-def make_folder(folder: Path) -> None:
-    """Create a folder to export to (ArchiveError: it is or lies below a file)."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
 
 
 def write_whole(path: Path, content: str) -> None:

@@ -138,7 +138,7 @@ def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int 
     if text is None:  # another machine has removed it meanwhile
         return None
     if kind == OF_CLEARED:
-        return 0 if archive.adopt_cleared(uri, text) else None
+        return 0 if archive.adopt(uri, text) else None
     files = parse_manifest(text)["files"]
 
     def fetch(part: Path) -> None:
@@ -153,18 +153,12 @@ def _of_run(objects: Objects, run: str, there: Iterable[str]) -> list[str]:
     runs = sorted(uri for uri in there if uri.startswith("runs/"))
     uri = f"runs/{run.removeprefix('runs/')}"
     if run == LATEST:
-        uri = next((one for one in reversed(runs) if not _is_ahead(one, objects)), uri)
+        uri = next((one for one in reversed(runs) if not lies_ahead(one.removeprefix("runs/"), "", warns=True)), uri)
     text = objects.read(f"{uri}/{MANIFEST}", parse_manifest) if uri in runs else None
     if text is None:
         known = ", ".join(name.removeprefix("runs/") for name in runs[-5:]) or "none"
         raise ArchiveError(f"{objects.url} has no run {run!r}; its latest are {known}")
     return [*sorted(parse_manifest(text)[RESTS_ON].keys() & set(there)), uri]
-
-
-def _is_ahead(uri: str, objects: Objects) -> bool:
-    """Return whether a run lies in the future, which a warning says."""
-    text = objects.read(f"{uri}/{MANIFEST}", parse_manifest)
-    return text is None or lies_ahead(uri.removeprefix("runs/"), parse_manifest(text)["created"], warns=True)
 
 
 def _published(listed: Iterable[str]) -> dict[str, str]:

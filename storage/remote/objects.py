@@ -10,12 +10,11 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from typing import TypeVar
-from urllib.parse import urlsplit
 
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 
@@ -23,29 +22,26 @@ AT_ONCE = 8  # transfers in parallel
 PART_BYTES = 8 << 20  # of the parts of a large object
 RETRIES = 4  # of one request, by obstore, in about two seconds
 PAUSES_S = (0.5, 2.0, 8.0)  # before what obstore does not try again
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _PART = r"(?!\.+(?:/|$))[A-Za-z0-9_.=+-]+"
 _ADDRESS = re.compile(rf"s3:/{{1,2}}({_PART})((?:/{_PART})*)/?")  # also as a path has it, which makes one slash of two
-_LASTING = (  # parts of a bucket's answers, and what a person has to do
-    (("NoSuchBucket",), "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL"),
-    (("169.254.16",), "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"),
-    (("RequestTimeTooSkewed",), "the clock of this machine is wrong: set it and run again"),
-    (
-        ("HeaderMalformed", "PermanentRedirect", "301 Moved", "redirect without LOCATION"),
-        "the bucket is in another region: set AWS_REGION",
+_LASTING = {  # of a bucket's answers: a part, and what a person has to do
+    "NoSuchBucket": "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL",
+    r"169\.254\.16": "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    "RequestTimeTooSkewed": "the clock of this machine is wrong: set it and run again",
+    "HeaderMalformed|PermanentRedirect|301 Moved|redirect without LOCATION": (
+        "the bucket is in another region: set AWS_REGION"
     ),
-    (
-        ("SignatureDoesNotMatch", "InvalidAccessKeyId", "ExpiredToken", "AccessDenied", "403 Forbidden", "401 Unauth"),
-        "access is denied: check the credentials and the bucket's policy (get, put, list)",
+    "SignatureDoesNotMatch|InvalidAccessKeyId|ExpiredToken|AccessDenied|403 Forbidden|401 Unauth": (
+        "access is denied: check the credentials and the bucket's policy (get, put, list)"
     ),
-)
-_PASSING = (  # which may pass by itself
-    (("status code: 5", "status code: 429", "SlowDown"), "it is overloaded or has a fault: run again later"),
-    (
-        ("error sending request", "timed out", "RequestTimeout", "response body"),
-        "it does not answer: check the network and AWS_ENDPOINT_URL",
+}
+_PASSING = {
+    "status code: (5|429)|SlowDown": "it is overloaded or has a fault: run again later",
+    "error sending request|timed out|RequestTimeout|response body": (
+        "it does not answer: check the network and AWS_ENDPOINT_URL"
     ),
-)
+}
 CURE = "remove this store from the bucket, and push it from a machine that has it"
 Answer = TypeVar("Answer")
 
@@ -164,7 +160,7 @@ class Objects:
 
     def explain(self, error: BaseException) -> UnreachableError:
         """Return the error of an answer of the bucket, with advice."""
-        advice = _advice(error, (*_LASTING, *_PASSING)) or _first_line(error)
+        advice = _advice(error, _LASTING | _PASSING) or _first_line(error)
         return UnreachableError(f"{self.url}{f' at {self.endpoint}' if self.endpoint else ''}: {advice}")
 
     def _ask(self, work: Callable[[], Answer]) -> Answer:
@@ -187,15 +183,11 @@ class Objects:
 def _endpoint() -> str:
     """Return the server that the environment names, or nothing for AWS itself."""
     text = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
-    try:
-        parts = urlsplit(text)
-        is_valid = parts.scheme in ("http", "https") and bool(parts.hostname)
-    except ValueError:
-        is_valid = False
-    if text and not is_valid:
+    found = re.match(r"(https?)://(\[[\da-f:]+\]|[^/:\s]+)(:\d+)?(/|$)", text)
+    if text and found is None:
         raise SettingsError(f"AWS_ENDPOINT_URL={text!r} is no address; expected https://HOST, or http://127.0.0.1:PORT")
     allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
-    if text and parts.scheme == "http" and parts.hostname not in LOOPBACK and not allowed:
+    if found is not None and found[1] == "http" and found[2] not in LOOPBACK and not allowed:
         raise SettingsError(
             f"AWS_ENDPOINT_URL={text}: over plain http others on the way can read and change the data; use https, or "
             "set AWS_ALLOW_HTTP=true"
@@ -203,8 +195,8 @@ def _endpoint() -> str:
     return text
 
 
-def _advice(error: BaseException, known: Iterable[tuple[tuple[str, ...], str]]) -> str | None:
-    return next((advice for signs, advice in known if any(sign in str(error) for sign in signs)), None)
+def _advice(error: BaseException, known: Mapping[str, str]) -> str | None:
+    return next((advice for signs, advice in known.items() if re.search(signs, str(error))), None)
 
 
 def _first_line(error: BaseException) -> str:
