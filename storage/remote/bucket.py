@@ -143,7 +143,7 @@ def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int 
 
     def fetch(part: Path) -> None:
         (part / MANIFEST).write_bytes(text)
-        some_at_a_time(lambda name: objects.fetch(_address(uri, text, name), part / name, files[name][1]), files)
+        some_at_a_time(lambda name: objects.fetch(_address(uri, text, name), part / name, *files[name]), files)
 
     return sum(size for size, _ in files.values()) if archive.adopt(uri, fetch) else None
 

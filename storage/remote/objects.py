@@ -20,6 +20,7 @@ from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, Set
 
 AT_ONCE = 8  # transfers in parallel
 PART_BYTES = 8 << 20  # of the parts of a large object
+MOST_BYTES = 256 << 20  # of a manifest, which takes 100 bytes a file
 RETRIES = 4  # of one request, by obstore, in about two seconds
 PAUSES_S = (0.5, 2.0, 8.0)  # before what obstore does not try again
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
@@ -102,8 +103,11 @@ class Objects:
         """
 
         def read() -> bytes:
-            content = bytes(self._store.get(name).bytes())
+            answer = self._store.get(name)
             try:
+                if answer.meta["size"] > MOST_BYTES:
+                    raise ValueError(f"it has {answer.meta['size']} bytes")
+                content = bytes(answer.bytes())
                 check(content)
             except ValueError as error:
                 raise IncompleteStoreError(f"{self.url}/{name} is damaged: {error}; {CURE}") from error
@@ -134,19 +138,20 @@ class Objects:
         """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
         self._ask(lambda: self._store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2))
 
-    def fetch(self, name: str, path: Path, sha256: str) -> None:
-        """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has another SHA-256."""
+    def fetch(self, name: str, path: Path, size: int, sha256: str) -> None:
+        """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has other content."""
         path.parent.mkdir(parents=True, exist_ok=True)
 
         def fetch() -> None:
             digest = hashlib.sha256()
             with path.open("wb") as file:
-                for block in self._store.get(name).stream(PART_BYTES):
+                answer = self._store.get(name)
+                for block in answer.stream(PART_BYTES) if answer.meta["size"] == size else ():
                     digest.update(block)
                     file.write(block)
             if digest.hexdigest() != sha256:
                 raise IncompleteStoreError(
-                    f"{self.url}/{name} has changed since it was published (its SHA-256 differs); {CURE}"
+                    f"{self.url}/{name} has changed since it was published (its size or SHA-256 differs); {CURE}"
                 )
 
         try:

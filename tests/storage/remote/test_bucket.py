@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import signal
@@ -13,6 +14,7 @@ from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
 from threading import Barrier
+from typing import Any
 
 import pytest
 
@@ -24,7 +26,7 @@ from spectralzoom.storage.remote import objects as requests
 from spectralzoom.storage.remote.bucket import Copied, pull, push
 from spectralzoom.storage.remote.objects import Objects, UnreachableError
 from spectralzoom.storage.runs import clear_up, verify_everything
-from spectralzoom.storage.store import Archive, Ref, is_cleared
+from spectralzoom.storage.store import Archive, Ref, is_cleared, manifest_text
 from tests.faulty_proxy import FAULTS, Choose, faulty_proxy
 from tests.storage.small_archive import make_store, publish_receipt, small_survey
 
@@ -355,6 +357,29 @@ def test_gc_works_on_a_copy(archive: Archive, bucket: str, tmp_path: Path) -> No
     other, _ = fetch(bucket, tmp_path / "there")
     assert len(clear_up(other, keep_days=0).removals) == 3
     assert len(fetch(bucket, other.root)[1].copied) == 3
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"../../../x": [1, ""]}, "no file of this folder"),
+        ({"/etc/x": [1, ""]}, "no file of this folder"),
+        ({"a": [-1, ""]}, "has changed"),
+        ({"a": [1, ""], "a/b": [1, ""]}, "has changed|cannot write to the archive"),
+        ({"n" * 300: [1, ""]}, "cannot write to the archive"),
+    ],
+)
+def test_a_hostile_manifest_is_refused(bucket: str, tmp_path: Path, files: dict[str, Any], words: str) -> None:
+    """Nothing is written outside of its store, nor more than it declares."""
+    text = manifest_text({"files": files}).encode()
+    place, objects = "stages/x/y", Objects(bucket)
+    objects.write(f"{place}/manifest.json", text)
+    for name in ("a", "a/b", "n" * 300):
+        objects.write(f"{place}/{hashlib.sha256(text).hexdigest()[:16]}/{name}", bytes(9))
+    with pytest.raises((ArchiveError, IncompleteStoreError), match=words):
+        fetch(bucket, tmp_path / "there")
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    assert contents(tmp_path / "there") == {}
 
 
 def test_addresses_that_lead_out_of_the_archive_are_ignored(archive: Archive, bucket: str, tmp_path: Path) -> None:
