@@ -334,37 +334,27 @@ def _obstacle(uri: str, problem: str | None, is_kept: bool) -> str | None:
     return None
 
 
-def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str) -> bool:
+def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str, seen: tuple[str, ...] = ()) -> bool:
     """Return whether the archive alone cannot make a store again: lines and pixels that were not simulated.
 
-    So is a store that was made of such lines, if they were cleared away or are missing.
+    So is a store that was made of such lines, if they were cleared away or are missing. Of a damaged or missing store
+    the runs that name it say whether its lines were simulated, and which they were.
     """
-    seen, waiting = set[str](), [uri]
-    while waiting:
-        seen.add(one := waiting.pop())
-        is_only, inputs = _origin(known, one)
-        if is_only:
-            return True
-        waiting += [name for name in inputs if name not in seen and (name not in known or known[name]["cleared"])]
-    return False
-
-
-def _origin(known: Mapping[str, Mapping[str, Any]], uri: str) -> tuple[bool, Sequence[str]]:
-    """Return whether a store holds lines or pixels that were not simulated, and its inputs.
-
-    Of a damaged or missing store the runs that name it say whether its lines were simulated, and which they were.
-    """
-    stage = uri.split("/")[1]
-    store = known.get(uri)
-    if store is not None and store["problem"] is None:
-        is_raster = stage == "rectify" and not store["inputs"]
-        return is_raster or (stage == CAPTURED and _source_in(store["params"]) != "sim"), store["inputs"]
+    stage, store = uri.split("/")[1], known.get(uri)
     runs = [one for one in known.values() if uri in one[RESTS_ON] and one["settings"]]
     sources = {one["settings"].get("source") for one in runs}
-    if stage == "rectify" or not LINES.fullmatch(uri):
-        return stage == "rectify" and "raster" in sources, ()
-    raw = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/") and name != uri]
-    return sources != {"sim"} and (stage == CAPTURED or not raw), raw
+    inputs: Sequence[str] = ()
+    if store is not None and store["problem"] is None:
+        inputs = store["inputs"]
+        is_only = _source_in(store["params"]) != "sim" if stage == CAPTURED else stage == "rectify" and not inputs
+    elif LINES.fullmatch(uri):
+        inputs = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/")]
+        is_only = sources != {"sim"} and (stage == CAPTURED or not inputs)
+    else:
+        is_only = stage == "rectify" and "raster" in sources
+    seen = (*seen, uri)
+    gone = (one for one in inputs if one not in seen and (one not in known or known[one]["cleared"]))
+    return is_only or any(is_only_copy(known, one, seen) for one in gone)
 
 
 def _source_in(params: Mapping[str, Any]) -> str | None:

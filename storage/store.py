@@ -28,7 +28,7 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from itertools import count
@@ -46,11 +46,11 @@ from spectralzoom.storage.whole_files import (
     entries,
     files_in,
     is_folder,
+    locked,
     refusals,
     remove,
     sha256,
     sync,
-    take_lock,
 )
 
 MANIFEST, CLEARED = "manifest.json", ".cleared"
@@ -492,14 +492,12 @@ class Archive:
                 remove(path)
         return held and not is_known(path)
 
-    @contextmanager
-    def in_use(self, *, alone: bool = False) -> Iterator[bool]:
+    def in_use(self, *, alone: bool = False) -> AbstractContextManager[bool]:
         """Keep other processes from removing stores while the block runs; many may use an archive at a time.
 
         ``alone`` asks for exclusive use, and yields False at once where another process uses the archive.
         """
-        with self._locked("use", wait=not alone, shared=not alone) as held:
-            yield held
+        return self._locked("use", wait=not alone, shared=not alone)
 
     def reclaim(self) -> list[str]:
         """Remove what killed processes left in this folder; return the addresses."""
@@ -532,22 +530,13 @@ class Archive:
         return sorted(one for one in there.union(cleared) if is_name(one.name))
 
     def _is_free(self, lock: str) -> bool:
-        path = self.root / ".locks" / f"{lock}.lock"
-        release = take_lock(path, wait=False) if path.exists() else lambda: None
-        if release is not None:
-            release()
-        return release is not None
+        if not (self.root / ".locks" / f"{lock}.lock").exists():
+            return True
+        with self._locked(lock, wait=False) as held:
+            return held
 
-    @contextmanager
-    def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
-        """Hold a lock while the block runs; yield False where another process holds it and ``wait`` is false."""
-        with refusals(self.root, "lock", every=True):
-            release = take_lock(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
-        try:
-            yield release is not None
-        finally:
-            if release is not None:
-                release()
+    def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> AbstractContextManager[bool]:
+        return locked(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
 
     # --- runs ---------------------------------------------------------------------------------------------------------
 

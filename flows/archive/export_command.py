@@ -7,7 +7,6 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -36,7 +35,7 @@ from spectralzoom.pipeline.errors import ArchiveError, PipelineError
 from spectralzoom.pipeline.products.indices import find_index
 from spectralzoom.storage.export.image_files import write_cog
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import remove_leftovers, take_lock, to_json, write_whole
+from spectralzoom.storage.whole_files import locked, remove_leftovers, to_json, write_whole
 
 COLLECTION = "collection.json"
 COG, CSV = "image/tiff; application=geotiff; profile=cloud-optimized", "text/csv"
@@ -89,9 +88,7 @@ def run_export(
     layers += spectral_layers(opened, indices, reflectance=products.reflectance)
     export = Export(opened, out)
     try:
-        with ExitStack() as stack:
-            release = take_lock(out / ".export.lock")
-            stack.callback(release if release is not None else lambda: None)
+        with locked(out / ".export.lock"):
             check_owner(export)
             for folder in (out, export.folder):
                 remove_leftovers(folder)

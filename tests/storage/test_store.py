@@ -37,7 +37,7 @@ from spectralzoom.storage.store import (
     text_of,
     uri_of,
 )
-from spectralzoom.storage.whole_files import PART, take_lock
+from spectralzoom.storage.whole_files import PART, locked
 from tests.storage.small_archive import flip, make_store, problems, rewrite, small_survey
 
 ROOT = Path(__file__).parents[2]
@@ -304,22 +304,20 @@ def test_paths_that_are_no_archive_are_refused(tmp_path: Path) -> None:
 # --- locks ------------------------------------------------------------------------------------------------------------
 
 
-def test_releasing_a_lock_twice_keeps_the_next_holders_lock(tmp_path: Path) -> None:
-    """The second release closes no file of the next holder; a lock file that gc removed is made again."""
+def test_a_lock_is_held_by_one_or_shared(tmp_path: Path) -> None:
+    """Also when gc has removed its file; a link in its place is refused."""
     path = tmp_path / "a.lock"
-    first = take_lock(path)
-    assert first is not None
-    assert take_lock(path, wait=False) is None
-    first()
-    second = take_lock(path, wait=False)
-    assert second is not None
-    first()
-    assert take_lock(path, wait=False) is None
+    with locked(path) as first, locked(path, wait=False) as second:
+        assert (first, second) == (True, False)
+        path.unlink()
+        with locked(path, wait=False) as third, locked(path, wait=False) as fourth:
+            assert (third, fourth) == (True, False)
+    with locked(path, shared=True) as first, locked(path, shared=True) as second, locked(path, wait=False) as third:
+        assert (first, second, third) == (True, True, False)
     path.unlink()
-    third = take_lock(path, wait=False)
-    assert third is not None
-    second()
-    third()
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ArchiveError, match="cannot lock"), locked(path):
+        pass
 
 
 def test_an_unknown_refusal_of_locks_is_one_error(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
