@@ -88,6 +88,7 @@ def run_export(
     layers += spectral_layers(opened, indices, reflectance=products.reflectance)
     export = Export(opened, out)
     try:
+        out.mkdir(parents=True, exist_ok=True)
         with locked(out / ".export.lock"):
             check_owner(export)
             for folder in (out, export.folder):
