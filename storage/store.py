@@ -366,8 +366,13 @@ class Archive:
                 (path / "stages").mkdir(parents=True, exist_ok=True)
                 sync(path)
                 sync(path.parent)
-            if write:
-                _check_writable(path, create=create)
+            try:  # rights alone do not tell of a read-only or full disk
+                if write:
+                    with tempfile.TemporaryFile(dir=path, buffering=0) as probe:
+                        probe.write(b"written to see whether this can be written to")
+            except OSError as error:
+                if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):  # a full disk is for gc to free
+                    raise
         return cls(path)
 
     @property
@@ -686,25 +691,10 @@ def _write_beside(folder: Path, manifest: bytes) -> None:
     sync(folder.parent)
 
 
-def _published(path: Path) -> Path:
-    """Return the path that a leftover was to get."""
-    return path.with_name(re.sub(r"(\.[0-9a-f]{8})?\.part$", "", path.name))
-
-
 def _lock_name(path: Path) -> str:
-    """Return the name of the lock of a store, run, spool or leftover."""
+    """Return the name of the lock of a store, run or spool, or of what a leftover was to become."""
     kind = CAPTURED if path.parent.name == "spool" else path.parent.name
-    return f"{kind}-{_published(path).name}"
-
-
-def _check_writable(path: Path, *, create: bool) -> None:
-    """Write a nameless file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
-    try:
-        with tempfile.TemporaryFile(dir=path, buffering=0) as probe:
-            probe.write(b"written to see whether this can be written to")
-    except OSError as error:
-        if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
+    return f"{kind}-" + re.sub(r"(\.[0-9a-f]{8})?\.part$", "", path.name)
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:

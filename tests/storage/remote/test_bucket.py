@@ -235,16 +235,6 @@ def test_a_store_cleared_meanwhile_is_sent_as_cleared(archive: Archive, bucket: 
     assert f"{raw.uri}/manifest.json" not in Objects(bucket).listing()
 
 
-def test_additions_of_another_machine_come_back(archive: Archive, bucket: str, tmp_path: Path) -> None:
-    """Two machines survey in turns, by pull and push."""
-    send(archive, bucket)
-    other, _ = fetch(bucket, tmp_path / "there")
-    small_survey(other, seed=1)
-    send(other, bucket)
-    assert len(fetch(bucket, archive.root)[1].copied) == 4
-    assert contents(other.root) == contents(archive.root)
-
-
 def test_one_run_comes_with_the_stores_that_it_names(archive: Archive, bucket: str, tmp_path: Path) -> None:
     """Other runs and their stores stay in the bucket; an unknown run is named."""
     second = small_survey(archive, seed=1)
