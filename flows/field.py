@@ -47,6 +47,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Ra
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.storage.readers.open_cubes import load_labels_array
 from spectralzoom.storage.readers.scene_files import RasterPixels, SceneFile
+from spectralzoom.storage.runs import dated, moment_of
 from spectralzoom.storage.store import Archive
 
 
@@ -73,6 +74,11 @@ class Field:
     def name(self) -> str:
         """Return the name of the field, or of its scene."""
         return self.settings.name or Path(self.scene.name).stem
+
+    @property
+    def acquired(self) -> str | None:
+        """Return the day or moment of acquisition by the visit, else by the scene's file; None if neither states it."""
+        return dated(self.settings.visit, self.scene.acquired)
 
     @property
     def camera(self) -> LineCamera:
@@ -158,6 +164,9 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     archive = Archive(Path(settings.out).absolute())
     name = settings.name or Path(scene.name).stem
     label_notes = check_labels(scene, model.described)
+    stated, known = moment_of(settings.visit), moment_of(scene.acquired)
+    if stated is not None and known is not None and stated.date() != known.date():
+        notes += (f"--visit {settings.visit} is kept, though the file says that it was acquired {scene.acquired}",)
     prior, prior_notes = find_prior(archive, settings, name, grid, model.described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
         settings = replace(settings, prior=NONE if prior is None else prior.run)

@@ -33,8 +33,8 @@ class References:
     """Dark and white frames of one sweep's binning, (sample, band) float32 DN, and the white reference's value by band.
 
     A sample's scene value is ``(raw - dark) / (white - dark) * white_reference``.
-    With ``by_mirror`` it is divided by the mirror's throughput, which falls off with its tilt. ``bad`` marks
-    unreliable elements of the detector.
+    With ``by_mirror`` it is divided by the mirror's throughput, which falls off with its tilt. With ``exposure_ms`` it
+    is multiplied by that over the exposure of the line. ``bad`` marks unreliable elements of the detector.
     """
 
     dark: NDArray[np.float32]
@@ -42,6 +42,7 @@ class References:
     white_reference: NDArray[np.float32]
     bad: NDArray[np.bool_] | None = None  # (sample, band)
     by_mirror: bool = False  # white was taken at rest; away from it the mirror passes another fraction of the light
+    exposure_ms: float | None = None  # of the white frame at the gain of the lines; None: that of every line
 
     def same_as(self, other: References) -> bool:
         """Return whether all frames of two references are equal bit for bit."""
@@ -97,6 +98,10 @@ class SweepLines(Protocol):
     @property
     def time_s(self) -> NDArray[np.float64]:
         """Return (line,) times of mid exposure, since the start of the sweep [s]."""
+
+    @property
+    def exposure_ms(self) -> NDArray[np.float64]:
+        """Return (line,) exposures."""
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:

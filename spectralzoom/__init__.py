@@ -12,19 +12,37 @@ from spectralzoom.pipeline.errors import PipelineError as Error
 
 if TYPE_CHECKING:
     from spectralzoom.opened import OpenedArchive, OpenedRun, open
+    from spectralzoom.storage.readers.open_cubes import open_cube
     from spectralzoom.verbs import evaluate, plan, survey, train
 
     __version__: str
 
-__all__ = ["Error", "OpenedArchive", "OpenedRun", "__version__", "evaluate", "open", "plan", "survey", "train"]
+_MODULES = {
+    "OpenedArchive": "opened",
+    "OpenedRun": "opened",
+    "open": "opened",
+    "open_cube": "storage.readers.open_cubes",
+}
+_MODULES |= dict.fromkeys(("evaluate", "plan", "survey", "train"), "verbs")
+__all__ = [
+    "Error",
+    "OpenedArchive",
+    "OpenedRun",
+    "__version__",
+    "evaluate",
+    "open",
+    "open_cube",
+    "plan",
+    "survey",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.import_module("importlib.metadata").version("spectralzoom")
-    if name in __all__:
-        opened = name in ("OpenedArchive", "OpenedRun", "open")
-        return getattr(importlib.import_module("spectralzoom.opened" if opened else "spectralzoom.verbs"), name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"spectralzoom.{_MODULES[name]}"), name)
     raise AttributeError(f"spectralzoom has no {name!r}; it has {', '.join(__all__)}")
 
 

@@ -127,7 +127,7 @@ class OpenedRun:
 
     @property
     def mosaic(self) -> xarray.DataArray:
-        """(y, x, band) float32 values of all passes, NaN where not captured; also indexed by ``wavelength``.
+        """(y, x, band) float32 values of all passes, NaN where not captured, by rising ``wavelength``, an index.
 
         Spectra are restored from their components when they are used.
         """
@@ -207,21 +207,24 @@ def open_labelled(path: Path) -> xarray.Dataset:
     """Open a store lazily, in dask's blocks of whole shards, with a coordinate on every axis.
 
     ``y`` and ``x`` are in metres for a georeferenced store (its CRS in ``spatial_ref``). Otherwise they are tangents of
-    the angle from the undeflected direction [rad], or pixels. ``band`` and ``wavelength`` are in nm, both an index.
+    the angle from the undeflected direction [rad], or pixels. ``band`` and ``wavelength`` are in nm, rising, both an
+    index; ``detector`` numbers the detectors of overlapping bands.
     Numbers keep their type: no class becomes a float. Attributes are text, numbers or lists of them, others JSON text,
     so that ``to_netcdf`` and ``to_zarr`` write them. Raises IncompleteStoreError: the store is missing or damaged.
     """
     import xarray  # takes a second
 
-    from spectralzoom.spectra import by_wavelength, with_plain_attributes
+    from spectralzoom.spectra import with_plain_attributes
+    from spectralzoom.storage.arrays.band_order import by_wavelength
 
     with damage_named(str(path)):
         store: Any = open_group(path).store  # xarray takes a path with :: for a chain of file systems
         opened = xarray.open_dataset(
             store, engine="zarr", consolidated=False, mask_and_scale=False, chunks=None, cache=False
         )
+        opened = by_wavelength(opened)
         for name, one in opened.data_vars.items():
             blocks = one.encoding.get("shards") or one.encoding.get("chunks") or one.shape
             opened = opened.assign({name: one.chunk(dict(zip(one.dims, blocks, strict=True)))})
     bare = {name: np.arange(size) for name, size in opened.sizes.items() if name not in opened.variables}  # as rgb
-    return by_wavelength(with_plain_attributes(opened.assign_coords(bare)))
+    return with_plain_attributes(opened.assign_coords(bare))

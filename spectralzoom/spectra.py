@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from spectralzoom.storage.arrays.band_order import OF_WAVELENGTHS, by_wavelength
 from spectralzoom.storage.arrays.georeference import GRID_MAPPING
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
 from spectralzoom.storage.arrays.signal_cubes import SignalCube, open_signal_cube, read_coordinates
 
 OpenStore = Callable[[Path], Mosaic | SignalCube]
-OF_WAVELENGTHS = ("band", "wavelength")
 OF_BANDS = (*OF_WAVELENGTHS, "fwhm")
 OF_LINES = ("line", "sample", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line")
 OF_PLACES = ("y", "x", GRID_MAPPING)
@@ -88,19 +88,8 @@ def _open(path: Path, dims: tuple[str, str, str], places: Sequence[str], open_st
     bare = {name: np.arange(length) for name, length in zip(dims, shape, strict=True) if name not in coords}
     mapped = {"grid_mapping": GRID_MAPPING} if GRID_MAPPING in coords else {}
     spectra = xarray.Variable(dims, indexing.LazilyIndexedArray(RestoredArray(shape, path, open_store)), VALUE | mapped)
-    found = xarray.Dataset({"spectra": spectra.chunk(dict(zip(dims, (*block, -1), strict=True)))}, coords | bare)
-    return by_wavelength(with_plain_attributes(xarray.decode_cf(found, mask_and_scale=False)))["spectra"]
-
-
-def by_wavelength(opened: xarray.Dataset) -> xarray.Dataset:
-    """Index by ``band`` and ``wavelength``, as in ``.sel(wavelength=660, method="nearest")``.
-
-    Slices and the nearest need ascending or descending wavelengths: ``.sortby("wavelength")`` gives them.
-    """
-    for name in OF_WAVELENGTHS:
-        if name in opened.coords and opened[name].dims == ("band",):
-            opened = opened.drop_indexes(name, errors="ignore").set_xindex(name)
-    return opened
+    found = xarray.decode_cf(xarray.Dataset({"spectra": spectra}, coords | bare), mask_and_scale=False)
+    return by_wavelength(with_plain_attributes(found))["spectra"].chunk(dict(zip(dims, (*block, -1), strict=True)))
 
 
 def with_plain_attributes(opened: xarray.Dataset) -> xarray.Dataset:

@@ -107,17 +107,17 @@ def evaluate(dataset: str | Path, *, progress: Listener | None = None, **flags: 
     Error
         A value or a file is not valid.
     """
-    from spectralzoom.flows.cli.model_verbs import EvaluateFlags
     from spectralzoom.flows.evaluate.command import evaluate_weights
+    from spectralzoom.flows.settings.model_flags import EvaluateFlags
 
     if "weights" not in flags:
         raise SettingsError("evaluate needs weights=FILE, the weights to judge on the data set")
     weights = flags.pop("weights")
     files = tuple(map(Path, [weights] if isinstance(weights, str | Path) else weights))
-    request = _flags(EvaluateFlags, "evaluate", flags, weights=files).request(str(dataset))
+    asked = _flags(EvaluateFlags, "evaluate", flags, weights=files)
     with _working(progress):
         content: dict[str, Any] = evaluate_weights(
-            request, lambda what, done, figure: None if progress is None else progress(what, done, 1.0)
+            str(dataset), asked, lambda what, done, figure: None if progress is None else progress(what, done, 1.0)
         )
     return content
 
@@ -145,7 +145,8 @@ def train(
     Error
         A value or a file is not valid.
     """
-    from spectralzoom.flows.cli.model_verbs import TrainFlags, run_training
+    from spectralzoom.flows.cli.model_verbs import run_training
+    from spectralzoom.flows.settings.model_flags import TrainFlags
 
     arguments = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
     asked = _flags(TrainFlags, "train", flags)

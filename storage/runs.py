@@ -41,6 +41,7 @@ from spectralzoom.storage.whole_files import entries, refusals
 
 RECEIPT = "receipt.json"
 YEARS = range(1900, 2201)
+_WITH_TIME = re.compile(r"\s*[\dW-]+[^\d-]\d\d")  # a date and an hour, in ISO 8601
 _DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 LINES = re.compile(rf"stages/({CAPTURED}|condense(_fine)?)/.*")
@@ -58,6 +59,16 @@ def moment_of(text: object) -> datetime | None:
             found = datetime.fromisoformat(some)
             return found.replace(tzinfo=found.tzinfo or UTC) if found.year in YEARS else None
     return None
+
+
+def dated(*texts: str | None) -> str | None:
+    """Return the first text that begins with a day or moment, as `moment_of` reads it; None without one."""
+    return next((text for text in texts if moment_of(text) is not None), None)
+
+
+def has_time(text: object) -> bool:
+    """Return whether a text begins with a day and a time of it."""
+    return _WITH_TIME.match(str(text)) is not None
 
 
 @dataclass(frozen=True)
@@ -94,6 +105,11 @@ class Run:
     def stages(self) -> list[dict[str, Any]]:
         """Its stages, each with name, key, state and costs."""
         return [row for row in _as(list, self.receipt.get("stages")) if isinstance(row, dict)]
+
+    @property
+    def acquired(self) -> str | None:
+        """Return the day or moment of its visit, else that of acquisition by its file; None if neither is known."""
+        return dated(self.settings.get("visit"), self.receipt.get("acquired"))
 
     @property
     def created(self) -> str:

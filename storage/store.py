@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
@@ -546,14 +546,19 @@ class Archive:
     # --- runs ---------------------------------------------------------------------------------------------------------
 
     def publish_run(
-        self, name: str, build: Callable[[Path, str], Mapping[str, Any] | None], inputs: Sequence[Ref] = ()
+        self,
+        name: str,
+        build: Callable[[Path, str], Mapping[str, Any] | None],
+        inputs: Sequence[Ref] = (),
+        day: date | None = None,
     ) -> Path:
-        """Publish a run below ``runs`` and return its folder.
+        """Publish a run below ``runs`` and return its folder, named by the time and, where it differs, a ``day``.
 
         ``build`` gets a folder to write into and the run's address, and returns facts for the manifest. ``inputs`` are
         the stores that the run names; `gc` keeps them, and all that they were made of.
         """
-        begun = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
+        now = datetime.now(UTC)
+        begun = f"{now:%Y%m%dT%H%M%S}-{run_stem(name)}" + (f"-{day:%Y%m%d}" if day not in (None, now.date()) else "")
         for number in count(1):
             final = self.root / "runs" / (begun if number == 1 else f"{begun}-{number}")
 

@@ -7,11 +7,10 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 from rich.console import Console
 from rich.markup import escape
@@ -24,7 +23,6 @@ from spectralzoom.flows.archive.export_layers import (
     map_layers,
     open_exported,
     parse_doses,
-    prior_map_layers,
     split_names,
 )
 from spectralzoom.flows.archive.export_values import check_doses, spectral_layers, write_areas, write_polygons
@@ -38,6 +36,7 @@ from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked, remove_leftovers, to_json, write_whole
 
 COLLECTION = "collection.json"
+Assets = dict[str, Any]  # pystac's, by key
 COG, CSV = "image/tiff; application=geotiff; profile=cloud-optimized", "text/csv"
 RUN_FILES = {
     "receipt.json": ("Receipt", "application/json"),
@@ -82,22 +81,22 @@ def run_export(
     doses = parse_doses(products.dose)
     indices = tuple(dict.fromkeys(map(find_index, split_names("indices", products.indices))))
     opened = open_exported(Archive.open(archive, create=False, write=False), run)
-    out = check_outside(out, opened.archive.root)
+    out = check_outside(out, opened.archive.root)  # with links resolved: addresses are relative
     check_doses(opened, doses)
-    layers = [*map_layers(opened), *prior_map_layers(opened)]
-    layers += spectral_layers(opened, indices, reflectance=products.reflectance)
-    export = Export(opened, out)
+    layers = [*map_layers(opened), *spectral_layers(opened, indices, reflectance=products.reflectance)]
+    folder, polygons = out / opened.id, products.polygons or bool(doses)
     try:
         out.mkdir(parents=True, exist_ok=True)
         with locked(out / ".export.lock"):
-            check_owner(export)
-            for folder in (out, export.folder):
-                remove_leftovers(folder)
-            _write_images(export, layers, console)
-            _write_tables(export, doses, console, polygons=products.polygons or bool(doses))
+            _collection_id(out, opened.archive.root.name)
+            for one in (out, folder):
+                remove_leftovers(one)
+            assets = _write_images(folder, layers, console)
+            with console.status("writing areas and polygons"):
+                assets |= _write_tables(opened, folder, doses, polygons=polygons)
             for name, (title, kind) in RUN_FILES.items():
-                export.add(Path(name).stem, opened.folder / name, title, kind, ["metadata"])
-            item, collection = write_catalogue(export)
+                assets[Path(name).stem] = _asset(folder, opened.folder / name, title, kind, "metadata")
+            written = _write_catalogue(out, opened.archive.root.name, _describe(opened, folder, assets))
     except PipelineError:  # some are OSErrors
         raise
     except (OSError, UnicodeEncodeError) as error:
@@ -106,134 +105,114 @@ def run_export(
     placed = opened.geobox is not None
     if not placed:
         console.print("[dim]note: neither a rig pose nor the scene has a place on the earth; images have no CRS[/]")
-    for path in (*(out / name for name in export.files.values()), item, collection):
+    if opened.undated:
+        console.print("[dim]note: nothing states when the scene was captured: its items have the day of the survey[/]")
+    own = {key: unquote(asset.href) for key, asset in assets.items() if not asset.href.startswith("..")}
+    files = {key: f"{opened.id}/{name}" for key, name in own.items()}
+    for path in (*(out / name for name in files.values()), *written):
         console.print(f"  {escape(str(path))}", soft_wrap=True)
-    return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": export.files}
+    return {"run": opened.id, "item": str(written[0]), "collection": str(written[1]), "placed": placed, "files": files}
 
 
-@dataclass
-class Export:
-    """The export of one run into a folder."""
+def _asset(folder: Path, path: Path, title: str, kind: str, *roles: str, **more: Any) -> Any:
+    """Return an asset of the item in ``folder``, with its address relative to it."""
+    import pystac
 
-    run: ExportedRun
-    out: Path  # with links resolved, so that the relative address of the archive is right
-    assets: dict[str, Any] = field(default_factory=dict)  # pystac's, by key
-    files: dict[str, str] = field(default_factory=dict)  # paths of assets in `out`, relative to it
-
-    @property
-    def folder(self) -> Path:
-        return self.out / self.run.id
-
-    @property
-    def collection_id(self) -> str:
-        return re.sub(r"[^A-Za-z0-9_-]+", "-", self.run.archive.root.name).strip("-") or "surveys"
-
-    def add(self, key: str, path: Path, title: str, kind: str, roles: Sequence[str], **more: Any) -> None:
-        """Add a file to the catalogue, by its address relative to the item."""
-        import pystac
-
-        href = quote(Path(os.path.relpath(path.resolve(), self.folder)).as_posix())
-        self.assets[key] = pystac.Asset(href, title, media_type=kind, roles=[*roles], extra_fields=more)
-        if path.resolve().is_relative_to(self.out):
-            self.files[key] = path.resolve().relative_to(self.out).as_posix()
+    href = quote(Path(os.path.relpath(path.resolve(), folder)).as_posix())
+    return pystac.Asset(href, title, media_type=kind, roles=[*roles], extra_fields=more)
 
 
-def _write_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
+def _write_images(folder: Path, layers: Sequence[Layer], console: Console) -> Assets:
+    """Write the images, and return their assets."""
+    assets = {}
     for layer in layers:
-        path = export.folder / f"{layer.name}.tif"
+        path = folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
             write_cog(path, layer.image, layer.rows())
         unit = {} if layer.unit is None else {"unit": layer.unit}
         bands = [{"name": name, "data_type": layer.image.dtype, **unit} for name in layer.image.bands]
-        export.add(layer.name, path, layer.title, COG, layer.roles, bands=bands)
+        assets[layer.name] = _asset(folder, path, layer.title, COG, *layer.roles, bands=bands)
+    return assets
 
 
-def _write_tables(export: Export, doses: Mapping[str, float], console: Console, *, polygons: bool) -> None:
-    areas = export.folder / "areas.csv"
-    write_areas(export.run, areas)
-    export.add("areas", areas, "Areas of the classes, with standard errors", CSV, ["data", "metadata"])
-    if polygons:
-        with console.status("drawing polygons"):
-            for key, path, kind in write_polygons(export.run, export.folder, doses):
-                export.add(key, path, "Classes as polygons", kind, ["data"])
+def _write_tables(run: ExportedRun, folder: Path, doses: Mapping[str, float], *, polygons: bool) -> Assets:
+    """Write the areas, and the classes as polygons if asked for; return their assets."""
+    write_areas(run, folder / "areas.csv")
+    title = "Areas of the classes, with standard errors"
+    assets = {"areas": _asset(folder, folder / "areas.csv", title, CSV, "data", "metadata")}
+    for key, path, kind in write_polygons(run, folder, doses) if polygons else ():
+        assets[key] = _asset(folder, path, "Classes as polygons", kind, "data")
+    return assets
 
 
-def check_owner(export: Export) -> None:
-    """Refuse a folder whose collection is another archive's (ArchiveError)."""
-    path = export.out / COLLECTION
-    if not path.exists():
-        return
+def _describe(run: ExportedRun, folder: Path, assets: Assets) -> Any:
+    """Return the run's item, with the place of its class map, the time of observation and the day of processing."""
+    import rio_stac
+
+    receipt = run.receipt
+    start, end = (datetime.fromisoformat(text) for text in run.observed)
+    about = f"Survey of {receipt['survey']}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that a file has no CRS: it gets no place
+        item = rio_stac.create_stac_item(
+            str(folder / "class_map.tif"),
+            input_datetime=start,
+            id=run.id,
+            assets=assets,
+            properties={
+                "title": about,
+                "description": f"{about} ({receipt['source']} source).",
+                "instruments": [str(receipt["source"])],
+                "created": receipt["finished"],
+            },
+            with_proj=run.geobox is not None,
+            geom_densify_pts=21,
+        )
+    item.common_metadata.start_datetime, item.common_metadata.end_datetime = start, end
+    if run.geobox is None:
+        item.geometry = item.bbox = None
+    return item
+
+
+def _collection_id(out: Path, archive: str) -> str:
+    """Return the identifier of an archive's collection (ArchiveError: ``out`` has another one's)."""
+    made = re.sub(r"[^A-Za-z0-9_-]+", "-", archive).strip("-") or "surveys"
+    path = out / COLLECTION
     try:
-        found = json.loads(path.read_bytes())["id"]
+        found = json.loads(path.read_bytes())["id"] if path.exists() else made
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ArchiveError(f"{path} cannot be read as STAC: {error}; remove it and export again") from error
-    if found != export.collection_id:
+    if found != made:
         raise ArchiveError(
-            f"{path} is the collection {found!r} of another archive, expected {export.collection_id!r}; choose another "
-            "--out"
+            f"{path} is the collection {found!r} of another archive, expected {made!r}; choose another --out"
         )
+    return made
 
 
-def write_catalogue(export: Export) -> tuple[Path, Path]:
+def _write_catalogue(out: Path, archive: str, item: Any) -> tuple[Path, Path]:
     """Write ``ID/ID.json`` and the collection of all items in the folder; return both paths.
 
     Raises ArchiveError: an item of an earlier export cannot be read.
     """
     import pystac
 
-    items = [_describe(export)]
-    for path in sorted(export.out.glob("*/*.json")):  # earlier exports, each in the folder of its own name
-        if path.stem == path.parent.name and path.stem != export.run.id:
+    items = [item]
+    for path in sorted(out.glob("*/*.json")):  # earlier exports, each in the folder of its own name
+        if path.stem == path.parent.name and path.stem != item.id:
             try:
                 content = json.loads(path.read_bytes())
-                items.append(pystac.Item.from_dict(content, href=f"/{path.relative_to(export.out)}"))
+                items.append(pystac.Item.from_dict(content, href=f"/{path.relative_to(out)}"))
             except (OSError, ValueError, KeyError, TypeError, pystac.STACError, pystac.STACTypeError) as error:
                 raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
-    items.sort(key=lambda one: (str(one.datetime), one.id))
-    text = f"Surveys exported from the archive {export.run.archive.root.name}."
-    made = pystac.Collection(export.collection_id, text, _extent(items), license="other")
-    made.add_items(items)
-    made.catalog_type = pystac.CatalogType.SELF_CONTAINED
-    made.normalize_hrefs("/")  # links are relative; a folder's name may have characters of addresses, as # and ?
-    written = []
-    for one in (next(one for one in items if one.id == export.run.id), made):
-        written.append(export.out / one.self_href.lstrip("/"))
-        write_whole(written[-1], to_json(one.to_dict(include_self_link=False)))
-    return written[0], written[1]
-
-
-def _describe(export: Export) -> Any:
-    """Return the run's item, with the place of its class map."""
-    import rio_stac
-
-    receipt = export.run.receipt
-    start, end = (datetime.fromisoformat(text) for text in export.run.observed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that a file has no CRS: it gets no place
-        item = rio_stac.create_stac_item(
-            str(export.folder / "class_map.tif"),
-            input_datetime=start,
-            id=export.run.id,
-            assets=export.assets,
-            properties={
-                "title": f"Survey of {receipt['survey']}",
-                "description": f"Survey of {receipt['survey']} ({receipt['source']} source).",
-                "instruments": [str(receipt["source"])],
-            },
-            with_proj=export.run.geobox is not None,
-            geom_densify_pts=21,
-        )
-    item.common_metadata.start_datetime, item.common_metadata.end_datetime = start, end
-    if export.run.geobox is None:
-        item.geometry = item.bbox = None
-    return item
-
-
-def _extent(items: Sequence[Any]) -> Any:
-    """Return the extent of all items; the whole earth if none has a place."""
-    import pystac
-
-    found = pystac.Extent.from_items(items)
+    extent = pystac.Extent.from_items(items)
     if all(one.bbox is None for one in items):
-        found.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
-    return found
+        extent.spatial = pystac.SpatialExtent([[-180.0, -90.0, 180.0, 90.0]])
+    text = f"Surveys exported from the archive {archive}."
+    collection = pystac.Collection(_collection_id(out, archive), text, extent, license="other")
+    collection.add_items(sorted(items, key=lambda one: (str(one.datetime), one.id)))
+    collection.catalog_type = pystac.CatalogType.SELF_CONTAINED
+    collection.normalize_hrefs("/")  # links are relative; a folder's name may have characters of addresses, as # and ?
+    written = out / item.self_href.lstrip("/"), out / COLLECTION
+    for path, one in zip(written, (item, collection), strict=True):
+        write_whole(path, to_json(one.to_dict(include_self_link=False)))
+    return written

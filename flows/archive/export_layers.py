@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,18 +18,18 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.flows.publish.receipt import Receipt, load_receipt
 from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.load import time_of_visit
-from spectralzoom.flows.settings.survey_settings import RIG
+from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RIG
 from spectralzoom.flows.stages.ground import colours_of
-from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
+from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out
 from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
-from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
+from spectralzoom.storage.arrays.georeference import load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
-from spectralzoom.storage.export.image_files import ANGULAR, CogImage, angular_geobox
-from spectralzoom.storage.runs import RECEIPT, read_run
-from spectralzoom.storage.store import LATEST, Archive, Ref, is_cleared, read_manifest, uri_of
+from spectralzoom.storage.export.image_files import CogImage
+from spectralzoom.storage.runs import has_time, read_run
+from spectralzoom.storage.store import LATEST, Archive, read_manifest
 
 
 @Parameter(name="*")
@@ -79,7 +79,11 @@ def parse_doses(given: str | None) -> dict[str, float]:
 
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
-CLASS, RGB = ("class",), ("red", "green", "blue")  # names of bands
+RGB = ("red", "green", "blue")  # names of bands
+ANGULAR = (
+    "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
+    "downwards; there is no CRS"
+)
 
 
 @dataclass(frozen=True)
@@ -96,38 +100,33 @@ class ExportedRun:
 
     @property
     def observed(self) -> tuple[str, str]:
-        """Return begin and end of the observation: those of the run, unless its visit is another moment.
+        """Return begin and end of the observation: those of the run, unless visit or file state another moment or day.
 
         A visit of a rig may be known by its date alone, and captures lines during the run.
         """
         began, ended = self.receipt["started"], self.receipt["finished"]
-        visit = time_of_visit(read_run(self.folder)) or began
+        run = read_run(self.folder)
+        moment = time_of_visit(run) or began
         known = 10 if self.receipt["source"] == RIG else 19  # characters: to the day, or to the second
-        return (began, ended) if visit[:known] == began[:known] else (visit, visit)
+        if moment[:known] == began[:known]:
+            return began, ended
+        whole_day = run.acquired is not None and not has_time(run.acquired)
+        return moment, f"{moment[:10]}T23:59:59+00:00" if whole_day else moment
 
-    def store(self, product: str) -> Ref | None:
-        """Return the store of a product; None if there is none, or if its files were cleared away.
+    @property
+    def undated(self) -> bool:
+        """Return whether nothing states when the light of a file was captured, so that `observed` is the survey's."""
+        run = read_run(self.folder)
+        dated = run.acquired is not None or run.settings.get("scene") in BUILT_IN_SCENES
+        return not dated and self.receipt["source"] != RIG
 
-        Raises IncompleteStoreError: the archive has lost the store or a part of it.
-        """
-        uri = self.receipt["products"].get(product)
-        if uri is None:
-            return None
-        parts = (uri_of(uri) or "stages//").split("/")  # of a damaged receipt: no name, and an error
-        stage, key = parts[1], parts[-1]
-        ref = self.archive.find(stage, key)
-        if ref is None and is_cleared(self.archive.ref(stage, key).path):
-            return None
-        if ref is None:
-            raise IncompleteStoreError(
-                f"the {product} of run {self.id} should lie in {uri} of {self.archive.name} and does not; run its "
-                "survey again, or restore the store from a copy"
-            )
-        return ref
+    def has(self, product: str) -> bool:
+        """Return whether the run made a product."""
+        return product in self.receipt["products"]
 
     def path(self, product: str) -> Path:
-        """Return the path of a product that every finished run has. Raises IncompleteStoreError: this run lacks it."""
-        if self.store(product) is None:
+        """Return the path of a product. Raises IncompleteStoreError: the run lacks it, or it is missing or damaged."""
+        if not self.has(product):
             raise IncompleteStoreError(f"the run {self.id} has no {product}: it did not finish; export another run")
         return self.archive.locate(self.receipt["products"][product])
 
@@ -139,19 +138,16 @@ class ExportedRun:
     @property
     def map_product(self) -> str:
         """Return the map that is exported: the one on the ground if there is a pose."""
-        return "class_map" if self.store("ground_map") is None else "ground_map"
+        return "ground_map" if self.has("ground_map") else "class_map"
 
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """Return a run by name or address, else the latest.
 
-    Raises NoRunError: there is none. Raises IncompleteStoreError: its receipt cannot be read.
+    Raises NoRunError: there is none; IncompleteStoreError, ShapeError: its receipt is damaged, or is no survey's.
     """
     folder = archive.run_folder(name or LATEST)
-    try:
-        return ExportedRun(archive, folder, load_receipt(folder))
-    except ShapeError as error:
-        raise IncompleteStoreError(f"{folder / RECEIPT} is no survey's: {error}; export another run") from error
+    return ExportedRun(archive, folder, load_receipt(folder))
 
 
 @dataclass(frozen=True)
@@ -167,27 +163,38 @@ class Layer:
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
-    """Return the class map, its confidence, the expected gain of the patches, and a picture."""
+    """Return class map, confidence, expected gain and picture, and after a prior map the old classes of changes."""
     product = run.map_product
     legend = legend_of(open_group(run.path(product)))
-    roles = ("data", "confidence")
-    return [
-        image_layer(run, product, "classes", "class_map", "Class map", bands=CLASS, nodata=UNLABELLED, legend=legend),
-        image_layer(run, product, "confidence", "confidence", "Probability of the class given", roles=roles, unit="1"),
+    fraction: dict[str, Any] = {"unit": "1", "roles": ("data", "confidence")}
+    layers = [
+        image_layer(run, product, "classes", "class_map", "Class map", legend=legend),
+        image_layer(run, product, "confidence", "confidence", "Probability of the class given", **fraction),
         _gain_layer(run),
         _picture(run),
     ]
+    revisited = product if product == "ground_map" else "class_probabilities"
+    if run.has(revisited) and OLD_CLASS in (group := open_group(run.path(revisited))):
+        title = "Class of the prior map, where the map is sure of another one"
+        layers.append(image_layer(run, revisited, OLD_CLASS, OLD_CLASS, title, legend=legend_of(group)))
+    return layers
 
 
-def layer_tags(run: ExportedRun, product: str, geobox: GeoBox) -> dict[str, str]:
-    """Return the tags of the run, which every image has."""
-    return {
+def cog_image(
+    run: ExportedRun, product: str, geobox: GeoBox, dtype: str, bands: tuple[str, ...], **more: Any
+) -> CogImage:
+    """Return an image with the tags of the run, NaN without a value; ``more`` are fields of `CogImage`."""
+    tags = {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
         "product": run.receipt["products"][product],
         "surveyed": run.observed[0],
+        "processed": run.receipt["finished"],
         "place": ANGULAR if geobox.crs is None else "map",
+        **({} if run.undated else {"ACQUISITIONDATETIME": run.observed[0]}),
+        **more.pop("tags", {}),
     }
+    return CogImage(geobox, dtype, bands, **{"nodata": np.nan, "tags": tags, **more})
 
 
 def geobox_of(stored: StoredImage) -> GeoBox:
@@ -206,56 +213,40 @@ def image_layer(
     title: str,
     *,
     roles: tuple[str, ...] = ("data",),
-    bands: tuple[str, ...] | None = None,
-    nodata: float = np.nan,
     unit: str | None = None,
     legend: ClassNames | None = None,
+    **more: Any,
 ) -> Layer:
-    """Return an image of a store on the store's own grid."""
+    """Return an image of a store on the store's own grid; ``more`` are fields of `CogImage`."""
     stored = open_image(run.path(product), array)
-    geobox = geobox_of(stored)
-    image = CogImage(geobox, stored.dtype.name, bands or (array,), nodata, legend, layer_tags(run, product, geobox))
+    more = (
+        {"bands": (array,), **more} if legend is None else {"bands": ("class",), "nodata": UNLABELLED, "legend": legend}
+    )
+    image = cog_image(run, product, geobox_of(stored), stored.dtype.name, **more)
     return Layer(name, title, roles, image, stored.rows, unit)
 
 
 def _gain_layer(run: ExportedRun) -> Layer:
-    """Return the expected gain with one pixel a patch, on the grid of the class map."""
-    stored = open_image(run.path("attention"), "score")
-    class_map = run.store("class_map")
-    assert class_map is not None
-    patch = int(read_manifest(class_map.path)["params"]["gains"]["frame"]["grid"]["patch"])
-    scene = grid_of(open_image(run.path("class_map"), "classes").about)
-    assert scene is not None
-    shape = (stored.shape[0], stored.shape[1])
-    fine = load_geobox(run.path("class_map"))
-    geobox = angular_geobox(replace(scene, factor=patch), shape) if fine is None else zoomed_out(fine, patch, shape)
-    policy = str(stored.about.get("policy", ""))
-    tags = {**layer_tags(run, "attention", geobox), "policy": policy, "patch_px": str(patch)}
-    image = CogImage(geobox, stored.dtype.name, ("score",), np.nan, tags=tags)
+    """Return the expected gain with one pixel a patch, from the corner of the class map on."""
+    stored, drawn = open_image(run.path("attention"), "score"), run.path("class_map")
+    patch = int(read_manifest(drawn.parent)["params"]["gains"]["frame"]["grid"]["patch"])
+    y, x = stored.shape
+    geobox = zoomed_out(geobox_of(open_image(drawn, "classes")), patch, (y, x))
+    tags = {"policy": str(stored.about.get("policy", "")), "patch_px": str(patch)}
+    image = cog_image(run, "attention", geobox, stored.dtype.name, ("score",), tags=tags)
     return Layer("attention", "Expected gain of a fine pass, by patch", ("data",), image, stored.rows, "1")
 
 
 def _picture(run: ExportedRun) -> Layer:
     """Return the picture on the ground, else the coarse mosaic in a photograph's tones: 1 to 255, 0 without a value."""
-    title = "Picture of the coarse pass"
-    roles = ("visual", "overview")
+    title, roles = "Picture of the coarse pass", ("visual", "overview")
     if run.map_product == "ground_map":
         return image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, bands=RGB, nodata=0)
-    geobox = geobox_of(open_image(run.path("mosaic"), "coverage"))
-    ref = run.store("mosaic")
-    assert ref is not None
+    place = run.path("mosaic")
+    image = cog_image(run, "mosaic", geobox_of(open_image(place, "coverage")), "uint8", RGB, nodata=0)
 
     def rows() -> Rows:
+        ref = run.archive.ref(*place.parent.relative_to(run.archive.root / "stages").parts)
         yield 0, np.nan_to_num(np.rint(colours_of(ref))).astype(np.uint8)
 
-    return Layer("rgb", title, roles, CogImage(geobox, "uint8", RGB, 0, tags=layer_tags(run, "mosaic", geobox)), rows)
-
-
-def prior_map_layers(run: ExportedRun) -> list[Layer]:
-    """Return what a prior map adds: the previous classes of changed pixels."""
-    product = "ground_map" if run.map_product == "ground_map" else "class_probabilities"
-    if run.store(product) is None or OLD_CLASS not in (group := open_group(run.path(product))):
-        return []
-    title = "Class of the prior map, where the map is sure of another one"
-    legend = legend_of(group)
-    return [image_layer(run, product, OLD_CLASS, OLD_CLASS, title, bands=CLASS, nodata=UNLABELLED, legend=legend)]
+    return Layer("rgb", title, roles, image, rows)

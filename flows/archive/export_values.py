@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from affine import Affine
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.archive.export_layers import ExportedRun, Layer, Rows, geobox_of, layer_tags
+from spectralzoom.flows.archive.export_layers import ExportedRun, Layer, Rows, cog_image, geobox_of
 from spectralzoom.models.evaluation.metrics import stratified_fractions
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
@@ -21,12 +20,13 @@ from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE
 from spectralzoom.pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at
 from spectralzoom.pipeline.ground.view import GroundView, RigPose
 from spectralzoom.pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
+from spectralzoom.storage.arrays.band_order import sort_bands
 from spectralzoom.storage.arrays.class_maps import legend_of
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
 from spectralzoom.storage.arrays.ground_maps import open_image
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
-from spectralzoom.storage.export.image_files import CogImage
+from spectralzoom.storage.export.csv_tables import csv_table
 from spectralzoom.storage.whole_files import write_whole, written_aside
 
 BYTES_AT_ONCE = 1 << 27
@@ -42,17 +42,16 @@ def write_areas(run: ExportedRun, path: Path) -> None:
 
     ``estimated_fraction`` and ``standard_error`` follow from the labels.
     """
-    import pandas as pd
-
     classes, confidence = (open_image(run.path(run.map_product), name) for name in ("classes", "confidence"))
-    names = tuple(classes.about["class_names"])
+    legend = legend_of(classes.group)
+    names, numbers = legend.names, list(legend.numbers)
     counts, sure_pixels, sums = np.zeros((3, 256))
     for (_, drawn), (_, sure) in zip(classes.rows(), confidence.rows(), strict=True):
         known = np.isfinite(sure)
         counts += np.bincount(drawn.ravel(), minlength=256)
         sure_pixels += np.bincount(drawn[known], minlength=256)
         sums += np.bincount(drawn[known], sure[known], 256)
-    pixels = counts[: len(names)].astype(int)
+    pixels = counts[numbers].astype(int)
     unknown = np.full(len(names), np.nan)
     areas = (run.receipt.get("areas") or {}).get("ha")
     hectares = unknown if areas is None else np.array([areas.get(name, 0.0) for name in names], np.float64)
@@ -62,14 +61,15 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     estimate, error = (unknown, unknown) if confusion is None else stratified_fractions(fraction, confusion)
     columns = {
         "class": names,
+        "value": numbers,
         "pixels": pixels,
         "hectares": hectares,
         "fraction": fraction,
-        "mean_confidence": np.divide(sums, sure_pixels, np.full(256, np.nan), where=sure_pixels > 0)[: len(names)],
+        "mean_confidence": np.divide(sums, sure_pixels, np.full(256, np.nan), where=sure_pixels > 0)[numbers],
         "estimated_fraction": estimate,
         "standard_error": error,
     }
-    write_whole(path, pd.DataFrame(columns).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    write_whole(path, csv_table(columns))
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class MosaicView:
     @cached_property
     def ground(self) -> GroundGrid | None:
         """Return the map's grid with its rays, by the pose in the map's store; None without one."""
-        if self.run.store("ground_map") is None:
+        if not self.run.has("ground_map"):
             return None
         path = self.run.path("ground_map")
         scene = grid_of(open_image(self.run.path("class_map"), "classes").about)
@@ -147,27 +147,29 @@ def spectral_layers(run: ExportedRun, indices: Sequence[SpectralIndex], *, refle
 
 
 def _reflectance(view: MosaicView, white: float) -> Layer:
-    wave, width = view.mosaic.wavelength_nm.tolist(), view.mosaic.fwhm_nm
+    """Return all bands by rising wavelength, with the detector of each where some overlap."""
+    order, centres, detector = sort_bands(view.mosaic.wavelength_nm)
+    width = view.mosaic.fwhm_nm
     values = "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
-    image = CogImage(
-        view.geobox,
-        "float32",
-        tuple(f"{centre:.1f} nm" for centre in wave),
-        np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.geobox), "values": values},
-        wavelength_nm=wave,
-        fwhm_nm=None if width is None else width.tolist(),
-    )
-    title, roles = f"{len(wave)} bands: {values}", ("data", "reflectance")
-    return Layer("reflectance", title, roles, image, lambda: view.rows(range(len(wave))), "1")
+    several = detector.any()
+    facts = {
+        "wavelength_nm": centres.tolist(),
+        "fwhm_nm": None if width is None else width[order].tolist(),
+        "detector": detector.tolist() if several else (),
+        "tags": {"values": values},
+    }
+    called = [f", detector {one}" if several else "" for one in detector]
+    bands = tuple(f"{nm:.1f} nm{of}" for nm, of in zip(centres, called, strict=True))
+    image = cog_image(view.run, "mosaic", view.geobox, "float32", bands, **facts)
+    title, roles = f"{len(order)} bands: {values}", ("data", "reflectance")
+    return Layer("reflectance", title, roles, image, lambda: view.rows(order.tolist()), "1")
 
 
 def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
     wave = view.mosaic.wavelength_nm[list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
-    tags = layer_tags(view.run, "mosaic", view.geobox)
-    tags |= {"index": index.name, "bands": taken, "reference": index.reference}
-    image = CogImage(view.geobox, "float32", (index.name,), np.nan, tags=tags)
+    tags = {"index": index.name, "bands": taken, "reference": index.reference}
+    image = cog_image(view.run, "mosaic", view.geobox, "float32", (index.name,), tags=tags)
 
     def rows() -> Rows:
         for first, values in view.rows(bands):
@@ -196,14 +198,15 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     stored = open_image(run.path(run.map_product), "classes")
     classes = np.concatenate([rows for _, rows in stored.rows()])
     legend = legend_of(stored.group)
-    place = Affine(*stored.about["spatial:transform"])
+    place = geobox_of(stored).affine
     found = list(rasterio_features.shapes(classes, mask=classes != UNLABELLED, transform=place))
     numbers = [int(number) for _, number in found]
-    names = [legend.names[number] for number in numbers]
+    index = [legend.numbers.index(number) for number in numbers]
+    names = [legend.names[one] for one in index]
     columns = {
         "class": numbers,
         "name": names,
-        "colour": [f"#{bytes(legend.colours[number].tolist()).hex()}" for number in numbers],
+        "colour": [f"#{bytes(legend.colours[one].tolist()).hex()}" for one in index],
     }
     crs = None if run.geobox is None else str(run.geobox.crs)
     outlines = [shapely.geometry.shape(outline) for outline, _ in found]
@@ -214,19 +217,13 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
         frame["dose"] = [doses.get(name, 0.0) for name in names]
     package, shapefile = folder / "classes.gpkg", folder / "classes.shp"
     parts = [f"classes{ending}" for ending in (PARTS if crs is not None else PARTS[:-1])]
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": run.receipt["finished"]})  # the same polygons, the same bytes
+    day = {"DBF_DATE_LAST_UPDATE": run.receipt["finished"][:10]}  # the same polygons, the same bytes
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": run.receipt["finished"]})
     try:
         with written_aside(folder, [package.name, *parts]) as aside, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
-            frame.to_file(aside / package.name, layer="classes", driver="GPKG", engine="pyogrio")
-            date = run.receipt["finished"][:10]
-            frame.to_file(
-                aside / shapefile.name,
-                driver="ESRI Shapefile",
-                engine="pyogrio",
-                encoding="utf-8",
-                DBF_DATE_LAST_UPDATE=date,
-            )
+            frame.to_file(aside / package.name, layer="classes", driver="GPKG")
+            frame.to_file(aside / shapefile.name, driver="ESRI Shapefile", encoding="utf-8", **day)
     except pyogrio.errors.DataSourceError as error:
         raise ArchiveError(f"{package} cannot be written: {error}; is there space on the disk?") from error
     finally:

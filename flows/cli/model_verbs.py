@@ -4,196 +4,18 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from cyclopts import Parameter
 from rich.console import Console
 
 from spectralzoom.flows.evaluate.command import run_evaluate
-from spectralzoom.flows.evaluate.frames import FRACTIONS, USUAL, EvaluateRequest
-from spectralzoom.flows.settings.flags import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list
+from spectralzoom.flows.settings.flags import AsJson, OutFile
+from spectralzoom.flows.settings.model_flags import NO_EVALUATE_FLAGS, NO_TRAIN_FLAGS, EvaluateFlags, TrainFlags
 from spectralzoom.flows.terminal.progress import print_json, stderr
-from spectralzoom.flows.training.train import check_counts, run_train
+from spectralzoom.flows.training.train import run_train
 from spectralzoom.flows.training.train_scenes import TrainRequest
-from spectralzoom.flows.training.train_temporal import LANDS, TemporalRequest, run_remember
-from spectralzoom.models.network.machine import PROCESSOR, Device
-from spectralzoom.models.training.temporal import TemporalTraining
-from spectralzoom.models.training.train import TrainingSettings
-from spectralzoom.pipeline.errors import SettingsError
-
-
-@Parameter(name="*")
-@dataclass(frozen=True, kw_only=True)
-class SceneFlags:
-    """Flags of a labelled scene.
-
-    Parameters
-    ----------
-    seed
-        Random seed of initial weights, crops, noise and random policy.
-    scenes
-        Number of built-in scenes. Default: 4 to evaluate; 48 to train, on days from April to October (`scouting`: May
-        to July).
-    device
-        Device of the network: `cpu`, `cuda`, `mps`, or `auto` (cuda or mps if available, else cpu).
-    labels
-        For one scene: label file.
-    bands
-        For one scene: band numbers to use, counted from 0, with commas.
-    wavelengths
-        For one scene: centre wavelengths of its bands [nm], with commas.
-    """
-
-    seed: int = 0
-    scenes: int | None = None
-    device: Device = PROCESSOR
-    labels: str | None = None
-    bands: str | None = None
-    wavelengths: str | None = None
-
-    def choices(self) -> dict[str, Any]:
-        """Return the choices of files and bands of one scene. Raises SettingsError: numbers are invalid."""
-        return {
-            "labels": self.labels,
-            "bands": parse_wholes(self.bands, "--bands"),
-            "wavelengths": parse_numbers(self.wavelengths, "--wavelengths"),
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainFlags(SceneFlags):
-    """Flags of a training.
-
-    Parameters
-    ----------
-    hold_out
-        Names of scenes to exclude from training, with commas: 059,060. The weights record the split.
-    validation
-        Number of validation scenes. Default: 3 built-in scenes, or one in eight of a folder, at most 4.
-    steps
-        Maximum number of steps; training stops at --steps or --minutes, whichever comes first.
-    minutes
-        Time limit of the steps [min]; reading scenes and validation are not included.
-    patch
-        Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
-    start
-        Weights from which the training starts. Bands, classes and sizes must be theirs, and DATASET must contain the
-        scenes that they know. The result is the mean of both networks, or the trained one where it reads the
-        validation scenes better.
-    learning_rate
-        Highest learning rate. Default: 0.0015, or a third of it with --start.
-    train_temporal
-        Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
-        reader that they have. It takes --scenes, --steps, --minutes and --seed; it does not resume. It
-        needs 4 GB of memory, and half an hour for reading the scenes besides --minutes.
-    dim
-        Token width of the transformer.
-    layers
-        Number of transformer layers. Default: 3, or 1 for frames of 512 px and more.
-    heads
-        Number of attention heads; a divisor of --dim.
-    crop
-        Size of the crops [px].
-    batch
-        Crops per step; half as many, of twice the area, in the last 30 % of the steps.
-    min_exposure_ms
-        Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
-        1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
-    train_mask
-        For one scene: mask image of the training pixels; 0 excludes a pixel.
-    mask_classes
-        For one scene: classes of the label file that the mask's numbers 1, 2, ... stand for, with commas.
-    """
-
-    hold_out: str | None = None
-    validation: int | None = None
-    steps: int = TrainingSettings.steps
-    minutes: float = TrainingSettings.minutes
-    patch: int | None = None
-    start: Path | None = None
-    learning_rate: float | None = None
-    train_temporal: Path | None = None
-    dim: int = 64
-    layers: int | None = None
-    heads: int = 4
-    crop: int = TrainingSettings.crop
-    batch: int = TrainingSettings.batch
-    min_exposure_ms: float = TrainingSettings.darkest_ms
-    train_mask: str | None = None
-    mask_classes: str | None = None
-
-    def choices(self) -> dict[str, Any]:
-        """Return the choices of files, bands and masks of one scene. Raises SettingsError: numbers are invalid."""
-        masks = {"train_mask": self.train_mask, "mask_classes": parse_wholes(self.mask_classes, "--mask-classes")}
-        return super().choices() | masks
-
-    def request(self, dataset: str, out: Path, command: str) -> TrainRequest:
-        """Return the request of a training of all weights. Raises SettingsError: numbers are invalid."""
-        same = {name: getattr(self, name) for name in ("steps", "minutes", "seed", "crop", "batch")}
-        usual = TrainingSettings.learning_rate / (3 if self.start else 1)
-        rate = usual if self.learning_rate is None else self.learning_rate
-        return TrainRequest(
-            dataset,
-            out,
-            split_list(self.hold_out),
-            self.validation,
-            self.scenes,
-            self.patch,
-            tokens={"dim": self.dim, "heads": self.heads} | ({} if self.layers is None else {"layers": self.layers}),
-            choices=self.choices(),
-            settings=TrainingSettings(**same, darkest_ms=self.min_exposure_ms, learning_rate=rate),
-            command=command,
-            device=self.device,
-            start=self.start,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateFlags(SceneFlags):
-    """Flags of an evaluation.
-
-    Parameters
-    ----------
-    weights
-        Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
-        trained on it.
-    out
-        Folder of evaluation.json.
-    fractions
-        Fractions of the patches to read at full resolution, with commas; none and all are always included.
-    policies
-        Policies that choose the patches, with commas.
-    frames
-        Names of the frames, with commas. Default: all.
-    """
-
-    weights: Annotated[tuple[Path, ...], Parameter(negative="")] = ()
-    out: OutFolder = None
-    fractions: str = ",".join(map(str, FRACTIONS))
-    policies: str = ",".join(USUAL)
-    frames: str | None = None
-
-    def request(self, dataset: str) -> EvaluateRequest:
-        """Return the request to judge weights. Raises SettingsError: numbers are invalid."""
-        return EvaluateRequest(
-            dataset,
-            self.weights,
-            self.out,
-            tuple(parse_numbers(self.fractions, "--fractions") or ()),
-            split_list(self.policies),
-            split_list(self.frames),
-            self.scenes,
-            self.seed,
-            self.choices(),
-            self.device,
-        )
-
-
-NO_TRAIN_FLAGS, NO_EVALUATE_FLAGS = TrainFlags(), EvaluateFlags()
-OF_TEMPORAL = ("train_temporal", "scenes", "steps", "minutes", "seed")  # flags of --train-temporal
+from spectralzoom.flows.training.train_temporal import run_remember
 
 
 def train(dataset: str, *, out: OutFile, flags: TrainFlags = NO_TRAIN_FLAGS, as_json: AsJson = False) -> int:
@@ -223,22 +45,8 @@ def _command() -> str:
 
 def run_training(dataset: str, out: Path, flags: TrainFlags, command: str, console: Console) -> dict[str, Any]:
     """Train weights, or only the temporal reader of given ones; return the record."""
-    request = flags.request(dataset, out, command)
-    if flags.train_temporal is None:
-        return run_train(request, console)
-    check_counts(request)
-    check_default(flags, OF_TEMPORAL, "not for --train-temporal")
-    how = TemporalTraining(flags.minutes, flags.steps, flags.seed)
-    lands = LANDS if flags.scenes is None else flags.scenes
-    reader = TemporalRequest(dataset, flags.train_temporal, out, lands, settings=how, command=command)
-    return run_remember(reader, console)
-
-
-def check_default(flags: SceneFlags, but: Sequence[str], why: str) -> None:
-    """Raise SettingsError where a flag other than ``but`` differs from its default."""
-    for one in fields(flags):
-        if one.name not in but and getattr(flags, one.name) != one.default:
-            raise SettingsError(f"--{one.name.replace('_', '-')} is {why}; leave it out")
+    run = run_train if flags.train_temporal is None else run_remember
+    return run(TrainRequest(dataset, out, flags, command), console)
 
 
 def evaluate(dataset: str, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json: AsJson = False) -> int:
@@ -249,7 +57,5 @@ def evaluate(dataset: str, *, flags: EvaluateFlags = NO_EVALUATE_FLAGS, as_json:
     dataset
         `farm`, `scouting`, a folder of labelled scenes, or one scene file.
     """
-    if not flags.weights:
-        raise SettingsError(f"evaluate {dataset}: give --weights FILE, the weights to judge on this data set")
-    run_evaluate(flags.request(dataset), stderr, as_json=as_json)
+    run_evaluate(dataset, flags, stderr, as_json=as_json)
     return 0

@@ -11,22 +11,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from spectralzoom.flows.evaluate.frames import (
-    Candidate,
-    EvaluateRequest,
-    checked_request,
-    observe_frame,
-    open_candidates,
-    open_frames,
-    sort_frames,
-)
+from spectralzoom.flows.evaluate.frames import Candidate, observe_frame, open_candidates, open_frames, sort_frames
 from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, seeds_of, summarise
+from spectralzoom.flows.settings.flags import split_list
+from spectralzoom.flows.settings.model_flags import EvaluateFlags
 from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
 from spectralzoom.models.weights.files import Weights, load_weights
+from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.whole_files import to_json, write_whole
 
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
@@ -37,32 +32,36 @@ CAPTION = (
 )
 
 
-def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
+def run_evaluate(dataset: str, flags: EvaluateFlags, console: Console, *, as_json: bool = False) -> dict[str, Any]:
     """Judge with progress on ``console``; print the figures as a table or JSON, and write them to the folder."""
     with StageProgress(console) as progress:
-        content = evaluate_weights(request, progress.show)
+        content = evaluate_weights(dataset, flags, progress.show)
     put_out(content, print_evaluation, as_json=as_json)
     for line in (*(f"note: {note}" for note in content["data_notes"]), *content["files"]):
         show_text(line, console)
     return content
 
 
-def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done, figure: None) -> dict[str, Any]:
+def evaluate_weights(
+    dataset: str, flags: EvaluateFlags, show: Report = lambda what, done, figure: None
+) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
-    Raises SettingsError: invalid fractions, policies or weights; SceneError: no frame is left, a named frame has no
+    Raises SettingsError: invalid fractions or weights; SceneError: no frame is left, a named frame has no
     weights left, or a frame has no labels.
     """
-    request = checked_request(request)
+    fractions = flags.parts
+    if flags.seed < 0:
+        raise SettingsError(f"--seed must be at least 0, got {flags.seed}")
     keep_freed_memory()
-    candidates = open_candidates(request.weights)
-    data = open_frames(request.dataset, request.frames, request.scenes, candidates[0].camera, request.choices)
-    if request.out is not None:
-        with writing(request.out):
-            request.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
-    jobs = sort_frames(request, data, candidates, show)
-    runs = _judge_frames(request, data, candidates, jobs.frames, show)
-    asked = {name: getattr(request, name) for name in ("fractions", "policies", "seed")}
+    candidates = open_candidates(flags.weights)
+    named = split_list(flags.frames)
+    data = open_frames(dataset, named, flags.scenes, candidates[0].camera, flags.choices())
+    if flags.out is not None:
+        with writing(flags.out):
+            flags.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
+    jobs = sort_frames(data, candidates, show, named=bool(named))
+    runs = _judge_frames(flags, data, candidates, jobs.frames, show)
     content = {
         "dataset": data.law,
         "weights": [
@@ -77,26 +76,26 @@ def evaluate_weights(request: EvaluateRequest, show: Report = lambda what, done,
         ],
         "frames": list(jobs.frames),
         "left_out": jobs.left_out,
-        "settings": {**asked, "camera": asdict(candidates[0].camera)},
+        "settings": {"fractions": fractions, "seed": flags.seed, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
-        **summarise(runs, candidates[0].described.class_names, request),
-        "data_notes": [*data.notes, *jobs.notes],
-        "files": [] if request.out is None else [str(request.out / "evaluation.json")],
+        **summarise(runs, candidates[0].described.class_names, fractions),
+        "data_notes": [*data.notes, *jobs.notes, *(note for one in candidates for note in one.notes)],
+        "files": [] if flags.out is None else [str(flags.out / "evaluation.json")],
     }
-    if request.out is not None:
-        write_whole(request.out / "evaluation.json", to_json(content))
+    if flags.out is not None:
+        write_whole(flags.out / "evaluation.json", to_json(content))
     return content
 
 
 def _judge_frames(
-    request: EvaluateRequest,
+    flags: EvaluateFlags,
     data: TrainingData,
     candidates: Sequence[Candidate],
     frames: dict[str, tuple[int, ...]],
     show: Report,
 ) -> list[dict[str, dict[Choice, Row]]]:
     """Judge every frame by its weights; return the rows of the frames of each of the weights."""
-    device = choose_device(request.device)
+    device = choose_device(flags.device)
     loaded: dict[int, Weights] = {}
     runs: list[dict[str, dict[Choice, Row]]] = [{} for _ in candidates]
     for number, (name, judges) in enumerate(frames.items()):
@@ -106,8 +105,8 @@ def _judge_frames(
             show("judging frames", (number + at / len(judges)) / len(frames), f"{name}, {one.path.name}")
             if index not in loaded:
                 loaded[index] = load_weights(one.path).on(device)
-            observed = observe_frame(scene, name, loaded[index], one.camera, request.seed)
-            runs[index][name] = judge_frame(request, observed, loaded[index])
+            frame = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
+            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], flags.parts, flags.seed)
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 

@@ -18,67 +18,27 @@ from numpy.typing import NDArray
 from spectralzoom.flows.tasks.scene import check_labels, judged_labels, seen_in_training
 from spectralzoom.flows.training.data import (
     Report,
+    SceneNotes,
     TrainingData,
-    alike_note,
     farm_test_data,
-    only_class,
     open_training_data,
-    scene_notes,
+    untaught_note,
 )
-from spectralzoom.models.network.machine import PROCESSOR
-from spectralzoom.models.network.spectral import patches_of
-from spectralzoom.models.policies.policies import POLICIES
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
 from spectralzoom.models.weights.files import Description, Weights, describe_weights
-from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
-FRACTIONS = (0.05, 0.10, 0.15, 0.20, 0.35)
-JUDGED = tuple(name for name in POLICIES if name != "mask")  # needs a file
-USUAL = ("gain", "random")
-
-
-@dataclass(frozen=True)
-class EvaluateRequest:
-    """Request to judge weights."""
-
-    dataset: str
-    weights: tuple[Path, ...]
-    out: Path | None = None
-    fractions: tuple[float, ...] = FRACTIONS
-    policies: tuple[str, ...] = USUAL
-    frames: tuple[str, ...] = ()  # empty: all
-    scenes: int | None = None  # of the built-in farm
-    seed: int = 0
-    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
-    device: str = PROCESSOR  # or auto
-
-
-def checked_request(request: EvaluateRequest) -> EvaluateRequest:
-    """Sort fractions and drop those that are always judged. Raises SettingsError for invalid values."""
-    for fraction in request.fractions:
-        if not 0 <= fraction <= 1:
-            raise SettingsError(f"--fractions are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}")
-    for policy in request.policies:
-        if policy not in JUDGED:
-            raise SettingsError(
-                f"--policies: {policy!r} cannot be judged on a data set; choose from {', '.join(JUDGED)}"
-            )
-    if request.seed < 0:
-        raise SettingsError(f"--seed must be at least 0, got {request.seed}")
-    return replace(
-        request,
-        fractions=tuple(sorted({fraction for fraction in request.fractions if 0 < fraction < 1})),
-        policies=tuple(dict.fromkeys(request.policies)),
-    )
-
-
 FARM_TEST_SCENES = 4
+VALIDATED = (
+    "the training chose reading, calibration and thresholds by {names}: scores of these validation frames may be too"
+    " good; --frames names others"
+)
 
 
 @dataclass(frozen=True)
@@ -99,19 +59,15 @@ class Candidate:
         """Return the training, validation and held-out scenes of the record."""
         return cast(dict[str, Any], self.described.record.get("split", {}))
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return the note on classes that the weights never draw, if any."""
+        names = self.described.untaught
+        return (f"{self.path.name}: {untaught_note(names)}",) if names else ()
+
     def validated_on(self, scene: RasterScene) -> bool:
         """Return whether the scene was one for validation."""
         return scene.clear_key in self.split.get("validation", {}).values()
-
-
-@dataclass(frozen=True)
-class ObservedFrame:
-    """One frame in the spectral features of some weights, with their coarse prediction."""
-
-    seen: CoarsePrediction
-    fine: NDArray[np.float32]  # (patch, p, p, column) normalised, every patch of the padded grid
-    labels: NDArray[np.uint8]  # (y, x) in the weights' classes
-    bands: int
 
 
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
@@ -121,11 +77,12 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     read.
     """
     if not paths:
-        raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
+        raise SettingsError("give --weights FILE, the weights to judge; spectralzoom train DATASET -o FILE makes them")
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
-        alike = one.described.config == first.described.config and one.camera == first.camera
+        configs = [replace(of.described.config, untaught=()) for of in (one, first)]  # a fold may lack a class
+        alike = configs[0] == configs[1] and one.camera == first.camera
         if not alike or one.described.class_names != first.described.class_names:
             raise SettingsError(
                 f"{one.path} differs from {first.path} in camera, sizes or classes; several --weights are seeds of one"
@@ -153,8 +110,13 @@ def open_frames(
     return replace(data, train=names, validation=(), held_out=())
 
 
-def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> ObservedFrame:
-    """Image a frame by the camera of the training; the noise depends on the seed and the frame's name."""
+def observe_frame(
+    scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int
+) -> tuple[CoarsePrediction, NDArray[np.uint8]]:
+    """Image a frame by the camera of the training; return its coarse prediction and labels in the weights' classes.
+
+    The noise depends on the seed and the frame's name.
+    """
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
@@ -162,9 +124,7 @@ def observe_frame(scene: RasterScene, name: str, weights: Weights, camera: LineC
     example = normalised(observe_scene(scene, camera, grid, weights.basis, rng), weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
-    seen = coarse_prediction_of_columns(weights, example.columns, grid)
-    fine = patches_of(example.columns, config.patch).astype(np.float32)
-    return ObservedFrame(seen, fine, labels, len(scene.wavelength_nm))
+    return coarse_prediction_of_columns(weights, example.columns, grid), labels
 
 
 @dataclass(frozen=True)
@@ -193,55 +153,37 @@ def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]
     return fit
 
 
-def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Report) -> Jobs:
-    """Assign to each frame the weights that were not trained on it.
+def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, *, named: bool = False) -> Jobs:
+    """Assign to each frame the weights that were not trained on it; every ``named`` one needs some.
 
     Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
     SettingsError: weights were trained on different pixels of a frame.
     """
     jobs = Jobs()
-    alike: dict[str, list[str]] = {}  # by their class
-    empty: list[str] = []
-    regridded: list[str] = []
-    validated: list[str] = []
+    notes = SceneNotes()
     labelled = False
-    for number, name in enumerate(data.train):
-        show("looking for frames", number / len(data.train), name)
-        try:
-            scene = data.scene(name)
-        except EmptySceneError:
-            empty.append(name)
-            continue
+    for _, name, scene in notes.scenes(data, data.train, "looking for frames", show):
         if scene.labels is None:
             raise SceneError(
                 f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
-        if (alone := only_class(scene)) is not None:
-            alike.setdefault(alone, []).append(name)
         fit = _judges(scene, weights)
         if not fit:
             jobs.left_out.append(name)
             continue
         jobs.frames[name] = fit
         if any(weights[at].validated_on(scene) for at in fit):
-            validated.append(name)
-        if scene.regridded:
-            regridded.append(name)
+            notes[VALIDATED].append(name)
+        notes.add(name, scene)
         labels = judged_labels(scene, weights[fit[0]].described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
-    if jobs.left_out and (request.frames or not jobs.frames):
+    if jobs.left_out and (named or not jobs.frames):
         raise SceneError(
             f"no weights are left for {', '.join(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
             "trained on it, and frames trained on are refused: judge by others, or train with some held out: "
             "spectralzoom train ... --hold-out NAMES"
         )
     if not labelled:
-        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
-    notes = [*(alike_note(*one) for one in alike.items()), *scene_notes(empty, regridded)]
-    if validated:
-        notes.append(
-            f"the training chose reading, calibration and thresholds by {list_some(validated)}: scores of these"
-            " validation frames may be too good; --frames names others"
-        )
-    return replace(jobs, notes=tuple(notes))
+        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {data.law} to judge by")
+    return replace(jobs, notes=tuple(notes.texts))

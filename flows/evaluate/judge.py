@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.evaluate.frames import EvaluateRequest, ObservedFrame
 from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.network.sizes import multiply_adds
-from spectralzoom.models.policies.placement import mixed
+from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.policies.policies import score_multiply_adds, score_patches
-from spectralzoom.models.reading.inference import segment
+from spectralzoom.models.reading.inference import CoarsePrediction
 from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.planning.coverage import frame_patches
 
-RANDOM_DRAWS = 5
+POLICIES = {"gain": 1, "random": 5}  # policy: draws
 NONE, ALL = ("none", 0.0), ("all", 1.0)  # no patch, every patch
 ENDS = (NONE[0], ALL[0])
 Choice = tuple[str, float]  # policy, and fraction of the patches
@@ -41,23 +40,28 @@ class Row:
 Run = Mapping[str, Mapping[Choice, Row]]  # rows of each frame, by some weights or by a seed
 
 
-def judge_frame(request: EvaluateRequest, frame: ObservedFrame, weights: Weights) -> dict[Choice, Row]:
-    """Return the confusion counts and multiply-adds of every policy and fraction."""
-    grid, config = frame.seen.grid, weights.config
+def judge_frame(
+    seen: CoarsePrediction,
+    labels: NDArray[np.uint8],
+    bands: int,
+    weights: Weights,
+    fractions: Sequence[float],
+    seed: int,
+) -> dict[Choice, Row]:
+    """Return the confusion counts and multiply-adds of every policy and fraction, by ``labels`` (y, x)."""
+    grid, config = seen.grid, weights.config
     every = grid.every_patch()
-    overview, full = (segment(weights, frame.seen, frame.fine[some], some).classes for some in (every[:0], every))
+    maps = ReadTwice.of(weights, seen, labels)
     chosen = {NONE: [every[:0]], ALL: [every]}  # patches of each draw
-    for policy in request.policies:
-        seeds = range(1000, 1000 * (RANDOM_DRAWS if policy == "random" else 1) + 1, 1000)
-        scores = [score_patches(policy, frame.seen, seed=request.seed + seed) for seed in seeds]
-        chosen |= {(policy, part): [frame_patches(one, part) for one in scores] for part in request.fractions}
+    for policy, draws in POLICIES.items():
+        scores = [score_patches(policy, seen, seed=seed + 1000 * draw) for draw in range(1, draws + 1)]
+        chosen |= {(policy, part): [frame_patches(one, part) for one in scores] for part in fractions}
     rows = {}
-    for (policy, fraction), draws in chosen.items():
-        maps = [mixed(overview, full, np.isin(every, some), grid) for some in draws]
-        counts = np.array([metrics.confusion(frame.labels, drawn, config.classes) for drawn in maps])
+    for (policy, fraction), drawn in chosen.items():
+        counts = np.array([maps.counts(np.isin(every, some), config.classes) for some in drawn])
         scored = 0 if policy in ENDS else score_multiply_adds(policy, config, grid)
-        spent = multiply_adds(config, grid, len(draws[0]), frame.bands, score=scored).total
-        rows[policy, fraction] = Row(counts, len(draws[0]), spent)
+        spent = multiply_adds(config, grid, len(drawn[0]), bands, score=scored).total
+        rows[policy, fraction] = Row(counts, len(drawn[0]), spent)
     return rows
 
 
@@ -93,10 +97,10 @@ def counts_of(seeds: Sequence[Run], choice: Choice) -> Counts:
     return counts
 
 
-def summarise(runs: Sequence[Run], class_names: Sequence[str], request: EvaluateRequest) -> dict[str, Any]:
+def summarise(runs: Sequence[Run], class_names: Sequence[str], fractions: Sequence[float]) -> dict[str, Any]:
     """Return the figures of every row. ``runs`` are the rows of `judge_frame` by each of the weights."""
     seeds = [{name: rows for number in members for name, rows in runs[number].items()} for members in seeds_of(runs)]
-    shared = [(policy, fraction) for policy in request.policies for fraction in request.fractions]
+    shared = [(policy, fraction) for policy in POLICIES for fraction in fractions]
     whole = counts_of(seeds, ALL)
     support = whole.sum(axis=4).max(axis=(0, 1)).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []

@@ -16,8 +16,7 @@ from spectralzoom.flows.tasks.prior_maps import Prior
 from spectralzoom.flows.terminal.figures import format_percent, spaced
 from spectralzoom.pipeline.errors import visible
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.storage.arrays.class_maps import class_counts
-from spectralzoom.storage.arrays.layout import open_group, read_array
+from spectralzoom.storage.arrays.class_maps import class_counts, load_class_map
 from spectralzoom.storage.arrays.mosaics import develop
 
 QUALITY = 80  # of a photograph as WebP
@@ -59,7 +58,7 @@ def prior_classes(prior: Prior) -> NDArray[np.uint8]:
     earlier = np.array(prior.classes)
     names = np.full(256, UNLABELLED, np.uint8)
     names[earlier[earlier >= 0]] = np.flatnonzero(earlier >= 0)
-    before = read_array(open_group(prior.probabilities.path / "class_map.zarr"), "classes")
+    before = load_class_map(prior.probabilities.path / "class_map.zarr").classes
     return np.asarray(names[before])
 
 

@@ -30,6 +30,7 @@ from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, c
 from spectralzoom.storage.arrays.ground_maps import GroundMap, load_ground_map
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.export.csv_tables import csv_table
 from spectralzoom.storage.store import Ref, read_table
 
 PLOTS_FILE = "plots.csv"
@@ -220,13 +221,10 @@ def _ground_m2(plan: SurveyPlan, kept: NDArray[np.bool_]) -> float | None:
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
     """Return the figures of all plots as CSV, one row for each plot; unknown cells are empty."""
-    import pandas as pd
-
     names = list(plots[0]["fractions"]) if plots else []
-    head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
-    cells = [[*(plot[name] for name in head), *(plot["fractions"][name] for name in names)] for plot in plots]
-    table = pd.DataFrame(cells, columns=[*head, *(f"fraction_{name}" for name in names)])
-    return str(table.to_csv(index=False, lineterminator="\n"))
+    facts = ("plot", "pixels", "mapped_pixels", "area_m2", "confidence")
+    columns = {fact: [plot[fact] for plot in plots] for fact in facts}
+    return csv_table(columns | {f"fraction_{name}": [plot["fractions"][name] for plot in plots] for name in names})
 
 
 def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:

@@ -122,6 +122,7 @@ class ReceiptFields(_Part):
     seed: int
     started: str  # ISO 8601, as all times
     finished: str
+    acquired: str | None = None  # when the light was captured, by visit or file, which may be long before ``started``
     versions: dict[str, str]
     settings: Facts
     stages: list[StageRow]

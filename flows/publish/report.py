@@ -100,7 +100,9 @@ def render_report(receipt: Receipt, quicklook: bytes, field: FieldMap) -> str:
         scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in MAP_SCRIPTS),
         title=receipt["survey"],
         lead=headline(receipt),
-        about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
+        about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, "
+        + (f"acquired {receipt['acquired']}, " if "acquired" in receipt else "")
+        + f"finished {receipt['finished']}",
         links={  # without raw lines, which may be cleared, and the report itself
             name.replace("_", " "): quote(posixpath.relpath(address, _run_folder(receipt)))
             for name, address in receipt["products"].items()

@@ -36,7 +36,7 @@ from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntr
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
-from spectralzoom.storage.runs import RECEIPT
+from spectralzoom.storage.runs import RECEIPT, moment_of
 from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
@@ -65,12 +65,13 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
         (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
-            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]))
+            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]), encoding="utf-8")
         (folder / RECEIPT).write_text(to_json(receipt), encoding="utf-8")
         (folder / REPORT).write_text(page, encoding="utf-8")
         return {"survey": receipt["survey"], "settings": receipt["settings"]}
 
-    folder = stores.archive.publish_run(plan.field.name, write, stores.refs)
+    day = moment_of(plan.field.acquired)
+    folder = stores.archive.publish_run(plan.field.name, write, stores.refs, None if day is None else day.date())
     return Published(receipt, folder)
 
 
@@ -97,6 +98,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
         seed=plan.settings.seed,
         started=in_seconds(started),
         finished=in_seconds(datetime.now(UTC)),
+        acquired=field.acquired,
         versions=versions(),
         settings={**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)},
         stages=[_stage_row(row) for row in stores.rows.values()],
@@ -164,7 +166,7 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
         class_map=found.classes,
-        class_names=found.names,
+        class_names=found.legend.titles,
         class_colours=found.colours,
         confidence=np.ascontiguousarray(found.confidence[thin]),
         chosen=chosen,

@@ -465,11 +465,11 @@ def place_of(key: str, origin: str | None) -> str:
 
 
 def time_of_visit(run: Run) -> str | None:
-    """Return the moment that names a run's visit, else day and hour of a built-in scene, else when the run began.
+    """Return the moment of a run's visit or file, else day and hour of a built-in scene, else when the run began.
 
     A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
     """
-    named = moment_of(run.settings.get("visit"))
+    named = moment_of(run.acquired)
     began = moment_of(run.receipt.get("started")) or moment_of(run.created)
     found = named or began
     with suppress(TypeError, ValueError, OverflowError):

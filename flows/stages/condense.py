@@ -129,7 +129,7 @@ def components_of(found: SignalStatistics, cubes: Sequence[RawCube], choice: Sig
     if np.count_nonzero(found.lit) > FEW_BANDS or not found.count:
         bands = cubes[0].wavelength_nm if cubes else np.zeros(found.bands)  # a pass without sweeps
         return components_of_field(found, bands, false_alarm=choice.false_alarm, least=choice.least)
-    return bands_alone(found, reduce(np.fmin, (number_values(cube.references) for cube in cubes)))
+    return bands_alone(found, reduce(np.fmin, (number_values(cube.references, cube.exposure_ms) for cube in cubes)))
 
 
 def _write_sweeps(

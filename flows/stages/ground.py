@@ -12,7 +12,7 @@ from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import PosedField, areas_by_number
 from spectralzoom.pipeline.ground.map_grid import GroundGrid, image_at, map_blocks, nearest_at
-from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, ProbabilityStore, load_class_map
+from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from spectralzoom.storage.arrays.mosaics import choose_bands, develop, open_mosaic
 from spectralzoom.storage.store import Ref
@@ -47,7 +47,7 @@ def ground(out: Output, class_map: Ref, mosaic: Ref, *, ground_grid: GroundGrid)
     writer = GroundMapWriter(
         out.path / STORE,
         ground_grid.geobox,
-        ClassNames(found.names, found.colours),
+        found.legend,
         about={"rig_pose": asdict(ground_grid.frame.view.pose), "scene_pixels": ground_grid.counts()},
         goes_on=old_class is not None,
     )

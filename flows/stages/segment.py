@@ -65,7 +65,7 @@ def create_maps(path: Path, gains: PatchGains, *, goes_on: bool) -> tuple[str, .
     frame = gains.frame
     shape = (frame.grid.height, frame.grid.width)
     weights = gains.work.weights.load()
-    legend = ClassNames(weights.class_names, weights.class_colours)
+    legend = ClassNames(weights.class_names, weights.class_colours, weights.class_values)
     create_class_map(path / MAP, shape, legend, grid=frame.angular_grid())
     create_probabilities(path / PROBABILITIES, shape, legend, grid=frame.angular_grid(), goes_on=goes_on)
     return legend.names

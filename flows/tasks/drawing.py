@@ -174,8 +174,9 @@ def prior_map_of(prior: Prior, region: Region, weights: Weights) -> PriorMap:
     """Read the prior map of a region, in the classes of the weights."""
     store = ProbabilityStore(prior.probabilities.path / PROBABILITIES)
     values, age, light = store.read(region.read.rows, region.read.columns)
-    if prior.classes != tuple(range(values.shape[-1])):
-        values = in_classes(values, prior.classes)
+    untaught = weights.config.untaught
+    if untaught or prior.classes != tuple(range(values.shape[-1])) or np.isneginf(values).any():
+        values = in_classes(values, prior.classes, untaught)
     height, width = region.read.shape
     columns = coarse_region(weights, prior.mosaic, region, LineSpec()).seen_columns[:height, :width]
     whole = np.asarray(pad_by_reflection(columns, region.grid.padded_shape), np.float32)

@@ -182,7 +182,8 @@ def _swaths(
     for rows in cuts(grid.height, SWATH_PATCHES * grid.patch):
         first, last = max(rows.start - EVERY_PX * HALO, 0), min(rows.stop + EVERY_PX * HALO, grid.height)
         probabilities, age, light = store.read(slice(first, last))
-        sampled = (part[::EVERY_PX, ::EVERY_PX] for part in (in_classes(probabilities, prior.classes), age, light))
+        probabilities = in_classes(probabilities, prior.classes, weights.config.untaught)
+        sampled = (part[::EVERY_PX, ::EVERY_PX] for part in (probabilities, age, light))
         today = carried(PriorMap(ClassProbabilities(*sampled), None, prior.days, prior.day_of_year), read)
         own = np.arange(rows.start, rows.stop) - first
         yield today.log_probability[own[:, None] // EVERY_PX, across], age[own] + np.float32(prior.days)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,13 +19,12 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, US
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore
 from spectralzoom.storage.arrays.georeference import load_geobox
-from spectralzoom.storage.runs import Run, moment_of, read_run
+from spectralzoom.storage.runs import Run, dated, has_time, moment_of, read_run
 from spectralzoom.storage.store import Archive, Ref, run_stem
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 NEWEST_RUNS = 60  # newest runs of a field that are searched for the previous visit
 PROBABILITIES = "class_probabilities"  # a product of runs
-_WITH_TIME = re.compile(r"\s*[\dW-]+[^\d-]\d\d")  # a date and an hour, in ISO 8601
 PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
@@ -76,7 +74,7 @@ def find_prior(
             why = found
         raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
     runs_by_reason: dict[str, list[str]] = {}
-    for run in _before(archive, settings, name, scene.key):
+    for run in _before(archive, settings, name, scene):
         found = _usable(archive, run, settings, grid, class_names, scene)
         if isinstance(found, Prior):
             return found, (*_unusable(runs_by_reason), f"prior map: {run.folder.name}, {found.days:.3g} days earlier")
@@ -93,7 +91,7 @@ def _unusable(runs_by_reason: dict[str, list[str]]) -> tuple[str, ...]:
     )
 
 
-def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> Iterator[Run]:
+def _before(archive: Archive, settings: Settings, name: str, scene: RasterScene) -> Iterator[Run]:
     """Return the newest runs of a field with class probabilities, the last captured before this visit first."""
     found: list[tuple[float, int, Run]] = []
     asked = anchor_paths(settings.to_dict(), Path.cwd())
@@ -105,9 +103,9 @@ def _before(archive: Archive, settings: Settings, name: str, scene_key: str) -> 
             continue
         run = read_run(folder)
         if run.receipt.get("survey") == name and PROBABILITIES in run.products:
-            if run.receipt.get("scene") == scene_key and all(run.settings.get(key) == asked[key] for key in light):
+            if run.receipt.get("scene") == scene.key and all(run.settings.get(key) == asked[key] for key in light):
                 continue  # made of the requested light itself: no earlier visit
-            days = _days_since(run, settings.visit, settings.moment)
+            days = _days_since(run, dated(settings.visit, scene.acquired), settings.moment)
             if days >= 0 or run.in_future:  # which a note names
                 found.append((days, number, run))
             if len(found) >= NEWEST_RUNS:
@@ -142,11 +140,11 @@ def _usable(
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
         return f"it has none of the classes of these weights, but {', '.join(names)}"
-    days = _days_since(run, settings.visit, settings.moment)
+    days = _days_since(run, dated(settings.visit, scene.acquired), settings.moment)
     if days < 0:
         return f"it was captured {-days:.3g} days after this visit"
     day = None if settings.moment is None else float(settings.moment[0])
-    if (called := moment_of(settings.visit)) is not None:
+    if (called := moment_of(dated(settings.visit, scene.acquired))) is not None:
         day = float(called.timetuple().tm_yday)
     return Prior(run.folder.name, probabilities, mosaic, days, day, classes)
 
@@ -164,23 +162,21 @@ def _off_grid(shape: tuple[int, int], before: GeoBox | None, grid: SceneGrid, sc
     return f"its corner lies {off:.3g} px away" if off > OFF_GRID_PX else None
 
 
-def _days_since(run: Run, visit: str | None, moment: tuple[int, float] | None) -> float:
-    """Return the days from a run's visit to another one; negative if that came first.
+def _days_since(run: Run, acquired: str | None, moment: tuple[int, float] | None) -> float:
+    """Return the days from a run's acquisition to another one; negative if that came first.
 
-    The dates of both visits count, with their times if both have one. Else day and hour of a built-in scene count, else
-    whole days of the clock.
+    The dates of both count, with their times if both have one. Else day and hour of a built-in scene count, else whole
+    days, where an acquisition without a date is that of the survey.
     """
-    then, now = map(moment_of, named := (run.settings.get("visit"), visit))
-    if then is not None and now is not None:
-        if not all(_WITH_TIME.match(str(one)) for one in named):
-            return float((now.date() - then.date()).days)
+    then, now = map(moment_of, named := (run.acquired, acquired))
+    if then is not None and now is not None and all(map(has_time, named)):
         return (now - then).total_seconds() / 86400
-    if moment is not None and run.settings.get("scene") in BUILT_IN_SCENES:
+    if (then is None or now is None) and moment is not None and run.settings.get("scene") in BUILT_IN_SCENES:
         before = [run.settings.get("day"), run.settings.get("hour")]
         day, hour = (
             usual if given is None else float(given)
             for given, usual in zip(before, (USUAL_DAY, USUAL_HOUR), strict=True)
         )
         return moment[0] - day + (moment[1] - hour) / 24
-    created = moment_of(run.created)
-    return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
+    then, now = then or moment_of(run.created), now or datetime.now(UTC)
+    return 0.0 if then is None else float((now.date() - then.date()).days)

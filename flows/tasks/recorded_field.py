@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from odc.geo.geobox import GeoBox
 
+from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
 from spectralzoom.flows.tasks.scene import FieldSource, unlit_scene
 from spectralzoom.pipeline.capture.recorded import RecordedSource
@@ -19,7 +20,7 @@ from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.source import Source
-from spectralzoom.storage.readers.recordings import RecordedWith, Recording, find_recorded_run, open_recording
+from spectralzoom.storage.readers.recordings import Recording, find_recorded_run, open_recording
 from spectralzoom.storage.readers.scene_files import load_field_labels
 from spectralzoom.storage.store import stage_key
 
@@ -73,6 +74,7 @@ class OpenedRecording:
             class_names=() if found is None else found.names,
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
             geobox=self.geobox,
+            acquired=self.recording.acquired,
         )
         return scene, (*self.notes, *notes)
 
@@ -83,7 +85,9 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     Raises SceneError, WavelengthError, SettingsError, ArchiveError, PoseError: as `open_recording`, or its lines are
     too far apart.
     """
-    files = RecordedWith(
+    recording = open_recording(
+        str(settings.sweeps),
+        settings.camera,
         pointing=None if settings.pointing is None else Path(settings.pointing),
         dark=None if settings.dark is None else Path(settings.dark),
         white=None if settings.white is None else Path(settings.white),
@@ -91,16 +95,17 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         white_reference=settings.rig.white_reference,
         mounting=settings.rig.mounting,
     )
-    recording = open_recording(str(settings.sweeps), settings.camera, files)
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
     source = recording.source(shape)
     camera = recording.camera
     geobox = None
-    if (run := find_recorded_run(str(settings.sweeps))) is not None:  # its full scan has the exposure of its camera
-        camera = replace(camera, exposure_ms=float(run.run.settings["camera"]["exposure_ms"]))
+    if (found := find_recorded_run(str(settings.sweeps))) is not None:  # its full scan has the exposure of its camera
+        run, of_run, place = found
+        camera = replace(camera, exposure_ms=float(run.settings["camera"]["exposure_ms"]))
         if camera.exposure_ms != settings.camera.exposure_ms:
             raise SettingsError("camera.exposure_ms is for a camera, and recorded lines have their own: leave it out")
-        geobox = run.geobox if run.shape == shape and settings.pose is None else None
+        recording = replace(recording, acquired=time_of_visit(run))
+        geobox = place if of_run == shape and settings.pose is None else None
     settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.as_taken:
         step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())

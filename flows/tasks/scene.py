@@ -30,6 +30,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadia
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.pipeline.source import Source
 from spectralzoom.storage.readers.cube_sources import ONE_FILE, machine_bytes
+from spectralzoom.storage.readers.labels import map_values
 from spectralzoom.storage.readers.open_cubes import split_variable
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file, open_scene_file
 
@@ -118,7 +119,8 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         key=file.light_hash,
         geobox=file.geobox,
     )
-    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
+    values = map_values(file.class_values)
+    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m, class_values=values)
 
 
 def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:
@@ -160,6 +162,7 @@ def _with_notes(
     ``became`` says what became of pixels without a value in some bands.
     """
     notes = file.provenance
+    scene = replace(scene, acquired=file.acquired)
     if scene.geobox is not None and settings.pose is not None:
         scene = replace(scene, geobox=None)
         notes = (*notes, POSE_WINS)

@@ -98,6 +98,8 @@ def beyond_training(
     found: list[str] = []
     if (known & ~reached).any():
         found.append(f"the bands cover {(known & reached).sum()} of the weights' {known.sum()} spectral features")
+    if described.untaught:
+        found.append(f"classes without a training pixel, which are never drawn: {', '.join(described.untaught)}")
     if trained is not None:
         if lacking := _lacking(trained.bands_nm or (), scene, described):
             found.append(f"no band near {', '.join(f'{nm:g}' for nm in lacking)} nm")

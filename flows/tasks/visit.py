@@ -9,13 +9,17 @@ from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.scene import scene_of_visit
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 
 
 def settings_of_visit(parameters: SurveySettings) -> Settings:
-    """Return the settings of a run; a run of a deployment is a visit of its due time. Raises SettingsError."""
+    """Return the settings of a run; a run of a deployment is a visit of its due time.
+
+    Raises SettingsError, SceneError: the settings or the raster cannot be used.
+    """
     due = due_time()
     settings = parameters.settings()
-    return settings if due is None else scene_of_visit(at_due_time(settings, due), due.astimezone())
+    return settings if due is None else at_due_time(scene_of_visit(settings, due.astimezone()), due)
 
 
 def due_time() -> datetime | None:
@@ -34,11 +38,13 @@ def due_time() -> datetime | None:
 def at_due_time(settings: Settings, due: datetime) -> Settings:
     """Return the settings of a scheduled visit: it has the due time as its name and starts from the newest prior map.
 
+    The visit of a raster has the time of acquisition in its file, if any (SceneError: it cannot be read).
     The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
+    acquired = open_cube_source(settings.scene).acquired if settings.is_map and settings.visit is None else None
     requested = replace(
         settings,
-        visit=settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
+        visit=settings.visit or acquired or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
         prior="latest" if settings.prior == "auto" else settings.prior,
     )
     if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.tasks.scene import scene_of_file
 from spectralzoom.flows.terminal.figures import counted
-from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
@@ -35,6 +36,7 @@ from spectralzoom.storage.readers.label_files import (
 )
 from spectralzoom.storage.readers.labels import load_codes
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
@@ -184,7 +186,7 @@ def _scenes(
     settings = find_scene_settings(folder / SETTINGS_NAME)
     masks = () if train_mask is None else (split_variable(train_mask)[0].resolve(),)
     found = match_folder(folder) if settings.labels is None else _match_by_settings(folder, settings)
-    images = [image for image in found.images if image.resolve() not in masks]
+    images = [within(folder, image) for image in found.images if image.resolve() not in masks]
     if not images:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"
@@ -314,38 +316,68 @@ def open_training_data(
     return TrainingData(files.path.stem, train, kept, files.held_out, camera, files, files.notes)
 
 
-def only_class(scene: RasterScene) -> str | None:
-    """Return the class of all labels of a scene; None for several classes, or no label."""
-    if scene.labels is None:
-        return None
-    there = np.unique(scene.labels[scene.labels != UNLABELLED])
-    return scene.class_names[there[0]] if len(there) == 1 else None
+def untaught_note(names: Sequence[str]) -> str:
+    """Return the note on classes without a training pixel."""
+    if len(names) == 1:
+        return f"class {names[0]} has no pixel in the training frames; it will never be drawn"
+    return f"classes {', '.join(names)} have no pixel in the training frames; they will never be drawn"
 
 
-def alike_note(kind: str, names: Sequence[str]) -> str:
+EMPTY = "{scenes} without any value left out: {names}"
+MOVED = (
+    "labels of {names} have another place, CRS or pixels than their images: they are brought to the images' pixels by"
+    " nearest neighbour"
+)
+DARK = "most values of {names} are negative, thus without light; add an offset to the scene.toml"
+
+
+def alike_note(kind: str) -> str:
     """Return the note on scenes with a single class, which may stand for unlabelled."""
     return (
-        f"all labels are {kind} in {list_some(names)}; if its value in the label files stands for no class, write"
+        f"all labels are {kind} in {{names}}; if its value in the label files stands for no class, write"
         " unlabelled = VALUE into the scene.toml"
     )
 
 
-def scene_notes(
-    empty: Sequence[str], regridded: Sequence[str], negative: Sequence[str] = (), unfit: Sequence[str] = ()
-) -> list[str]:
-    """Return notes on scenes without any value, with labels on another grid, with mostly negative values, and unfit."""
-    left_out = f"{counted(len(empty), 'scene')} without any value left out: {list_some(empty)}"
-    moved = (
-        f"labels of {list_some(regridded)} have another place, CRS or pixels than their images: they are brought to"
-        " the images' pixels by nearest neighbour"
-    )
-    dark = f"most values of {list_some(negative)} are negative, thus without light; add an offset to the scene.toml"
-    copied = (
-        f"{counted(len(unfit), 'validation scene')} left out, without a labelled pixel or with the image of a"
-        f" training scene: {list_some(unfit)}"
-    )
-    notes = (empty, left_out), (regridded, moved), (negative, dark), (unfit, copied)
-    return [note for names, note in notes if names]
+def filled(note: str, names: Sequence[str]) -> str:
+    """Return a note with the names of its scenes, and their number."""
+    for kind in ("scene", "validation scene"):
+        note = note.replace(f"{{{kind}s}}", counted(len(names), kind))
+    return note.replace("{names}", list_some(names))
+
+
+class SceneNotes(defaultdict[str, list[str]]):
+    """Names of scenes by the note on them."""
+
+    def __init__(self) -> None:
+        super().__init__(list)
+
+    def scenes(
+        self, data: TrainingData, names: Sequence[str], what: str, report: Report
+    ) -> Iterator[tuple[int, str, RasterScene]]:
+        """Open scenes with a value; yield number, name and scene."""
+        for number, name in enumerate(names):
+            report(what, number / len(names), name)
+            try:
+                yield number, name, data.scene(name)
+            except EmptySceneError:
+                self[EMPTY].append(name)
+
+    def add(self, name: str, scene: RasterScene) -> None:
+        """Note labels of a single class or another grid, and values without light."""
+        if scene.labels is not None:
+            there = np.unique(scene.labels[scene.labels != UNLABELLED])
+            if len(there) == 1:
+                self[alike_note(scene.class_names[there[0]])].append(name)
+        if scene.regridded:
+            self[MOVED].append(name)
+        if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
+            self[DARK].append(name)
+
+    @property
+    def texts(self) -> list[str]:
+        """Return the notes."""
+        return [filled(note, names) for note, names in self.items()]
 
 
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:

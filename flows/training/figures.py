@@ -60,7 +60,7 @@ def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) 
     for example in examples:
         grid, labels = _parts(weights, example)
         _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
-        valid = (labels != UNLABELLED) & np.isfinite(every_class[..., 0])
+        valid = (labels != UNLABELLED) & ~np.isnan(every_class[..., 0])
         maps.append(metrics.JudgedMap(every_class[valid], labels[valid]))
     return metrics.judge_confidence(maps, seed) if maps else None
 

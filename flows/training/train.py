@@ -5,28 +5,39 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
+from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.tasks.scene import masks_contain
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
 from spectralzoom.flows.training import figures
-from spectralzoom.flows.training.data import Report, TrainingData, check_out, open_training_data, read_farm_name
-from spectralzoom.flows.training.train_scenes import Scenes, TrainRequest, network_config, observe_all, training_capture
+from spectralzoom.flows.training.data import (
+    Report,
+    TrainingData,
+    alike_note,
+    check_out,
+    filled,
+    open_training_data,
+    read_farm_name,
+    untaught_note,
+)
+from spectralzoom.flows.training.train_scenes import CAMERA, Scenes, TrainRequest, network_config, observe_all
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
-from spectralzoom.models.training.train import PIXELS, LabelledPixels, linear_classifier, train
+from spectralzoom.models.training.train import PIXELS, LabelledPixels, continued, linear_classifier, train
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
     CASCADE,
+    CLASS_VALUES,
     TRAINED_ON,
     TrainedOn,
     Weights,
@@ -36,7 +47,7 @@ from spectralzoom.models.weights.files import (
     save_weights,
     with_record,
 )
-from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
@@ -56,29 +67,32 @@ def train_weights(
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
-    begun = None if request.start is None else load_weights(request.start)
-    device = choose_device(request.device)
-    settings = request.settings
-    choices = {"hold_out": request.hold_out, **request.choices}
-    data = open_training_data(request.dataset, request.validation, request.scenes, request.camera, **choices)
+    flags = request.flags
+    begun = None if flags.start is None else load_weights(flags.start)
+    device = choose_device(flags.device)
+    settings = flags.settings
+    data = open_training_data(request.dataset, flags.validation, flags.scenes, CAMERA, **flags.choices())
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
+    check_classes(request, scenes, tell)
     if begun is None:
         normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
     else:
         check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    augmentation = training_capture(normalisation, settings.darkest_ms)
+    simulated = settings.darkest_ms < REFERENCE_MS
+    augmentation = CaptureAugmentation(normalisation, min_exposure_ms=settings.darkest_ms) if simulated else None
     weights, training = _learned(request, scenes, normalisation, augmentation, begun, checkpoint, device, report)
     record = {
         "command": request.command,
         "data": data.law,
+        **({CLASS_VALUES: list(scenes.common.values)} if scenes.common.values else {}),
         TRAINED_ON: asdict(_trained_on(data, scenes, settings.darkest_ms)),
         "split": scenes.split | {"held_out": list(data.held_out)},
         "settings": asdict(settings),
-        "camera": asdict(request.camera),
+        "camera": asdict(CAMERA),
         "device": device,
         **({} if begun is None else {"started_from": begun.record.get("command", "")}),
         **training,
@@ -115,12 +129,29 @@ def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> T
     )
 
 
+def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], None]) -> None:
+    """Tell the classes without a training pixel. Raises SceneError: fewer than two classes have one."""
+    names, frames = scenes.common.names, [*scenes.train.keys]
+    taught = [name for number, name in enumerate(names) if number not in scenes.untaught]
+    if len(taught) < 2:
+        note = filled(alike_note(taught[0]), frames) if taught else f"no pixel of {list_some(frames)} has a label"
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
+    if scenes.untaught:
+        tell(untaught_note([names[number] for number in scenes.untaught]))
+
+
 def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     """Raise SettingsError unless a training can start from these weights.
 
     Bands, classes and sizes must be theirs, and the training must contain the pixels that they know, by the content of
     the scenes. So none of these pixels judges the result, and the record names them all.
     """
+    if begun.class_names != scenes.common.names:
+        both = [", ".join(names) for names in (begun.class_names, scenes.common.names)]
+        raise SettingsError(
+            f"--start {request.flags.start}: its classes are {both[0]}, those of {request.dataset} are {both[1]};"
+            " give the same classes in the same order, in scene.toml"
+        )
     split = begun.record.get("split", {})
     known = set(split.get("train", {}).values())
     masks = split.get("pixels", {})
@@ -129,12 +160,11 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
         "training scenes": known <= set(now.keys.values()),
         "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
         "bands": begun.basis == scenes.common.basis,
-        "classes": begun.class_names == scenes.common.names,
-        "sizes of the network": begun.config == network_config(request, scenes.common),
+        "sizes of the network": replace(begun.config, untaught=()) == network_config(request.flags, scenes.common),
     }.items():
         if not kept:
             raise SettingsError(
-                f"--start {request.start}: its training had other {what}; give its data set and options"
+                f"--start {request.flags.start}: its training had other {what}; give its data set and options"
             )
 
 
@@ -150,12 +180,14 @@ def _learned(
 ) -> tuple[Weights, dict[str, Any]]:
     """Train the network; return weights, and their figures on the validation scenes for the record."""
     common = scenes.common
-    settings = request.settings
+    settings = request.flags.settings
     examples = scenes.train.examples
-    config = network_config(request, common)
+    config = replace(network_config(request.flags, common), untaught=scenes.untaught)
     rng = np.random.default_rng([0x1DA])
     pixels = LabelledPixels.drawn(examples, rng, augmentation).brightened(normalisation.gain_shift, rng)
     start = linear_classifier(pixels, config.classes) | (load_encoder() if config.deep else {})
+    if begun is not None:
+        begun = replace(begun, segmenter=continued(begun.segmenter, config, start))
     model, summary = train(
         config,
         examples,
@@ -187,27 +219,24 @@ def _learned(
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; print and return the record."""
-    check_counts(request)
+    check_counts(request.flags)
     with one_after_the_other(console) as report:
         record = train_weights(request, report, lambda note: show_text(f"note: {note}", console))
     _print_figures(record, request, console)
     return record
 
 
-def check_counts(request: TrainRequest) -> None:
+def check_counts(flags: TrainFlags) -> None:
     """Raise SettingsError for a count or size that is not positive, or an exposure beyond the reference."""
-    settings = request.settings
-    counts = {name: getattr(settings, name) for name in ("steps", "minutes", "learning_rate", "batch", "crop")}
-    counts |= {name: getattr(request, name) for name in ("scenes", "patch")}
-    for name, value in {**counts, **request.tokens}.items():
-        if value is not None and not value > 0:
-            raise SettingsError(f"--{name.replace('_', '-')} must be above 0, got {value}")
-    for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
-        if number is not None and number < 0:
-            raise SettingsError(f"{name} must be 0 or more, got {number}")
-    if not 0 < settings.darkest_ms <= REFERENCE_MS:
+    counts = ("steps", "minutes", "learning_rate", "batch", "crop", "scenes", "patch", "dim", "layers", "heads")
+    for name in (*counts, "validation", "seed"):
+        value = getattr(flags, name)
+        if value is not None and not (value > 0 if name in counts else value >= 0):
+            limit = "above 0" if name in counts else "0 or more"
+            raise SettingsError(f"--{name.replace('_', '-')} must be {limit}, got {value}")
+    if not 0 < flags.min_exposure_ms <= REFERENCE_MS:
         limits = f"above 0 and at most {REFERENCE_MS:g}, the reference exposure"
-        raise SettingsError(f"--min-exposure-ms must be {limits}, got {settings.darkest_ms}")
+        raise SettingsError(f"--min-exposure-ms must be {limits}, got {flags.min_exposure_ms}")
 
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
@@ -227,12 +256,12 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         show_text(f"{what}: {of_baselines}", console)
     judged = record["validation"]
     if judged is None:
-        left = built_in_laws(request.dataset) or request.hold_out or request.choices.get("train_mask") is not None
+        left = built_in_laws(request.dataset) or request.flags.hold_out or request.flags.train_mask is not None
         on = request.dataset if left else "OTHER_SCENES"
         command = shlex.join(["spectralzoom", "evaluate", on, "--weights", str(request.out)])
         more = "" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"
         show_text(f"no scene was kept for validation; to judge the weights on other scenes: {command}{more}", console)
-        if request.settings.darkest_ms < REFERENCE_MS:
+        if request.flags.min_exposure_ms < REFERENCE_MS:
             show_text("the file has no scan performance, by which survey --seconds chooses", console)
         return
     title = f"{judged['scenes']} scene{'s' if judged['scenes'] > 1 else ''} kept for validation"

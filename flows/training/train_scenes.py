@@ -1,4 +1,4 @@
-"""Define the request of a training, and image its scenes."""
+"""Image the scenes of a training."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.flows.settings.model_flags import NO_TRAIN_FLAGS, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
-from spectralzoom.flows.training.data import Report, TrainingData, alike_note, only_class, scene_notes, trained_pixels
-from spectralzoom.models.network.machine import PROCESSOR
+from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, alike_note, filled, trained_pixels
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
-from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import Example, normalised, observe_scene
-from spectralzoom.models.training.train import TrainingSettings
-from spectralzoom.pipeline.errors import EmptySceneError, SceneError, SettingsError, list_some
+from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
+from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
@@ -26,27 +24,18 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 DEEP_PATCH_PX = 32  # of frames of 512 px and more, whose objects are larger than a token
 COLUMNS = {True: 24, False: 48}  # spectral features: of built-in scenes, and of files
+CAMERA = LineCamera()
+UNFIT = "{validation scenes} left out, without a labelled pixel or with the image of a training scene: {names}"
 
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """Request of a training; a ``patch`` of None follows from the data."""
+    """Request of a training."""
 
     dataset: str
     out: Path
-    hold_out: tuple[str, ...] = ()
-    validation: int | None = None
-    scenes: int | None = None  # of a built-in farm; None: its default
-    patch: int | None = None
-    columns: int | None = None  # of spectral features; None: 24 of built-in scenes, 48 of files
-    width: int = SegmenterConfig.width
-    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads
-    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
-    settings: TrainingSettings = field(default_factory=TrainingSettings)
-    camera: LineCamera = field(default_factory=LineCamera)
+    flags: TrainFlags = NO_TRAIN_FLAGS
     command: str = ""
-    device: str = PROCESSOR  # or auto
-    start: Path | None = None  # weights from which the training starts
 
 
 @dataclass(frozen=True)
@@ -58,6 +47,7 @@ class Common:
     colours: NDArray[np.uint8]
     patch: int
     wavelength_nm: NDArray[np.float64]
+    values: tuple[int, ...] = ()  # numbers of the classes in the label files, where maps can have them
 
     def check(self, scene: RasterScene) -> None:
         """Raise SceneError where a scene has other classes or bands."""
@@ -86,6 +76,11 @@ class Scenes:
     common: Common
     train: Imaged
     validation: Imaged
+
+    @property
+    def untaught(self) -> tuple[int, ...]:
+        """Return the classes without a training pixel, ascending."""
+        return untaught_classes(self.train.examples, len(self.common.names))
 
     @property
     def split(self) -> dict[str, Any]:
@@ -129,40 +124,24 @@ def _imaged(
     With ``trained`` scenes, these are for validation: those without a label, or of a trained image, are left out.
     """
     found = Imaged()
-    alike: dict[str, list[str]] = {}  # by their class
-    lists: list[list[str]] = [[], [], [], []]
-    empty, regridded, negative, unfit = lists
+    notes = SceneNotes()
     stream = 0x0B5 if trained is None else 0x0B6  # validation has noise of its own
-    for number, name in enumerate(names):
-        report(what, number / len(names), name)
-        try:
-            scene = data.scene(name)
-        except EmptySceneError:
-            empty.append(name)
-            continue
+    for number, name, scene in notes.scenes(data, names, what, report):
         mask = trained_pixels(scene)  # raises for a scene without labels
         common = common or _common(request, scene)
         common.check(scene)
         if trained is not None and (scene.key in trained.keys.values() or not mask.any()):
-            unfit.append(name)
+            notes[UNFIT].append(name)
             continue
         found.keys[name] = scene.key
         found.content.extend(scene.content)
-        if request.choices.get("train_mask") is not None:
+        if request.flags.train_mask is not None:
             found.pixels[scene.key] = pack_mask(mask)
-        if (alone := only_class(scene)) is not None:
-            alike.setdefault(alone, []).append(name)
-        if scene.regridded:
-            regridded.append(name)
-        if scene.content and 2 * np.count_nonzero(scene.planes < 0) > scene.planes.size:
-            negative.append(name)
+        notes.add(name, scene)
         grid = SceneGrid(*scene.shape, common.patch)
-        rng = np.random.default_rng([request.settings.seed, stream, number])
-        found.examples.append(observe_scene(scene, request.camera, grid, common.basis, rng))
-    notes = [alike_note(*one) for one in alike.items()]
-    if trained is None and [*alike.values()] == [[*found.keys]]:
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    for note in (*notes, *scene_notes(*lists)):
+        rng = np.random.default_rng([request.flags.seed, stream, number])
+        found.examples.append(observe_scene(scene, CAMERA, grid, common.basis, rng))
+    for note in notes.texts:
         tell(note)
     return common, found
 
@@ -171,13 +150,13 @@ def _common(request: TrainRequest, scene: RasterScene) -> Common:
     if not scene.class_names:
         raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
     if len(scene.class_names) < 2:
-        note = alike_note(scene.class_names[0], [scene.name])
+        note = filled(alike_note(scene.class_names[0]), [scene.name])
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
     built_in = bool(built_in_laws(request.dataset))
-    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns or COLUMNS[built_in])
-    patch = request.patch or suggested_patch(scene.shape, built_in=built_in)
-    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
-    network_config(request, common)  # raises for invalid sizes before the first scene is imaged
+    basis = SpectralBasis.spanning(scene.wavelength_nm, COLUMNS[built_in])
+    patch = request.flags.patch or suggested_patch(scene.shape, built_in=built_in)
+    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
+    network_config(request.flags, common)  # raises for invalid sizes before the first scene is imaged
     return common
 
 
@@ -186,7 +165,7 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
     return 16 if built_in or 256 <= min(shape) < 512 else 32 if min(shape) >= 512 else 8
 
 
-def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
+def network_config(flags: TrainFlags, common: Common) -> SegmenterConfig:
     """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
     deep = common.patch >= DEEP_PATCH_PX
     try:
@@ -194,16 +173,10 @@ def network_config(request: TrainRequest, common: Common) -> SegmenterConfig:
             classes=len(common.names),
             columns=common.basis.columns,
             patch=common.patch,
-            width=request.width,
             deep=deep,
-            **{"layers": 1 if deep else SegmenterConfig.layers, **request.tokens},
+            dim=flags.dim,
+            heads=flags.heads,
+            layers=flags.layers or (1 if deep else SegmenterConfig.layers),
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
-
-
-def training_capture(normalisation: Normalisation, min_exposure_ms: float) -> CaptureAugmentation | None:
-    """Return the simulation of shorter exposures and wider spacings; None for the reference exposure alone."""
-    return (
-        CaptureAugmentation(normalisation, min_exposure_ms=min_exposure_ms) if min_exposure_ms < REFERENCE_MS else None
-    )

@@ -6,8 +6,7 @@ line spacing, which the weights segment. Other lands then measure what the prior
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,8 @@ from rich.table import Table
 
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text
 from spectralzoom.flows.training.data import Report, check_out
+from spectralzoom.flows.training.train import check_counts
+from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.network.temporal_reader import TemporalReader
@@ -27,11 +28,12 @@ from spectralzoom.models.training.temporal import PastPass, TemporalTraining, Vi
 from spectralzoom.models.weights.files import Weights, add_reader, describe_weights, load_reader, load_weights
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
 
 SHAPE = (512, 640)  # (y, x) of a land
+FLAGS = ("train_temporal", "scenes", "steps", "minutes", "seed")  # that apply
 LANDS = 40
 FIRST_SEED, JUDGED_SEED = 200_000, 300_000  # of lands of the training, and of those that judge it
 VISITS = 5  # of each land
@@ -57,58 +59,52 @@ MAPS = {
 BEFORE, NOW = (1, 25.0), (2, 5.0)  # line spacing [px] and exposure [ms] of the judged scans
 
 
-@dataclass(frozen=True)
-class TemporalRequest:
-    """Weights, output file and settings of a training."""
-
-    dataset: str
-    weights: Path
-    out: Path
-    lands: int = LANDS
-    settings: TemporalTraining = field(default_factory=TemporalTraining)
-    command: str = ""
-
-
-def train_temporal(request: TemporalRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+def train_temporal(request: TrainRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Train a temporal reader for weights, judge it on other lands, save it, and return the record of its file.
 
     The training starts from the reader of the weights if they have one.
-    Raises SettingsError: the dataset is not the built-in farm, its classes are not those of the weights, or the file
-    cannot be written; WeightsError: the weights cannot be read.
+    Raises SettingsError: a flag is for other trainings, the dataset is not the built-in farm, its classes are not those
+    of the weights, or the file cannot be written; WeightsError: the weights cannot be read.
     """
+    flags, path = request.flags, request.flags.train_temporal
+    assert path is not None
+    check_counts(flags)
+    for one in fields(flags):
+        if one.name not in FLAGS and getattr(flags, one.name) != one.default:
+            raise SettingsError(f"--{one.name.replace('_', '-')} is not for --train-temporal; leave it out")
+    settings = TemporalTraining(flags.minutes, flags.steps, flags.seed)
+    count = LANDS if flags.scenes is None else flags.scenes
     if request.dataset not in FARM_NAMES:
         raise SettingsError(
             f"--train-temporal {request.dataset}: expected farm, the only data set with several days of one land. "
             "Weights without a temporal reader use the more confident of prior map and visit"
         )
     check_out(request.out)
-    weights = load_weights(request.weights)
+    weights = load_weights(path)
     if weights.class_names != CLASSES:
-        raise SettingsError(
-            f"--train-temporal {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
-        )
+        raise SettingsError(f"--train-temporal {path}: expected weights of the farm's classes, {', '.join(CLASSES)}")
     lands = []
-    for number in range(request.lands):
+    for number in range(count):
         seed = FIRST_SEED + number
-        report("visiting lands", number / request.lands, f"land {seed}")
-        rng = np.random.default_rng([request.settings.seed, seed])
+        report("visiting lands", number / count, f"land {seed}")
+        rng = np.random.default_rng([settings.seed, seed])
         lands.append([_visit(weights, seed, *moment, rng) for moment in _moments(rng)])
-    known = describe_weights(request.weights).reader
+    known = describe_weights(path).reader
     reader, steps = train_reader(
         lands,
-        request.settings,
+        settings,
         lambda now: report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
-        start=None if known is None else load_reader(request.weights),
+        start=None if known is None else load_reader(path),
     )
     record = {
         "command": request.command,
-        "lands": [FIRST_SEED + number for number in range(request.lands)],
-        "settings": asdict(request.settings),
+        "lands": [FIRST_SEED + number for number in range(count)],
+        "settings": asdict(settings),
         "steps": steps,
         "started_from": None if known is None else known.key,
-        "validation": judge_temporal(weights, reader, request.settings.seed, report),
+        "validation": judge_temporal(weights, reader, settings.seed, report),
     }
-    add_reader(request.weights, request.out, reader, record)
+    add_reader(path, request.out, reader, record)
     return record
 
 
@@ -130,7 +126,8 @@ def _visit(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Ge
         observation = _scan(weights, land, step, exposure_ms, rng)
         probability = np.exp(observation.log_probability).astype(np.float16)
         drawn.append(PastPass(step, observation.light, probability, observation.coarse.astype(np.float16)))
-    return Visit(day + hour / 24, land.labels, drawn)
+    labels = np.where(np.isin(land.labels, weights.config.untaught), np.uint8(UNLABELLED), land.labels)
+    return Visit(day + hour / 24, labels, drawn)
 
 
 def _observed(weights: Weights, seed: int, day: int, hour: float, rng: np.random.Generator) -> Example:
@@ -177,7 +174,7 @@ def judge_temporal(weights: Weights, reader: TemporalReader, seed: int, report: 
     ]
 
 
-def run_remember(request: TemporalRequest, console: Console) -> dict[str, Any]:
+def run_remember(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``, and return the record of the file."""
     with one_after_the_other(console) as report:
         record = train_temporal(request, report)

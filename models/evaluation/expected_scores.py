@@ -41,7 +41,7 @@ def expected_counts(swaths: Iterable[NDArray[np.floating]], classes: int) -> Flo
     found = np.zeros((classes, classes))
     for swath in swaths:
         known = swath.reshape(-1, classes)
-        chance = np.exp(known[np.isfinite(known).all(axis=1)].astype(np.float64))
+        chance = np.exp(known[~np.isnan(known).any(axis=1)].astype(np.float64))
         mapped = chance.argmax(axis=1)
         for one in np.flatnonzero(np.bincount(mapped, minlength=classes)):
             found[:, one] += chance[mapped == one].sum(axis=0)

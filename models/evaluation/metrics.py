@@ -119,7 +119,7 @@ def calibration_error(counts: Floats) -> float:
 class JudgedMap:
     """Log-probabilities of the labelled pixels of a map."""
 
-    log_probability: NDArray[np.float32]  # (pixel, class)
+    log_probability: NDArray[np.float32]  # (pixel, class), minus infinity for a class that is never drawn
     labels: NDArray[np.uint8]  # (pixel,)
 
 
@@ -137,11 +137,15 @@ def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
 
 
 def fitted_temperature(maps: list[JudgedMap], seed: int) -> float:
-    """Return the temperature with the highest likelihood of the labels."""
+    """Return the temperature with the highest likelihood of the labels that maps can have; 1 without one."""
     rng = np.random.default_rng([seed, 0x7E3])
     drawn = [rng.choice(len(one.labels), min(FITTED_PIXELS, len(one.labels)), replace=False) for one in maps]
     values = np.concatenate([one.log_probability[i] for one, i in zip(maps, drawn, strict=True)]).astype(np.float64)
     labels = np.concatenate([one.labels[i] for one, i in zip(maps, drawn, strict=True)])
+    possible = values[np.arange(len(labels)), labels] > -np.inf
+    if not possible.any():
+        return 1.0
+    values, labels = values[possible], labels[possible]
 
     def loss(log_temperature: float) -> float:
         scaled = scipy.special.log_softmax(values / np.exp(log_temperature), axis=1)

@@ -168,7 +168,7 @@ class Overview:
     """Features and logits of the overview, which the full network corrects."""
 
     features: Tensor  # (B, c, H, W)
-    logits: Tensor  # (B, classes, H, W)
+    logits: Tensor  # (B, classes, H, W), minus infinity for untaught classes
 
 
 class Segmenter(nn.Module):
@@ -229,7 +229,10 @@ class Segmenter(nn.Module):
         spectral = F.pad(self.spectral.weight, (0, 0, 0, 0, 0, PLANES))
         # the mean of the logits is that of the mean spectrum
         alone = mean_around(F.conv2d(image, spectral, self.spectral.bias, dilation=2))
-        return Overview(drawn, self.overview_classes(F.gelu(drawn)).add_(alone[:, :, :height, :width]))
+        logits = self.overview_classes(F.gelu(drawn)).add_(alone[:, :, :height, :width])
+        if self.config.untaught:  # patches add finite numbers to these logits, which stay minus infinity
+            logits = logits.index_fill(1, torch.tensor(self.config.untaught, device=logits.device), -torch.inf)
+        return Overview(drawn, logits)
 
     def read_patches(self, overview: Overview, patches: Tensor, patch_index: Tensor) -> Tensor:
         """Return logits (B, K, classes, p, p) of patches (B, K, J + PLANES, p, p) at ``patch_index`` (B, K)."""

@@ -60,8 +60,10 @@ class SegmenterConfig:
     heads: int = 4
     mlp_ratio: int = 3
     deep: bool = False  # an overview for large frames, with an encoder that was trained on ImageNet
+    untaught: tuple[int, ...] = ()  # classes without a training pixel: their probability is 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "untaught", tuple(self.untaught))  # a list in files
         for name in ("classes", *MOST):
             if isinstance(getattr(self, name), bool) or not isinstance(getattr(self, name), Integral):
                 raise ShapeError(f"{name} of a segmenter must be a whole number, got {getattr(self, name)!r}")
@@ -71,6 +73,8 @@ class SegmenterConfig:
             if not 1 <= getattr(self, name) <= most:
                 least = f"{name} of a segmenter must be at least 1"
                 raise ShapeError(f"{least} and at most {most}, got {getattr(self, name)}")
+        if not {*self.untaught} < {*range(self.classes)}:
+            raise ShapeError(f"untaught must be some of the {self.classes} classes, got {self.untaught}")
         level_widths(self.width, self.patch)  # refuses a patch that cannot be halved down to the lowest level
         if self.dim % 4 or self.dim % self.heads:
             raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")

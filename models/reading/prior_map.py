@@ -43,7 +43,7 @@ Floats = NDArray[np.float32]
 class ClassProbabilities:
     """Class probabilities of a field, or of a part of it, after a visit."""
 
-    log_probability: Floats  # (y, x, class)
+    log_probability: Floats  # (y, x, class); minus infinity for a class that is never drawn
     age_days: Floats  # (y, x) since the last capture; NaN without one
     light: Floats  # (y, x) sum of all captures, older ones weigh less: reference exposures over squared line spacing
 
@@ -108,9 +108,9 @@ def pooled(columns: Floats) -> Floats:
 
 def first_probabilities(observation: CurrentVisit) -> ClassProbabilities:
     """Return the class probabilities of a field without a prior map: those of the current visit."""
-    kept = np.maximum(observation.log_probability, np.float32(FAINTEST))  # NaN stays
+    kept = _floored(observation.log_probability)
     light = np.where(observation.seen, observation.light_of(np.s_[:]), 0).astype(np.float32)
-    return ClassProbabilities(kept, np.where(_finite(kept), np.float32(0), np.float32(np.nan)), light)
+    return ClassProbabilities(kept, np.where(_known(kept), np.float32(0), np.float32(np.nan)), light)
 
 
 def fuse(prior_map: PriorMap, observation: CurrentVisit, reader: TemporalReader | None) -> ClassProbabilities:
@@ -149,26 +149,30 @@ def _fused(
 ) -> ClassProbabilities:
     """Return the class probabilities of some rows; the outermost rows lack some of their neighbours."""
     before, today = prior_map.probabilities.log_probability[rows], observation.log_probability[rows]
-    known, shown = _finite(before), _finite(today)
+    known, shown = _known(before), _known(today)
     seen = observation.seen[rows] & shown
     age = prior_map.probabilities.age_days[rows] + np.float32(prior_map.days)
     days = np.nan_to_num(age, nan=0.0)
     flat = np.float32(-math.log(before.shape[-1]))
-    old, new = (_normalised(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
+    images = [np.where(where[..., None], one, flat) for where, one in ((known, before), (seen, today))]
+    never = np.isneginf(images[0]) | np.isneginf(images[1])
+    old, new = (_normalised(_without(never, one)) for one in images)
     left = np.float32(math.exp(-prior_map.days / LIGHT_FADES_DAYS))
     rests_on = np.where(known, prior_map.probabilities.light[rows] * left, 0).astype(np.float32)
     if reader is None:
         after = _more_confident(old, new, seen, days)
     else:
-        images = old, np.where(seen[..., None], new, 0), seen, days, rests_on
-        after = _read(reader, prior_map, observation, images, rows)
+        finite = (np.where(never, np.float32(FAINTEST), one) for one in (old, np.where(seen[..., None], new, 0)))
+        after = _read(reader, prior_map, observation, (*finite, seen, days, rests_on), rows)
+        after = _normalised(_without(never, after)) if never.any() else after
         # The reader was trained on visits that are days apart: without a capture it is phased in over the first day.
         fraction = np.where(seen, 1, np.minimum(days / np.float32(SETTLED_DAYS), 1))[..., None]
         if not (fraction == 1).all():
-            mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
+            with np.errstate(divide="ignore"):  # a class that is never drawn
+                mixed = np.log((1 - fraction) * np.exp(old) + fraction * np.exp(after)).astype(np.float32)
             after = np.where(fraction == 1, after, mixed)
     after = np.where(known[..., None], after, today)  # the visit alone; NaN where that is unknown too
-    kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
+    kept = _floored(after)
     own_light = np.where(seen, observation.light_of(rows), 0).astype(np.float32)
     return ClassProbabilities(kept, np.where(seen, np.float32(0), age), rests_on + own_light)
 
@@ -184,23 +188,36 @@ def _normalised(log_probability: Floats) -> Floats:
     return np.asarray(log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True)))
 
 
-def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
+def in_classes(log_probability: Floats, numbers: Sequence[int], untaught: Sequence[int] = ()) -> Floats:
     """Return log-probabilities (..., class) of other classes, given the present number of each; -1 is a new class.
 
-    A new class gets the probability of one class of a uniform distribution. That of removed classes is spread over all
-    classes.
+    A new class gets the probability of one class of a uniform distribution, as does one that was never drawn. That of
+    removed classes is spread over all others. ``untaught`` classes are never drawn: they count as removed.
     """
-    kept = np.exp(log_probability[..., list(numbers)])
-    removed = np.setdiff1d(np.arange(log_probability.shape[-1]), numbers)
-    spread = np.exp(log_probability[..., removed]).sum(axis=-1, keepdims=True) / len(numbers)
-    return _normalised(np.log(np.where(np.array(numbers) < 0, 1 / len(numbers), kept) + spread)).astype(np.float32)
+    taught = np.isin(np.arange(len(numbers)), untaught, invert=True)
+    before = np.exp(log_probability[..., list(numbers)])
+    removed = np.setdiff1d(np.arange(log_probability.shape[-1]), np.array(numbers)[taught])
+    spread = np.exp(log_probability[..., removed]).sum(axis=-1, keepdims=True) / taught.sum(dtype=np.float32)
+    kept = np.where((np.array(numbers) < 0) | (before == 0), 1 / taught.sum(dtype=np.float32), before) + spread
+    return _normalised(_without(~taught, np.log(kept))).astype(np.float32)
 
 
 def faded(log_probability: Floats, age_days: Floats) -> Floats:
-    """Return a prior map that is mixed with equal probabilities by its age."""
+    """Return a prior map that is mixed by its age with equal probabilities of all classes that it may have."""
+    never = np.isneginf(log_probability)
     left = np.exp(-age_days.astype(np.float64) / FADES_DAYS).astype(np.float32)[..., None]
-    mixed = left * np.exp(log_probability) + (1 - left) / log_probability.shape[-1]
-    return np.asarray(np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32))
+    mixed = left * np.exp(log_probability) + (1 - left) / (~never).sum(axis=-1, keepdims=True, dtype=np.float32)
+    return _without(never, np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32))
+
+
+def _without(never: NDArray[np.bool_], log_probability: Floats) -> Floats:
+    """Return log-probabilities (..., class) with minus infinity for the classes that are ``never`` drawn."""
+    return np.where(never, np.float32(-np.inf), log_probability)
+
+
+def _floored(log_probability: Floats) -> Floats:
+    """Return log-probabilities of at least `FAINTEST`; NaN and minus infinity stay."""
+    return _without(np.isneginf(log_probability), np.maximum(log_probability, np.float32(FAINTEST)).astype(np.float32))
 
 
 def _more_confident(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floats) -> Floats:
@@ -240,6 +257,11 @@ def _read(
         coarsely = (_image(np.nan_to_num(values, posinf=0, neginf=0)) for values in (past, now))
         found = reader(*map(fine, images), *taken, *coarsely, _image(both))
     return np.ascontiguousarray(found[0, :, :y, :x].permute(1, 2, 0).numpy(), np.float32)
+
+
+def _known(log_probability: Floats) -> NDArray[np.bool_]:
+    """Return which pixels of (y, x, class) have probabilities."""
+    return np.asarray(~np.isnan(log_probability).any(axis=-1), np.bool_)
 
 
 def _finite(values: Floats) -> NDArray[np.bool_]:

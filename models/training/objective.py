@@ -91,7 +91,7 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
     weights = torch.where(labelled, weight[labels.where(labelled, 0)], 0.0)
     total = weights.sum()
     if not total > 0:
-        return logits.sum() * 0.0
+        return losses.sum() * 0.0
     loss = (losses * weights).sum() / total
     if not soft_dice:
         return loss

@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     from spectralzoom.models.network.temporal_reader import TemporalReader
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT = "spectralzoom-weights/6"
+FORMAT = "spectralzoom-weights/7"
 ENCODER = "spectralzoom-encoder/1"
 COLOURS = "class_colours"
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
 CALIBRATION = "calibration"  # of a record: calibration error and temperature
 READER = "memory"  # entry in the description, prefix of tensor names
+CLASS_VALUES = "class_values"  # of a record
 TRAINED_ON = "trained_on"  # entry in a record
 MAP_SCORES = "map_scores"  # entry in the description: corrections of expected scores
 MOST_WIDTH = 1024
@@ -95,6 +96,11 @@ class Description:
     reader: ReaderPart | None = None
     about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # complete, with hashes
 
+    @property
+    def untaught(self) -> tuple[str, ...]:
+        """Return the names of the classes without a training pixel, which are never drawn."""
+        return tuple(self.class_names[number] for number in self.config.untaught)
+
 
 @dataclass(frozen=True)
 class Weights:
@@ -111,6 +117,11 @@ class Weights:
     def config(self) -> SegmenterConfig:
         """Return the sizes of the network."""
         return self.segmenter.config
+
+    @property
+    def class_values(self) -> tuple[int, ...]:
+        """Return the number of each class in the label files of the training, by the record; empty if unknown."""
+        return tuple(self.record.get(CLASS_VALUES) or ())
 
     @property
     def temperature(self) -> float:

@@ -81,6 +81,7 @@ class InterlacedLines:
     number: NDArray[np.intp]  # (line,) its line number there
     position: NDArray[np.float64]  # (line, 2) mirror at mid exposure
     time_s: NDArray[np.float64]  # (line,) since the start of their own sweeps
+    exposure_ms: NDArray[np.float64]  # (line,)
     valid_line: NDArray[np.bool_]  # (line,)
     usable: NDArray[np.bool_]  # (line, sample)
     source: str  # of the first sweep
@@ -101,7 +102,8 @@ class InterlacedLines:
                 found[part == taker] = column[number[part == taker]]
             return found
 
-        columns: dict[str, Any] = {name: gathered(name) for name in ("position", "time_s", "valid_line", "usable")}
+        names = ("position", "time_s", "exposure_ms", "valid_line", "usable")
+        columns: dict[str, Any] = {name: gathered(name) for name in names}
         shared = {name: getattr(parts[0], name) for name in ("source", "references", "components", "step")}
         return cls(sweep, tuple(parts), part, number, **columns, **shared)
 

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -172,28 +172,28 @@ class RigSource:
         folders = self._journal.references
         if folders.get(exposure_ms, "") not in self._whole:
             with self.session() as runner:
-                known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
+                known = self._known_references(runner, folders[exposure_ms], sweep) if exposure_ms in folders else None
                 for read in (self._known_references, self._whole_references):
                     if not known:  # again where an emptied camera used the name of a folder whose files are held
                         self._journal.record_references(runner.capture_at_rest(REFERENCES, exposure_ms), exposure_ms)
-                        known = read(runner, folders[exposure_ms])
+                        known = read(runner, folders[exposure_ms], sweep)
                 assert known is not None
                 self._whole[folders[exposure_ms]] = known
         whole = self._whole[folders[exposure_ms]]
         bad = None if whole.bad is None or not whole.bad.any() else whole.bad
-        return References(whole.dark, whole.white, whole.white_reference, bad, by_mirror=self.rig.white_at_rest)
+        return replace(whole, bad=bad, by_mirror=self.rig.white_at_rest)
 
-    def _known_references(self, runner: CaptureRunner, folder: str) -> References | None:
+    def _known_references(self, runner: CaptureRunner, folder: str, sweep: Sweep) -> References | None:
         """Return the frames of an earlier session; None where the camera does not have them any more."""
         try:
-            return self._whole_references(runner, folder)
+            return self._whole_references(runner, folder, sweep)
         except RigError as error:
             if type(error) not in (RigError, DeviceRefused) or getattr(error, "code", None) == NOT_LOGGED_IN:
                 raise
             LOG.warning("dark and white frames are taken again; %s: %s", folder, error)
             return None
 
-    def _whole_references(self, runner: CaptureRunner, folder: str) -> References:
+    def _whole_references(self, runner: CaptureRunner, folder: str, sweep: Sweep) -> References:
         """Return the dark and white frames of all samples."""
         frames = runner.devices.camera.references(folder, self._kept)
         if missing := [kind for kind in ("dark", "white") if kind not in frames]:
@@ -201,9 +201,11 @@ class RigSource:
                 f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
                 "own program, then run again"
             )
-        whole = as_references(frames["dark"], frames["white"], white_reference=self.rig.white_reference)
+        exposure_ms = exposing(self.camera, sweep).exposure_ms
+        dark, white = frames["dark"], frames["white"]
+        whole, notes = as_references(dark, white, white_reference=self.rig.white_reference, exposure_ms=exposure_ms)
         self._check_size(whole.dark.shape, folder)
-        for note in full_scale_notes(whole.white, self.camera.full_scale_dn):
+        for note in (*notes, *full_scale_notes(whole.white, self.camera.full_scale_dn)):
             self._say(note)
         return whole
 

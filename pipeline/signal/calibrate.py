@@ -90,9 +90,14 @@ def judge_elements(references: References) -> Elements:
     return Elements(references, gain, out, lit, fill)
 
 
-def number_values(references: References) -> Floats:
-    """Return the scene value of one DN, (band,): the median over the samples; NaN of bands without light."""
+def number_values(references: References, exposure_ms: Floats) -> Floats:
+    """Return the scene value of one DN, (band,): the median over the samples; NaN of bands without light.
+
+    Of lines of several exposures, (line,) [ms], the longest counts.
+    """
     gain = judge_elements(references).gain.astype(np.float64)
+    if references.exposure_ms is not None:
+        gain *= references.exposure_ms / np.nanmax(exposure_ms)
     known = np.full(references.dark.shape[1], np.nan)
     lit = np.isfinite(gain).any(axis=0)
     known[lit] = np.abs(np.nanmedian(gain[:, lit], axis=0))
@@ -122,13 +127,15 @@ def calibrate(
     *,
     saturated_dn: float,
     position: ArrayLike | None = None,
+    exposure_ms: ArrayLike | None = None,
 ) -> tuple[Floats32, Bools]:
     """Return scene values ``(raw - dark) / (white - dark) * white_reference / throughput``, and their validity.
 
     ``raw`` is (line, sample, band) uint16 DN. ``position`` (line, 2) mirror X and Y is needed for references with
-    ``by_mirror``; a line without a finite position is then NaN. A bad element takes the value between the nearest good
-    samples of its line and band, at most 8 away, linear in sample. It is not filled if more than half of its sample's
-    bands are bad.
+    ``by_mirror``; a line without a finite position is then NaN. ``exposure_ms`` (line,) is needed for references with
+    their own: values are multiplied by the exposure of the references over that of the line. A bad element takes the
+    value between the nearest good samples of its line and band, at most 8 away, linear in sample. It is not filled if
+    more than half of its sample's bands are bad.
 
     Not valid are elements that :func:`judge_elements` puts out, saturated elements, and filled ones with saturated
     neighbours. A band without light in any sample puts nothing out, and is NaN; nothing is valid if all bands are.
@@ -146,24 +153,32 @@ def calibrate(
     Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
     """
     elements = _judged(raw, references)
-    line_gain = _line_gain(raw, elements.references, position)
+    gain = line_gain(elements.references, position, exposure_ms)
     valid = _valid(raw, elements, saturated_dn)
-    if line_gain is not None:
-        valid[~np.isfinite(line_gain)] = False
-    return _scene_values(raw, elements, line_gain), valid
+    if gain is not None:
+        valid[~np.isfinite(gain)] = False
+    return _scene_values(raw, elements, gain), valid
 
 
-def _line_gain(raw: NDArray[np.integer[Any]], references: References, position: ArrayLike | None) -> Floats32 | None:
-    """Return one over the mirror's throughput of each line, (line,); None if the references do not need it."""
-    if not references.by_mirror:
-        return None
-    if position is None:
-        raise PoseError("the white frame was taken at rest (by_mirror), which needs the lines' mirror positions")
-    at = np.asarray(position, np.float64)
-    known = np.isfinite(at).all(axis=1)
-    gain = np.full(len(raw), np.nan, np.float32)
-    gain[known] = 1 / mirror_throughput(at[known])
-    return gain
+def line_gain(references: References, position: ArrayLike | None, exposure_ms: ArrayLike | None) -> Floats32 | None:
+    """Return the factor of each line for its exposure and the mirror's throughput, (line,); None if there is none.
+
+    Raises PoseError: mirror positions are needed and missing, or one lies beyond the rim. Raises ShapeError: exposures
+    are needed and missing.
+    """
+    gain: Floats | None = None
+    if references.by_mirror:
+        if position is None:
+            raise PoseError("the white frame was taken at rest (by_mirror), which needs the lines' mirror positions")
+        at = np.asarray(position, np.float64)
+        known = np.isfinite(at).all(axis=1)
+        gain = np.full(len(at), np.nan)
+        gain[known] = 1 / mirror_throughput(at[known])
+    if references.exposure_ms is not None:
+        if exposure_ms is None:
+            raise ShapeError("the white frame has its own exposure, which needs those of the lines")
+        gain = (1.0 if gain is None else gain) * (references.exposure_ms / np.asarray(exposure_ms, np.float64))
+    return None if gain is None else gain.astype(np.float32)
 
 
 def _scene_values(raw: NDArray[np.integer[Any]], elements: Elements, line_gain: Floats32 | None) -> Floats32:

@@ -238,7 +238,8 @@ class LineStatistics:
     def add(self, lines: Sequence[Line], raw: NDArray[np.uint16]) -> None:
         """Add the next lines, at most 64, whose raw numbers are ``raw`` (line, sample, band)."""
         at = np.array([(line.mirror_x, line.mirror_y) if line.valid else (np.nan, np.nan) for line in lines])
-        values, valid = calibrate(raw, self._elements, saturated_dn=self._saturated, position=at)
+        exposed = np.array([line.exposure_ms for line in lines])
+        values, valid = calibrate(raw, self._elements, saturated_dn=self._saturated, position=at, exposure_ms=exposed)
         self._found.add(values, valid & np.array([line.valid for line in lines]).reshape(-1, *[1] * (valid.ndim - 1)))
 
 
@@ -304,7 +305,9 @@ def calibrated_blocks(
         if chosen is not None and part.start // BLOCK_LINES not in chosen:
             continue
         raw = lines.read(part.start, part.stop)
-        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=lines.position[part])
+        values, valid = calibrate(
+            raw, elements, saturated_dn=saturated, position=lines.position[part], exposure_ms=lines.exposure_ms[part]
+        )
         lost = ~lines.valid_line[part]
         if lost.any():
             valid[lost] &= raw[lost].any(axis=2).reshape(-1, raw.shape[1], *[1] * (valid.ndim - 2))

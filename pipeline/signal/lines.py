@@ -66,8 +66,9 @@ class Signal:
         whole = len(self.elements.fill.element) > 0
         elements = self.elements if whole else self.elements.part(samples)
         raw = _raw_of(read, numbers, slice(0, self.samples) if whole else samples)
+        position, exposure_ms = self.lines.position[numbers], self.lines.exposure_ms[numbers]
         saturated = full_scale_dn * self.lines.sweep.binning
-        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=self.lines.position[numbers])
+        values, valid = calibrate(raw, elements, saturated_dn=saturated, position=position, exposure_ms=exposure_ms)
         if whole:
             values, valid = values[:, samples], valid[:, samples]
         return values, valid & self.lines.valid_line[numbers].reshape(-1, *[1] * (valid.ndim - 1))

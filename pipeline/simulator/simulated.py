@@ -173,6 +173,10 @@ class SimulatedSweep:
         return exposing(self.source.camera, self.sweep).mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
 
     @property
+    def exposure_ms(self) -> NDArray[np.float64]:
+        return np.full(self.sweep.lines, exposing(self.source.camera, self.sweep).exposure_ms)
+
+    @property
     def valid_line(self) -> NDArray[np.bool_]:
         return np.ones(self.sweep.lines, bool)
 

@@ -2,13 +2,13 @@
 
 Names of classes are CF flags. Each pixel has log-probabilities of its classes, and age and light of its last capture.
 Log-probabilities are packed by CF's rules into one byte of 0.05 nat; all classes less likely than 1 in 1100 have the
-same value. Ages and light are floats: each visit starts from those of the one before, and rounding would add up.
-Confidence is stored as floats in steps of 1/256.
+same value, and a class that is never drawn has the least one. Ages and light are floats: each visit starts from those
+of the one before, and rounding would add up. Confidence is stored as floats in steps of 1/256.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "vali
 CONFIDENCE_STEP = 1 / 256
 STEP = 0.05  # nats
 FAINTEST = -12.7  # nats
-NOTHING = 255  # unknown; 254 is certainty
+NOTHING, NEVER = 255, 0  # unknown, and of a class that is never drawn; 254 is certainty
 LEAST, UNLIKELY = -7.0, -11.0  # nats: lower values are stored as their mean, in a tenth of the bytes
 # values of the images in unknown pixels
 NOT_BELIEVED = {"log_probability": NOTHING, "age": np.nan, "light": 0}
@@ -35,26 +35,70 @@ Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class ClassMap:
-    """Class of every pixel."""
-
-    classes: NDArray[np.uint8]  # (y, x) index into ``names``, 255 = none
-    confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where there is no class
-    names: tuple[str, ...]
-    colours: NDArray[np.uint8]  # (class, 3)
-
-
-@dataclass(frozen=True)
 class ClassNames:
-    """Names and colours of the classes of a map."""
+    """Names and colours of the classes of a map, and their numbers in stored images: those of the label files."""
 
     names: tuple[str, ...]
     colours: NDArray[np.uint8]  # (class, 3)
+    values: tuple[int, ...] = ()  # 0 to 254, by class; empty: 0, 1, 2, ...
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Return the number of each class in stored images."""
+        return self.values or tuple(range(len(self.names)))
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """Return the names for legends, with the number of the label files if the name lacks it."""
+        pairs = zip(self.names, self.values or self.names, strict=True)
+        return tuple(
+            name if f"{number}" in (name, name.removeprefix("class_")) else f"{name} ({number})"
+            for name, number in pairs
+        )
 
     @property
     def attributes(self) -> dict[str, Any]:
         """Return the attributes of a store, as `legend_of` reads them."""
-        return {"class_names": list(self.names), "class_colours": np.asarray(self.colours).tolist()}
+        plain = {"class_names": list(self.names), "class_colours": np.asarray(self.colours).tolist()}
+        return plain | ({"class_values": list(self.values)} if self.values else {})
+
+    def stored(self, classes: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """Return the stored numbers of class indices, 255 for none (ShapeError: a class has no name)."""
+        worst = int(classes.max(initial=0, where=classes != UNLABELLED))
+        if worst >= len(self.names) and (classes == worst).any():
+            raise ShapeError(f"class {worst} is in the map, but only {len(self.names)} classes have names")
+        return _translated(np.asarray(classes, np.uint8), dict(enumerate(self.values)))
+
+    def index(self, stored: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the class indices of stored numbers, 255 for none."""
+        return _translated(stored, {number: index for index, number in enumerate(self.values)})
+
+
+def _translated(image: NDArray[np.uint8], numbers: Mapping[int, int]) -> NDArray[np.uint8]:
+    """Return an image with other numbers, 255 for those without; the image itself if there are none."""
+    if not numbers:
+        return image
+    table = bytes(numbers.get(number, UNLABELLED) for number in range(256))
+    return np.frombuffer(bytearray(image.tobytes()).translate(table), np.uint8).reshape(image.shape)
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """Class of every pixel."""
+
+    classes: NDArray[np.uint8]  # (y, x) index into the names, 255 = none
+    confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where there is no class
+    legend: ClassNames
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the classes."""
+        return self.legend.names
+
+    @property
+    def colours(self) -> NDArray[np.uint8]:
+        """Return the colours (class, 3)."""
+        return self.legend.colours
 
 
 def create_class_map(
@@ -62,7 +106,7 @@ def create_class_map(
 ) -> None:
     """Create a class map of (y, x) ``shape`` without classified pixels."""
     group, place = create_placed_group(path, "class map", grid, shape, legend.attributes)
-    _create_flat(group, "classes", ("y", "x"), shape, "|u1", {**class_flags(legend.names, legend.colours), **place})
+    _create_flat(group, "classes", ("y", "x"), shape, "|u1", {**class_flags(legend), **place})
     _create_flat(group, "confidence", ("y", "x"), shape, "<f4", {**CONFIDENCE, **place})
 
 
@@ -83,36 +127,29 @@ def write_class_tile(
     IncompleteStoreError: there is no map.
     """
     group = layout.open_group(path, "r+")
-    check_named(classes, len(legend_of(group).names))
+    stored = legend_of(group).stored(classes)
     rounded = np.rint(np.asarray(confidence) / CONFIDENCE_STEP) * CONFIDENCE_STEP
-    for name, values in (("classes", classes), ("confidence", rounded)):
+    for name, values in (("classes", stored), ("confidence", rounded)):
         array = layout.array_of(group, name)
         array[layout.tile_place(origin, classes.shape)] = np.asarray(values, array.dtype)
 
 
-def check_named(classes: NDArray[np.integer], count: int) -> None:
-    """Raise ShapeError where a pixel of (y, x) has a class without a name."""
-    worst = int(classes.max(initial=0, where=classes != UNLABELLED))
-    if worst >= count and (classes == worst).any():
-        raise ShapeError(f"class {worst} is in the map, but only {count} classes have names")
-
-
-def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
-    """Return CF's flag attributes of an image of class indices."""
+def class_flags(legend: ClassNames) -> dict[str, Any]:
+    """Return CF's flag attributes of an image of classes."""
     return {
         "long_name": "class",
         "nodata": UNLABELLED,  # no _FillValue: xarray would make fractions of the numbers
-        "flag_values": list(range(len(names))),
-        "flag_meanings": " ".join("_".join(name.split()) for name in names),
-        "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in colours.tolist()),
+        "flag_values": list(legend.numbers),
+        "flag_meanings": " ".join("_".join(name.split()) for name in legend.names),
+        "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in legend.colours.tolist()),
     }
 
 
 def legend_of(group: zarr.Group) -> ClassNames:
-    """Read names and colours of the classes from a group's attributes."""
+    """Read names, colours and numbers of the classes from a group's attributes."""
     attributes: dict[str, Any] = dict(group.attrs)
     colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
-    return ClassNames(tuple(attributes.get("class_names", ())), colours)
+    return ClassNames(tuple(attributes.get("class_names", ())), colours, tuple(attributes.get("class_values", ())))
 
 
 def load_class_map(path: Path) -> ClassMap:
@@ -120,7 +157,7 @@ def load_class_map(path: Path) -> ClassMap:
     group = layout.open_group(path)
     classes, confidence = (layout.read_array(group, name) for name in ("classes", "confidence"))
     legend = legend_of(group)
-    return ClassMap(classes, confidence, legend.names, legend.colours)
+    return ClassMap(legend.index(classes), confidence, legend)
 
 
 def class_counts(classes: NDArray[np.integer], count: int) -> NDArray[np.int64]:
@@ -158,18 +195,22 @@ def create_probabilities(
 def old_class_flags(legend: ClassNames) -> dict[str, Any]:
     """Return CF's flag attributes of an image of the previous classes."""
     return {
-        **class_flags(legend.names, legend.colours),
+        **class_flags(legend),
         "long_name": f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else",
     }
 
 
 def packed_probabilities(log_probability: Floats) -> NDArray[np.uint8]:
-    """Return (y, x, class) log-probabilities in stored bytes; NaN is unknown, values below `LEAST` are `UNLIKELY`."""
+    """Return (y, x, class) log-probabilities in stored bytes.
+
+    NaN is unknown, minus infinity is `NEVER`, other values below `LEAST` are `UNLIKELY`.
+    """
     packed = np.empty(log_probability.shape, np.uint8)
     for rows in cuts(len(packed), layout.SHARD_ROWS):  # so that temporary floats are few
         part = log_probability[rows]
         steps = np.rint((np.where(part < LEAST, UNLIKELY, np.minimum(part, 0)) - FAINTEST) / STEP)
         packed[rows] = np.where(np.isnan(part), NOTHING, np.minimum(steps, NOTHING - 1))
+        packed[rows][np.isneginf(part)] = NEVER
     return packed
 
 
@@ -191,7 +232,7 @@ def write_probabilities_tile(
         "log_probability": packed,
         "age": age_days,
         "light": light,
-        OLD_CLASS: old_class,
+        OLD_CLASS: None if old_class is None else legend_of(group).stored(old_class),
     }
     for name, values in images.items():
         if values is not None:
@@ -214,10 +255,12 @@ class ProbabilityStore:
     def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
         """Return log-probabilities (y, x, class), ages in days (y, x) and light (y, x).
 
-        The exponentials of the log-probabilities sum to 1. Unknown pixels are NaN; without light, light is 0.
+        The exponentials of the log-probabilities sum to 1; a class that is never drawn has minus infinity. Unknown
+        pixels are NaN; without light, light is 0.
         """
         packed = layout.read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
+        values[packed == NEVER] = -np.inf
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
         age, light = (layout.read_array(self._group, name, np.s_[rows, columns]) for name in ("age", "light"))
@@ -225,4 +268,6 @@ class ProbabilityStore:
 
     def old_class(self) -> NDArray[np.uint8] | None:
         """Return the previous (y, x) classes of changed pixels, else 255; None for a first visit."""
-        return layout.read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
+        if OLD_CLASS not in self._group:
+            return None
+        return self.legend.index(layout.read_array(self._group, OLD_CLASS))

@@ -43,6 +43,7 @@ class SweepHeader:
             "source": self.source,
             "started": self.started,
             "by_mirror": True if self.references.by_mirror else None,
+            "white_exposure_ms": self.references.exposure_ms,
             "simulation": None if self.simulation is None else dict(self.simulation),
         }
         return {name: fact for name, fact in facts.items() if fact is not None}
@@ -209,7 +210,9 @@ def read_references(group: zarr.Group) -> References:
     """Read the frames that `write_references` stored."""
     dark, white, white_reference = (layout.read_array(group, name) for name in ("dark", "white", "white_reference"))
     bad = layout.read_array(group, "bad") if "bad" in group else None
-    return References(dark, white, white_reference, bad, bool(group.attrs.get("by_mirror", False)))
+    exposure = group.attrs.get("white_exposure_ms")
+    exposure_ms = float(exposure) if isinstance(exposure, int | float) else None
+    return References(dark, white, white_reference, bad, bool(group.attrs.get("by_mirror", False)), exposure_ms)
 
 
 def open_raw_cube(path: Path) -> RawCube:

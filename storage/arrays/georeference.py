@@ -40,7 +40,6 @@ _PROJ, _SPATIAL = (
 )
 _OF_ANGLES = "Relation of array indices to tangents of the undeflected direction; there is no CRS"
 _DEGREES = {"x": ("longitude", "degrees_east"), "y": ("latitude", "degrees_north")}
-_EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
 
 
 @dataclass(frozen=True)
@@ -146,10 +145,12 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
 
 def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
     """Return CF's attributes of one axis of a map."""
+    unit = str(crs.proj.axis_info[0].unit_name).replace(" ", "_") if crs.proj.axis_info else "metre"
     if crs.geographic:
-        standard, unit = _DEGREES[name]
-        return {"standard_name": standard, "long_name": f"{standard} of the pixel's centre", "units": unit}
-    unit = crs.proj.axis_info[0].unit_name if crs.proj.axis_info else "metre"
+        standard, degrees = _DEGREES[name]
+        standard, degrees = (f"grid_{standard}", "degrees") if crs.proj.is_derived else (standard, degrees)
+        about = {"standard_name": standard, "long_name": f"{standard} of the pixel's centre"}
+        return {**about, "units": degrees if unit == "degree" else unit}
     return {
         "standard_name": f"projection_{name}_coordinate",
         "long_name": f"{name} of the pixel's centre on the map",
@@ -175,56 +176,7 @@ def geobox_of_group(group: zarr.Group) -> GeoBox | None:
     if GRID_MAPPING not in group:
         return None
     with damage_named(f"the grid of {group.store_path}"):
-        sizes = {name: array.shape[0] for name, array in group.arrays() if name in ("x", "y")}
-        attributes = {**dict(group.attrs), "grid_mapping": GRID_MAPPING}
-        geobox = find_geobox(attributes, dict(group.arrays()), (sizes["y"], sizes["x"]), ("y", "x"))
-        if geobox is None:
-            raise KeyError(f"{GRID_MAPPING}, x and y give none")
-    return geobox
-
-
-def find_geobox(
-    attributes: Mapping[str, Any], arrays: Mapping[str, Any], shape: tuple[int, int], dims: tuple[str, str]
-) -> GeoBox | None:
-    """Return the grid on the earth of an image of (y, x) ``shape``, by its store; None without CRS and grid.
-
-    ``attributes`` are those of the image and its group, ``arrays`` the other arrays of the group, ``dims`` the names of
-    the image's axes. Read are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform,
-    and evenly spaced coordinates of pixel centres.
-    """
-    named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
-    single = [dict(array.attrs) for array in arrays.values() if array.ndim == 0]
-    single = [about for about in single if {"crs_wkt", "spatial_ref"} & set(about)]
-    mapping = dict(arrays[named].attrs) if named in arrays else single[0] if len(single) == 1 else {}
-    places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
-    crs_name = next((about[name] for about, names in places for name in names if about.get(name)), None)
-    if crs_name is None:
-        return None
-    crs = odc_crs.CRS(crs_name)
-    numbers = str(mapping.get("GeoTransform", "")).split()
-    if len(numbers) == 6:
-        upright = Affine.from_gdal(*map(float, numbers))
-        flipped = upright * Affine(1, 0, 0, 0, -1, shape[0])
-        axes = _transform_of_axes(arrays, dims)
-        # GDAL stores netCDF from the bottom up, with the GeoTransform of the image upright.
-        bottom_up = axes is not None and axes.almost_equals(flipped, _EVEN * abs(upright.e))
-        return odc_geobox.GeoBox(shape, flipped if bottom_up else upright, crs)
-    if (stated := attributes.get("spatial:transform")) is not None:
-        return odc_geobox.GeoBox(shape, Affine(*map(float, stated)), crs)
-    transform = _transform_of_axes(arrays, dims)
-    return None if transform is None else odc_geobox.GeoBox(shape, transform, crs)
-
-
-def _transform_of_axes(arrays: Mapping[str, Any], dims: tuple[str, str]) -> Affine | None:
-    """Return the transform by coordinates of pixel centres; None where they are missing or not evenly spaced."""
-    if not all(name in arrays and arrays[name].ndim == 1 and arrays[name].shape[0] > 1 for name in dims):
-        return None
-    y, x = (np.asarray(arrays[name][...], np.float64) for name in dims)
-    steps: list[float] = []
-    for centres in (y, x):
-        step = float(centres[-1] - centres[0]) / (len(centres) - 1)
-        even = np.abs(centres - centres[0] - step * np.arange(len(centres))).max() <= _EVEN * abs(step)
-        if not step or not even:
-            return None
-        steps.append(step)
-    return Affine(steps[1], 0.0, float(x[0]) - steps[1] / 2, 0.0, steps[0], float(y[0]) - steps[0] / 2)
+        mapping = dict(group[GRID_MAPPING].attrs)
+        transform = Affine.from_gdal(*map(float, str(mapping["GeoTransform"]).split()))
+        about: dict[str, Any] = dict(group.attrs)
+        return odc_geobox.GeoBox(tuple(about["spatial:shape"]), transform, odc_crs.CRS(str(mapping["crs_wkt"])))

@@ -85,7 +85,7 @@ class GroundMapWriter:
         self._group = layout.create_group(path, "class map on the ground", facts, georeference.map_coordinates(geobox))
         self._legend = legend
         images: dict[str, tuple[str, Mapping[str, Any]]] = {
-            "classes": ("|u1", class_maps.class_flags(legend.names, legend.colours)),
+            "classes": ("|u1", class_maps.class_flags(legend)),
             "confidence": ("<f4", class_maps.CONFIDENCE),
             PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
         }
@@ -103,10 +103,9 @@ class GroundMapWriter:
         """Store one block of all images, by name (ShapeError: an image lacks, or a class has no name)."""
         if set(images) != set(self._images):
             raise ShapeError(f"a block got {', '.join(images)}; give {', '.join(self._images)}, one value a pixel")
-        for name in NUMBERED & set(images):
-            class_maps.check_named(np.asarray(images[name], np.uint8), len(self._legend.names))
         for name, image in images.items():
-            self._images[name][rows, columns] = image
+            stored = self._legend.stored(np.asarray(image, np.uint8)) if name in NUMBERED else image
+            self._images[name][rows, columns] = stored
 
     def finish(self, areas_m2: NDArray[np.float64]) -> None:
         """Store the area of each class (class,) beside the map: m2, ha and fraction of the classified area."""

@@ -20,8 +20,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.geometry.mirror import mirror_throughput
-from spectralzoom.pipeline.signal.calibrate import judge_elements
+from spectralzoom.pipeline.signal.calibrate import judge_elements, line_gain
 from spectralzoom.pipeline.signal.components import Components
 from spectralzoom.pipeline.signal.condense import RESIDUAL_STEP, UNUSABLE
 from spectralzoom.pipeline.source import References
@@ -196,8 +195,8 @@ class RestoredCube(cubes.RawCube):
         """Return the numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16."""
         first, last, _ = slice(start, stop).indices(len(self.time_s))
         values = self.signal.spectra(first, last)
-        if self.references.by_mirror:
-            values *= mirror_throughput(np.nan_to_num(self.position[first:last])).astype(np.float32)[:, None, None]
+        gain = line_gain(self.references, np.nan_to_num(self.position[first:last]), self.exposure_ms[first:last])
+        values = values if gain is None else values / gain[:, None, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             numbers = np.rint(values / self._gain + self.references.dark)
         return np.where(np.isfinite(numbers), np.clip(numbers, 0, MOST_DN), MOST_DN).astype(np.uint16)[:, samples]

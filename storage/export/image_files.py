@@ -11,28 +11,16 @@ from xml.etree import ElementTree
 import numpy as np
 import rasterio
 import rasterio.shutil
-from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from rasterio.errors import RasterioError
 
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.arrays.class_maps import ClassNames
-from spectralzoom.storage.arrays.georeference import AngularGrid
 from spectralzoom.storage.whole_files import written_aside
 
 TILE = 512  # px: rasters within one tile need no overviews
-ANGULAR = (
-    "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
-    "downwards; there is no CRS"
-)
-
 Blocks = Iterable[tuple[int, NDArray[Any]]]  # first row, (row, x) or (row, x, band) values, in order
-
-
-def angular_geobox(grid: AngularGrid, shape: tuple[int, int]) -> GeoBox:
-    """Return the grid of an image of (y, x) px in tangents of the camera's angles [rad], without a CRS."""
-    return GeoBox(shape, Affine(*grid.attributes(shape)["spatial:transform"]), None)
 
 
 @dataclass(frozen=True)
@@ -47,6 +35,7 @@ class CogImage:
     tags: Mapping[str, str] = field(default_factory=dict)
     wavelength_nm: Sequence[float] | None = None  # of each band
     fwhm_nm: Sequence[float] | None = None
+    detector: Sequence[int] = ()  # of each band
 
 
 def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
@@ -55,39 +44,42 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     Classes get a colour table, and their names as tags of the band and as GDAL's category names in ``NAME.aux.xml``.
     Raises ArchiveError: the disk refuses or changes the numbers.
     """
+    sidecar = f"{path.name}.aux.xml"
+    names = [path.name] if image.legend is None else [path.name, sidecar]
+    options = {
+        "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
+        "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
+        "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
+        "BLOCKSIZE": str(TILE),
+        "NUM_THREADS": "1",
+    }
     try:
-        _write_cog(path, image, blocks)
+        with written_aside(path.parent, names) as aside:
+            plain, made = aside / "plain.tif", aside / path.name
+            _write_plain(plain, image, blocks)
+            rasterio.shutil.copy(str(plain), str(made), driver="COG", **options)
+            _check_same(plain, made, path)
+            if image.legend is not None:
+                _write_categories(aside / sidecar, image.legend)
     except RasterioError as error:
         raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
 
 
-def _write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
-    sidecar = f"{path.name}.aux.xml"
-    with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
-        plain, made = aside / "plain.tif", aside / path.name
-        _write_plain(plain, image, blocks)
-        options = {
-            "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
-            "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
-            "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
-            "BLOCKSIZE": str(TILE),
-            "NUM_THREADS": "1",
-        }
-        rasterio.shutil.copy(str(plain), str(made), driver="COG", **options)
-        with rasterio.open(plain) as wanted, rasterio.open(made) as found:
-            with_nan = np.dtype(image.dtype).kind == "f"
-            same = all(  # a tile holds every band
-                np.array_equal(wanted.read(window=tile), found.read(window=tile), equal_nan=with_nan)
-                for _, tile in found.block_windows(1)
-            )
-        if not same:
-            raise ArchiveError(f"{path} does not read back as written; is the disk full? Run again")
-        if image.legend is not None:
-            root = ElementTree.Element("PAMDataset")
-            names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
-            for name in image.legend.names:
-                ElementTree.SubElement(names, "Category").text = name
-            ElementTree.ElementTree(root).write(aside / sidecar, encoding="utf-8")
+def _check_same(plain: Path, made: Path, path: Path) -> None:
+    """Refuse a copy with other numbers (ArchiveError), which GDAL leaves on a full disk without an error."""
+    with rasterio.open(plain) as wanted, rasterio.open(made) as found:
+        for _, tile in found.block_windows(1):  # a tile holds every band
+            if wanted.read(window=tile).tobytes() != found.read(window=tile).tobytes():
+                raise ArchiveError(f"{path} does not read back as written; is the disk full? Run again")
+
+
+def _write_categories(path: Path, legend: ClassNames) -> None:
+    root = ElementTree.Element("PAMDataset")
+    names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
+    named = dict(zip(legend.numbers, legend.names, strict=True))
+    for number in range(max(named) + 1):  # the place of a name is its number
+        ElementTree.SubElement(names, "Category").text = named.get(number, "")
+    ElementTree.ElementTree(root).write(path, encoding="utf-8")
 
 
 def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
@@ -104,11 +96,11 @@ def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
             names = image.legend.names
             file.update_tags(
                 1,
-                **{f"CLASS_{number}": name for number, name in enumerate(names)},
-                flag_values=", ".join(str(number) for number in range(len(names))),
+                **{f"CLASS_{number}": name for number, name in zip(image.legend.numbers, names, strict=True)},
+                flag_values=", ".join(map(str, image.legend.numbers)),
                 flag_meanings=" ".join("_".join(name.split()) for name in names),
             )
-            colours = enumerate(image.legend.colours.tolist())
+            colours = zip(image.legend.numbers, image.legend.colours.tolist(), strict=True)
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
         for first, values in blocks:
             planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
@@ -117,14 +109,10 @@ def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
 
 def _tag_wavelengths(file: Any, image: CogImage) -> None:
     """Write each band's wavelength and width in GDAL's domain IMAGERY [um], and as its ENVI driver has them [nm]."""
-    if image.wavelength_nm is None:
-        return
-    widths = [None] * len(image.bands) if image.fwhm_nm is None else image.fwhm_nm
-    for band, (centre, width) in enumerate(zip(image.wavelength_nm, widths, strict=True), start=1):
-        own = {"CENTRAL_WAVELENGTH_UM": f"{centre / 1000:.9g}"}
-        usual = {"wavelength": f"{centre:.9g}", "wavelength_units": "Nanometers"}
-        if width is not None:
-            own["FWHM_UM"] = f"{width / 1000:.9g}"
-            usual["fwhm"] = f"{width:.9g}"
-        file.update_tags(band, ns="IMAGERY", **own)
-        file.update_tags(band, **usual)
+    facts = {"wavelength": ("CENTRAL_WAVELENGTH_UM", image.wavelength_nm), "fwhm": ("FWHM_UM", image.fwhm_nm)}
+    for name, (own, lengths) in facts.items():
+        for band, length in enumerate(() if lengths is None else lengths, start=1):
+            file.update_tags(band, ns="IMAGERY", **{own: f"{length / 1000:.9g}"})
+            file.update_tags(band, **{name: f"{length:.9g}", "wavelength_units": "Nanometers"})
+    for band, detector in enumerate(image.detector, start=1):
+        file.update_tags(band, detector=str(detector))

@@ -1,93 +1,49 @@
 """Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy and .mat.
 
-Axes are found by their names; without names they are y, x and band. Values follow from scale, offset and fill value,
-the place on the earth from a grid mapping.
+Axes are found by their names; without names they are y, x and band. xarray decodes scale, offset, fill value and
+unsigned numbers; the valid range, which it leaves out, is applied here.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.arrays.georeference import find_geobox
-from spectralzoom.storage.readers.cube_sources import (
-    BLOCK_LINES,
-    MOST_RATIO,
+from spectralzoom.storage.readers.array_files import Arrays, FileArray
+from spectralzoom.storage.readers.band_facts import (
+    GOOD_BANDS,
     Bands,
-    CubeSource,
-    Guard,
-    check_claim,
-    check_memory,
-    read_by_chunks,
-    unpacked,
+    are_wavelengths,
+    bad_bands,
+    bad_bands_of_texts,
+    bands_of_numbers,
+    bands_of_texts,
+    is_spectral,
+    letters,
+    wavelength_unit,
+    width_unit,
 )
+from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, Guard, read_by_chunks
+from spectralzoom.storage.readers.places import Place, place_of_dataset
 
-ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
-_ACROSS = ("crosstrack", "across_track")
+_ALONG = ("downtrack", "along_track", "number_of_lines")
+_ACROSS = ("crosstrack", "across_track", "pixels_per_line")
+ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", *_ALONG)
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
-BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
-WAVELENGTHS = (
-    *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
-    *("wl", "lambda", "nm"),
-)
-METRES = {"m", "meter", "meters", "metre", "metres"}
+BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel", "channels", "spectral")
 
 UNNAMED = "dims have no names, read as y, x, band"
+MOST_UNEVEN = 16  # times that a picture is longer than wide
 _SHOWN = 5  # arrays in a note
-
-
-@dataclass(frozen=True)
-class FileArray:
-    """One array of a file: its axes, attributes, and the function that reads a part of it.
-
-    ``_ARRAY_DIMENSIONS`` in its attributes are the names of its axes, if they have names.
-    """
-
-    where: str  # address, for messages
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    attrs: Mapping[str, Any]
-    get: Callable[[Any], NDArray[Any]] = field(repr=False)
-    chunks: tuple[int, ...]  # numbers along each axis that are read at a time
-    stored: int  # bytes on the disk that it may take
-    ratio: int = MOST_RATIO  # bytes of numbers that one of them can be
-    lost: str = ""  # note on parts without a file
-
-    @property
-    def ndim(self) -> int:
-        return len(self.shape)
-
-    @property
-    def dims(self) -> list[str]:
-        """Return the names of the axes; empty if there are none."""
-        named = self.attrs.get("_ARRAY_DIMENSIONS")
-        return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
-
-    def __getitem__(self, part: Any) -> NDArray[Any]:
-        if part is ...:
-            self.check(self.shape)
-        return self.get(part)
-
-    def check(self, part: Sequence[int]) -> None:
-        """Refuse an array that its file, or a ``part`` of it that the memory, cannot hold (SceneError)."""
-        claimed = max(math.prod(self.shape), math.prod(self.chunks)) * self.dtype.itemsize
-        check_claim(self.where, claimed, self.stored, self.ratio)
-        needed = self.dtype.itemsize
-        for size, chunk, wanted in zip(self.shape, self.chunks, part, strict=True):
-            needed *= min(-(-wanted // chunk) + 1, -(-size // chunk)) * chunk
-        check_memory(self.where, needed)
-
-
-Arrays = Mapping[str, FileArray]  # by name, or by path within a file
 
 
 @dataclass(frozen=True)
@@ -100,9 +56,9 @@ class ArrayCube:
     notes: tuple[str, ...] = ()
 
     @property
-    def dims(self) -> list[str]:
+    def dims(self) -> Sequence[str]:
         """Return names of all axes, or those of their order if they have none."""
-        return self.array.dims or ["y", "x", "band"]
+        return self.array.dims or ("y", "x", "band")
 
 
 def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
@@ -119,22 +75,13 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool 
 def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any], guard: Guard) -> CubeSource:
     """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
 
-    Lines of an array with scale or offset are float32, NaN where there is no value. So are whole numbers with a valid
-    range but no fill value. Raises SceneError: the cube claims more than its file or the memory can hold.
+    Packed lines are float32, NaN where there is no value. Whole numbers with one fill value and no valid range stay
+    whole. Raises SceneError: the cube claims more than its file or the memory can hold.
     """
     array, order = cube.array, cube.order
     array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
-    scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
-    unsigned = array.dtype.kind == "i" and str(array.attrs.get("_Unsigned", "")).lower() == "true"
-    stored = np.dtype(f"u{array.dtype.itemsize}") if unsigned else array.dtype.newbyteorder("=")
-    given = [np.ravel(array.attrs[name]) for name in ("_FillValue", "missing_value") if name in array.attrs]
-    given = [one for one in given if one.dtype.kind in "iuf"]
-    missing = list(dict.fromkeys(float(number) for one in given for number in _as_stored(one, stored)))
-    fill = missing[0] if missing else None
-    low, high = _valid_range(array.attrs, stored)
-    checked = len(missing) > 1 or (low, high) != (-np.inf, np.inf)
-    plain = scale in (None, 1.0) and offset in (None, 0.0)
-    plain = plain and (stored.kind == "f" or fill is not None or not checked)  # whole numbers have no NaN
+    about = _packing_of(array.attrs)
+    values = _Values.of(about, array.dtype.newbyteorder("="))
     sizes = [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
@@ -143,57 +90,189 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
         selection[order[0]] = slice(start, stop)
         with guard():
             block = np.transpose(np.asarray(array[tuple(selection)]), order)
-        native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
-        native = (native[..., None] if native.ndim == 2 else native).view(stored)
-        out = (native < low) | (native > high) | np.isin(native, missing[1:]) if checked else np.False_
-        if not plain:
-            values = unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
-            return np.where(out, np.float32(np.nan), values) if checked else values
-        return np.where(out, stored.type(np.nan if fill is None else fill), native) if out.any() else native
+            native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
+            native = native[..., None] if native.ndim == 2 else native
+            return values.of_numbers(native)
 
-    dims = cube.dims[order[0]], cube.dims[order[1]]
-    geobox, notes = place_or_note(lambda: find_geobox(attributes, arrays, (sizes[0], sizes[1]), dims))
+    bands = _bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1)
+    with guard():
+        geobox, notes = _place_of(cube, arrays, attributes)
     return CubeSource(
         name=path.name,
         shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
-        dtype=stored if plain else np.dtype(np.float32),
+        dtype=values.dtype,
         read=read_by_chunks(read, sizes[0], array.chunks[order[0]]),
         files=(path,),
-        bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
-        nodata=fill if plain else None,
+        bands=bands,
+        nodata=values.nodata,
         geobox=geobox,
-        scaling=f"{stored} without {missing}, {low} to {high}" if unsigned or checked else "",
-        notes=(*cube.notes, *notes),
+        scaling="" if values.plain else json.dumps({key: np.ravel(one).tolist() for key, one in sorted(about.items())}),
+        notes=(*array.notes, *cube.notes, *notes, *bands.notes),
     )
 
 
-def place_or_note(find: Callable[[], GeoBox | None]) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return a place, or a note on why it cannot be read."""
-    try:
-        return find(), ()
-    except Exception as error:  # of PROJ, too
-        return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
+_CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
+_FILLS = ("_FillValue", "missing_value")
+_ENDS = ("valid_range", "valid_min", "valid_max")
+
+
+def _packing_of(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of packing that can be used: numbers, and _Unsigned."""
+    known = {name: attributes[name] for name in (*_FILLS, *_ENDS) if name in attributes}
+    known = {name: value for name, value in known.items() if np.asarray(value).dtype.kind in "iuf"}
+    factors = {name: np.ravel(attributes[name]) for name in _CODED[:2] if name in attributes}
+    known |= {name: np.float64(one[0]) for name, one in factors.items() if one.size == 1 and one.dtype.kind in "iuf"}
+    if "_Unsigned" in attributes:
+        known["_Unsigned"] = str(attributes["_Unsigned"]).lower()
+    return known
+
+
+@dataclass(frozen=True)
+class _Values:
+    """How the numbers of a file become values."""
+
+    stored: np.dtype[Any]
+    coded: Mapping[str, Any]
+    fills: tuple[float, ...]  # as values
+    low: float | None
+    high: float | None
+
+    @classmethod
+    def of(cls, about: Mapping[str, Any], stored: np.dtype[Any]) -> _Values:
+        """Return the rule by the attributes of an array."""
+        coded = {name: about[name] for name in _CODED if name in about}
+        if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
+            coded = {name: value for name, value in coded.items() if name == "_Unsigned"}
+        listed = [number for name in _FILLS for number in np.ravel(about.get(name, ()))]
+        fills = [_as_value(number, coded, stored) for number in listed]
+        pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
+        pair = pair if np.size(pair) == 2 else (None, None)
+        ends = [None if end is None else _end_as_value(end, coded, stored) for end in pair]
+        low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
+        return cls(stored, coded, tuple(dict.fromkeys(one for one in fills if one is not None)), low, high)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the numbers are the values, with one no-data value at most."""
+        return not self.coded and len(self.fills) < 2 and self.low is None and self.high is None
+
+    @property
+    def whole(self) -> bool:
+        """Whether values are whole numbers; without a no-data value those out of the valid range would be lost."""
+        has_nodata = bool(self.fills) or (self.low is None and self.high is None)
+        return self.stored.kind in "biu" and not set(self.coded) - {"_Unsigned"} and has_nodata
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        as_stored = self.plain or self.whole
+        return _decoded(np.zeros(1, self.stored), self.coded).dtype if as_stored else np.dtype(np.float32)
+
+    @property
+    def nodata(self) -> float | None:
+        """Return the no-data value; None where NaN stands for it."""
+        return self.fills[0] if self.fills and (self.plain or self.whole) else None
+
+    def of_numbers(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Return values of `dtype`; the no-data value, or NaN without one, where a number is no value."""
+        if self.plain:
+            return numbers
+        values = _decoded(numbers, self.coded)
+        with np.errstate(invalid="ignore"):
+            out = np.isin(values, self.fills[1:] if self.whole else self.fills)
+            out |= False if self.low is None else values < self.low
+            out |= False if self.high is None else values > self.high
+        values = values.astype(self.dtype, copy=False)
+        void = np.nan if self.nodata is None else self.nodata
+        return np.where(out, values.dtype.type(void), values) if out.any() else values
+
+
+def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
+    """Return numbers of a file as values, decoded by xarray."""
+    packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
+    return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
+
+
+def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
+    """Return a number of an attribute as the value that it stands for; None where the file cannot hold it."""
+    if stored.kind == "f":
+        return float(number)
+    if not np.isfinite(number) or int(number) != number:
+        return None
+    held, limits = int(number), np.iinfo(stored)
+    if "_Unsigned" in coded and not limits.min <= held <= limits.max:  # written with the other sign
+        held = (held - int(limits.min)) % 2 ** (8 * stored.itemsize) + int(limits.min)
+    if not limits.min <= held <= limits.max:
+        return None
+    return float(_decoded(np.array([held], stored), coded)[0])
+
+
+def _end_as_value(end: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
+    """Return an end of the valid range as a value; None if it leaves nothing out.
+
+    Floating ends of whole numbers with a scale are values, others are packed as the numbers are (NetCDF Users Guide,
+    Attribute Conventions).
+    """
+    if stored.kind in "biu" and np.asarray(end).dtype.kind == "f" and set(coded) - {"_Unsigned"}:
+        return float(end)
+    return _as_value(end, coded, stored)
+
+
+def _place_of(cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any]) -> Place:
+    """Return the place of a cube by the arrays beside it, of which only coordinates along its axes are read."""
+    dims = [dim or f"axis {at}" for at, dim in enumerate(cube.dims[: cube.array.ndim])]
+    sizes = dict(zip(dims, cube.array.shape, strict=True))
+    read: dict[str, xr.Variable] = {}
+    named: dict[str, xr.Variable] = {}
+    for name, one in arrays.items():
+        axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if name.lower() in words), None)
+        by_name = name if name in dims or axis is None else dims[cube.order[axis]]
+        own = one.dims or (by_name,) * one.ndim  # a scale of HDF5 is its own axis
+        fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
+        if one.ndim < 2 and fits and one.dtype.kind in "iuf":
+            plain = {key: value for key, value in one.attrs.items() if key not in (*_CODED, *_FILLS, *_ENDS)}
+            read[name] = xr.Variable(own, one[...], plain | _packing_of(one.attrs))
+        else:
+            own = tuple(dims) if name == cube.name else tuple(f"{name} {axis}" for axis in range(one.ndim))
+            named[name] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
+    dataset = xr.decode_cf(xr.Dataset(read, attrs=dict(attributes)), decode_times=False, decode_coords=False)
+    return place_of_dataset(dataset.assign(named), cube.name, (dims[cube.order[0]], dims[cube.order[1]]))
 
 
 def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
-    """Return wavelengths and widths in nm; none if their unit is no length."""
+    """Return wavelengths and widths by arrays of such names, the axis of the bands or attributes, or all reasons."""
     axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
-    found = _vector(arrays, WAVELENGTHS, count)
-    if found is None and _is_line(arrays, axis, count) and _is_spectral(arrays[axis]):
-        found = axis
-    if found is None:
-        return Bands()
-    centres = np.asarray(arrays[found][...], np.float64).ravel()
-    unit = _unit(arrays[found].attrs)
-    known = {**dict.fromkeys(NANOMETRES, 1.0), **dict.fromkeys(MICROMETRES, 1000.0), **dict.fromkeys(METRES, 1e9)}
-    scale = (1000.0 if centres.max() <= 20 else 1.0) if unit in UNSAID else known.get(unit)  # [nm]
-    if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
-        return Bands()
-    source = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
-    beside = _vector(arrays, ("fwhm",), count)
-    widths = None if beside is None else np.asarray(arrays[beside][...], np.float64).ravel() * scale
-    widths = None if widths is None or not (widths > 0).all() else widths
-    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {source}")
+    named = sorted(
+        (name for name in arrays if wavelength_unit(_word(name)) is not None), key=lambda one: len(_word(one))
+    )
+    named += [axis] if axis in arrays and is_spectral(arrays[axis].attrs) else []
+    beside = next(
+        (name for name in arrays if width_unit(_word(name)) is not None and _is_line(arrays, name, count)), ""
+    )
+    widths = (arrays[beside][...], _unit(arrays[beside].attrs) or width_unit(_word(beside))) if beside else ()
+    notes: list[str] = []
+    for name in dict.fromkeys(named):
+        if not _is_line(arrays, name, count):
+            notes.append(f"the array {name} is left out: it has shape {arrays[name].shape} for {count} bands")
+            continue
+        unit = _unit(arrays[name].attrs) or wavelength_unit(_word(name))
+        found = bands_of_numbers(arrays[name][...], unit, f"wavelengths from the array {name}", *widths)
+        if found.wavelength_nm is not None:
+            return found
+        notes += found.notes
+    if not named and _is_line(arrays, axis, count) and are_wavelengths(centres := np.asarray(arrays[axis][...], float)):
+        return bands_of_numbers(centres, "", f"wavelengths from the array {axis}")
+    about = cube.array.attrs.items()
+    usable = {key: one for key, one in about if isinstance(one, str) or np.asarray(one).dtype.kind in "iuf"}
+    found = bands_of_texts(usable, _names_of(arrays, (axis, "band_names", "band_name"), count), cube.name)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | None]:
+    """Return the texts, one a band, of the first array of texts that has one of the names; None each without one."""
+    listed = [arrays[name] for name in names if name in arrays]
+    texts = next((one for one in listed if one.shape == (count,) and one.dtype.kind in "SOUT"), None)
+    each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
+    return [None if one is None else np.asarray(one).astype(str).item() for one in each]
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
@@ -231,7 +310,9 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
         )
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS) or dim in arrays for dim in named):
-        counts = {math.prod(one.shape) for key, one in arrays.items() if one.ndim and _word(key) in WAVELENGTHS}
+        counts = {
+            math.prod(one.shape) for key, one in arrays.items() if one.ndim and wavelength_unit(_word(key)) is not None
+        }
         if array.ndim == 3 and counts & set(array.shape[:2]) and array.shape[2] not in counts:
             raise SceneError(
                 f"{path} holds shape {array.shape} without names of its axes and {max(counts)} wavelengths; expected"
@@ -240,52 +321,53 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple
         return tuple(range(array.ndim)), (UNNAMED,)
     words = [_word(dim) for dim in named]
     found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
-    found[2] = found[2] or [at for at, dim in enumerate(named) if _is_spectral(arrays.get(dim))]
+    found[2] = found[2] or [at for at, dim in enumerate(named) if dim in arrays and is_spectral(arrays[dim].attrs)]
     if any(len(places) != 1 for places in found[: array.ndim]) or (array.ndim == 2 and found[2]):
         raise SceneError(f"{path} has dims {', '.join(named)}; expected y, x, band (or band, y, x); rename them")
     return tuple(places[0] for places in found[: array.ndim]), ()
 
 
-def _is_spectral(coordinate: FileArray | None) -> bool:
-    """Return whether a coordinate has wavelengths, by its standard name or unit."""
-    if coordinate is None or coordinate.ndim != 1:
-        return False
-    return coordinate.attrs.get("standard_name") in WAVELENGTHS or _unit(coordinate.attrs) in NANOMETRES | MICROMETRES
-
-
-def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:
-    """Return the first array of ``count`` numbers that has one of the names, in their order."""
-    found = (name for word in words for name in arrays if _word(name) == word and _is_line(arrays, name, count))
-    return next(found, None)
-
-
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
     """Return whether an array has ``count`` numbers along one of its axes."""
     shape = arrays[name].shape if name in arrays else ()
-    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
+    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "buif"
 
 
 def _word(name: str) -> str:
     return name.rpartition("/")[2].lower()
 
 
-def _valid_range(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[float, float]:
-    """Return the smallest and largest valid number of an array, before scale and offset."""
-    pair = attributes.get("valid_range", (attributes.get("valid_min"), attributes.get("valid_max")))
-    ends = [None if one is None else np.ravel(one) for one in pair] if np.size(pair) == 2 else [None, None]
-    low, high = (None if one is None or one.dtype.kind not in "iuf" else _as_stored(one, stored)[0] for one in ends)
-    return -np.inf if low is None else float(low), np.inf if high is None else float(high)
-
-
-def _as_stored(numbers: NDArray[Any], stored: np.dtype[Any]) -> NDArray[Any]:
-    """Return numbers of an attribute as those of an unsigned array that is stored with a sign."""
-    signed = stored.kind == "u" and numbers.dtype.kind == "i" and (numbers < 0).any()
-    return numbers % 2 ** (8 * stored.itemsize) if signed else numbers
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
 def _unit(attributes: Mapping[str, Any]) -> str:
     return str(attributes.get("units", attributes.get("unit", ""))).strip().lower()
+
+
+def check_picture(shape: tuple[int, ...], where: object) -> None:
+    """Refuse a scene of one band that is a table of spectra (SceneError)."""
+    if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
+        return
+    turned = ".T" if shape[0] < shape[1] else ""
+    raise SceneError(
+        f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
+        f" If its {'columns' if turned else 'rows'} are spectra, store a cube: numpy.reshape(values{turned}, "
+        f"(height, width, {min(shape)}), order='F'), or order='C' if pixels go along the rows"
+    )
+
+
+def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
+    """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
+    groups = name.split("/")[:-1]
+    heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
+    return {
+        path.removeprefix(head): array
+        for head in heads
+        for path, array in arrays.items()
+        if path.startswith(head) and "/" not in path.removeprefix(head)
+    } | {path: array for path, array in arrays.items() if "/" in path}
+
+
+def marked_bands(cube: ArrayCube, arrays: Arrays, count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the bands (from 0) that an array or an attribute of good bands marks by 0, and notes."""
+    for name, array in arrays.items():
+        if letters(_word(name)) in GOOD_BANDS and _is_line(arrays, name, count):
+            return bad_bands(array[...], count, name)
+    return bad_bands_of_texts(cube.array.attrs, count)

@@ -1,61 +1,109 @@
-"""List the arrays of .npy, .mat, NetCDF and HDF5 files.
+"""List the arrays of .npy, .mat, NetCDF, HDF5 and Zarr by their headers; only the array wanted is read.
 
-Files are listed by their headers, and only the array wanted is read. Python objects, cells and structures are not read,
-nor links and virtual arrays of HDF5, which may lead to any file. EMIT's files follow CF, except for wavelengths and
-good bands, which lie in a group of their own.
+Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file. A
+Zarr store is checked before it is opened: links out of it and codecs other than those of numbers are refused.
 """
 
 from __future__ import annotations
 
+import base64
 import importlib
+import math
 import mmap
+import os
+import struct
 import warnings
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import xarray as xr
+import zarr
 from numpy.typing import NDArray
+from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.array_cubes import Arrays, FileArray
-from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO
+from spectralzoom.storage.readers.checked_chunks import WIDEST, CheckedStore, outside_links, read_hdf5, unpack
+from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
+from spectralzoom.storage.readers.own_files import within
 
 ARRAY_ENDINGS = (".npy", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
-GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
-MOST_UNEVEN = 16  # times that a picture is longer than wide
+METADATA = ("zarr.json", ".zarray", ".zgroup")
+_CLASSIC = b"CDF"  # with which NetCDF 3 begins
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
+_SIZES = (("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("lines", "samples"), ("height", "width"))
+_MAT_MATRIX, _MAT_PACKED = 14, 15  # kinds of elements
+_MAT_HEAD = 4096  # bytes for sizes and name of an array
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
-def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Return the arrays of a file by their names or paths, and the attributes of the file.
+@dataclass(frozen=True)
+class FileArray:
+    """One array of a file: its axes, attributes, and the function that reads a part of it."""
 
-    Raises SceneError: it is a NetCDF file of version 3; other errors are those of the libraries.
+    where: str  # address, for messages
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    attrs: Mapping[str, Any]
+    get: Callable[[Any], NDArray[Any]] = field(repr=False)
+    chunks: tuple[int, ...]  # numbers along each axis that are read at a time
+    stored: int  # bytes on the disk that it may take
+    dims: tuple[str, ...] = ()  # names of the axes; empty if there are none
+    ratio: int = MOST_RATIO  # bytes of numbers that one of them can be
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        if part is ...:
+            self.check(self.shape)
+        return self.get(part)
+
+    def check(self, part: Sequence[int]) -> None:
+        """Refuse an array that its file, or a ``part`` of it that the memory, cannot hold (SceneError)."""
+        claimed = max(math.prod(self.shape), math.prod(self.chunks)) * self.dtype.itemsize
+        check_claim(self.where, claimed, self.stored, self.ratio)
+        needed = self.dtype.itemsize
+        for size, chunk, wanted in zip(self.shape, self.chunks, part, strict=True):
+            needed *= min(-(-wanted // chunk) + 1, -(-size // chunk)) * chunk
+        check_memory(self.where, needed)
+
+
+Arrays = Mapping[str, FileArray]  # by name, or by path within a file; "" is an array without a name
+
+
+def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Return the arrays of a file or Zarr store by their names or paths, and the attributes of the file.
+
+    Raises SceneError: as the readers of each kind; other errors are those of the libraries.
     """
     ending = path.suffix.lower()
+    if path.is_dir():
+        return _zarr_arrays(path)
     if ending == ".npy":
         values = load_npy(path)
         each = (1,) * values.ndim
         return {"": FileArray(str(path), values.shape, values.dtype, {}, values.__getitem__, each, values.nbytes)}, {}
-    if not h5py.is_hdf5(path):
-        if ending == ".mat":
-            return _mat_arrays(path), {}
-        raise SceneError(
-            f"{path} cannot be read as NetCDF or HDF5: it does not begin as HDF5; copy it again, or if it is NetCDF 3, "
-            "write it as NetCDF 4 (nccopy -k nc4)"
-        )
-    arrays, attributes = _hdf_arrays(path)
+    if h5py.is_hdf5(path):
+        arrays, attributes = _hdf_arrays(path)
+        return (_matlab_order(arrays), {}) if ending == ".mat" else (arrays, attributes)
     if ending == ".mat":
-        numbers = {name: one for name, one in arrays.items() if "/" not in name and one.dtype.kind in "buif"}
-        return {name: _transposed(one) for name, one in numbers.items() if one.attrs.get("MATLAB_class") != "char"}, {}
-    return arrays, attributes
+        return as_pictures(_mat_arrays(path)), {}
+    with path.open("rb") as file:
+        if file.read(len(_CLASSIC)) == _CLASSIC:
+            return _classic_arrays(path)
+    raise SceneError(f"{path} cannot be read as NetCDF or HDF5: it begins as neither; copy it again")
 
 
 def load_npy(path: Path) -> NDArray[Any]:
@@ -68,30 +116,72 @@ def _whole(
 ) -> FileArray:
     """Return an array that is always read whole."""
     chunks = tuple(max(size, 1) for size in shape)
-    return FileArray(where, shape, kind, {}, lambda part: load()[part], chunks, stored, ratio)
+    return FileArray(where, shape, kind, {}, lambda part: load()[part], chunks, stored, ratio=ratio)
 
 
 def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str, kind: str) -> NDArray[Any]:
+    def load(name: str, number: int, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
+        most = 2 * WIDEST * math.prod(shape) + _MAT_HEAD  # complex numbers are two
         with _mapped(path) as content:
-            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
+            values = np.asarray(scipy_io.loadmat(_plain_mat(content, most, number), variable_names=[name])[name])
         if np.iscomplexobj(values):
             raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
         return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
-        listed = scipy_io.whosmat(content)
+        listed = scipy_io.whosmat(_plain_mat(content, _MAT_HEAD))
     size = path.stat().st_size
-    ratio = 8 * DEFLATE_RATIO  # a double may be one byte
-    return {
-        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, ratio)
-        for name, shape, kind in listed
-        if kind in _MATLAB
-    }
+    found: dict[str, FileArray] = {}
+    for number, (name, shape, kind) in enumerate(listed):
+        if kind in _MATLAB:
+            read = partial(load, name, number, shape, kind)
+            ratio = 8 * DEFLATE_RATIO  # a double may be one byte
+            found[name] = _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), read, size, ratio)
+    return found
+
+
+def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> mmap.mmap:
+    """Return a .mat file without packing: the first ``most`` bytes of each element, or all of the ``wanted`` one.
+
+    ValueError: the wanted element has more of them.
+    """
+    if 0 in content[:4]:  # version 4 packs nothing
+        return content
+    parts = [content[:128]]
+    order = "<II" if content[126:128] == b"IM" else ">II"
+    at, number = 128, 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack(order, content[at : at + 8])
+        if wanted in (None, number):
+            body = content[at + 8 : at + 8 + (size if kind == _MAT_PACKED else min(size, most))]
+            if kind == _MAT_PACKED:
+                plain = zlib.decompressobj().decompress(body, most) if wanted is None else unpack("zlib", body, most)
+                kind, body = _MAT_MATRIX, plain[8:]
+            _check_parts(body, order, 3 if wanted is None else 5)  # flags, sizes and name, and numbers
+            parts += [struct.pack(order, kind, len(body)), body]
+        at += 8 + size
+        number += 1
+    whole = b"".join(parts)
+    plain_file = mmap.mmap(-1, len(whole))
+    plain_file.write(whole)
+    plain_file.seek(0)
+    return plain_file
+
+
+def _check_parts(body: bytes, order: str, count: int) -> None:
+    """Refuse an element of which one of the first parts claims more bytes than it has (ValueError)."""
+    at = 0
+    for _ in range(count):
+        if at + 8 <= len(body):
+            kind, size = struct.unpack(order, body[at : at + 8])
+            size = 0 if kind >> 16 else size  # up to four bytes lie within the eight
+            if size > len(body) - at - 8:
+                raise ValueError(f"a part of an array claims {size} bytes, and {len(body) - at - 8} are there")
+            at += 8 + -(-size // 8) * 8
 
 
 @contextmanager
@@ -101,81 +191,181 @@ def _mapped(path: Path) -> Iterator[mmap.mmap]:
         yield content
 
 
-def _transposed(one: FileArray) -> FileArray:
-    """Return an array of a .mat file of version 7.3 with the axes in MATLAB's order."""
-    return _whole(one.where, one.shape[::-1], one.dtype, lambda: one[...].T, one.stored, one.ratio)
+def _matlab_order(arrays: Arrays) -> dict[str, FileArray]:
+    """Return the arrays of numbers of a .mat file of version 7.3 with the axes in MATLAB's order."""
+    numbers = {name: one for name, one in arrays.items() if "/" not in name and one.dtype.kind in "buif"}
+    plain = {name: one for name, one in numbers.items() if one.attrs.get("MATLAB_class") != "char"}
+
+    def turned(one: FileArray) -> FileArray:
+        return _whole(one.where, one.shape[::-1], one.dtype, lambda: one[...].T, one.stored, one.ratio)
+
+    return as_pictures({name: turned(one) for name, one in plain.items()})
 
 
-def check_picture(shape: tuple[int, ...], where: object) -> None:
-    """Refuse a scene of one band that is a table of spectra (SceneError)."""
-    if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
-        return
-    turned = ".T" if shape[0] < shape[1] else ""
-    raise SceneError(
-        f"{where} is a table of {shape[0]} x {shape[1]} numbers, expected a picture (y, x) or a cube (y, x, band)."
-        f" If its {'columns' if turned else 'rows'} are spectra, store a cube: numpy.reshape(values{turned}, "
-        f"(height, width, {min(shape)}), order='F'), or order='C' if pixels go along the rows"
-    )
+def as_pictures(arrays: dict[str, FileArray]) -> dict[str, FileArray]:
+    """Return the arrays with tables (band, pixel) or (pixel, band) as cubes, where nRow and nCol stand beside them.
+
+    Pixels go down the columns, as MATLAB stores them. Arrays of one pixel a band are turned too: labels (1, pixel).
+    """
+    words = {name.lower().replace("_", ""): one for name, one in arrays.items() if math.prod(one.shape) == 1}
+    pair = next((names for names in _SIZES if set(names) <= set(words)), None)
+    if pair is None:
+        return arrays
+    height, width = (float(words[name][...].item()) for name in pair)
+    if not (height.is_integer() and width.is_integer() and min(height, width) > 0):
+        return arrays
+    shape = int(height), int(width)
+    tables = {name: one for name, one in arrays.items() if one.ndim == 2 and math.prod(shape) in one.shape}
+    return {**arrays, **{name: _as_picture(one, shape) for name, one in tables.items() if one.shape != shape}}
+
+
+def _as_picture(table: FileArray, shape: tuple[int, int]) -> FileArray:
+    """Return a table of spectra as a cube (y, x, band)."""
+    pixels = shape[0] * shape[1]
+    bands_first = table.shape[1] == pixels
+    bands = table.shape[0] if bands_first else table.shape[1]
+
+    def load() -> NDArray[Any]:
+        values = table[...].T if bands_first else table[...]
+        return values.reshape(*shape, bands, order="F")
+
+    order = "(band, pixel)" if bands_first else "(pixel, band)"
+    note = f"a table {order} of {shape[0]} x {shape[1]} px (y x x), as the sizes beside it say; pixels go down columns"
+    cube = _whole(table.where, (*shape, bands), table.dtype, load, table.stored, table.ratio)
+    return replace(cube, notes=(note,))
+
+
+def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """List the arrays of a NetCDF file of version 3."""
+    with xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False) as opened:
+        listed, attributes = {str(name): one for name, one in opened.variables.items()}, dict(opened.attrs)
+
+    def read(name: str, part: Any) -> NDArray[Any]:
+        with xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False) as file:
+            return np.asarray(file.variables[name][part].values)
+
+    size = path.stat().st_size
+    return {
+        name: FileArray(
+            f"{path}:{name}",
+            one.shape,
+            one.dtype,
+            dict(one.attrs),
+            partial(read, name),
+            (1,) * one.ndim,
+            size,
+            tuple(map(str, one.dims)),
+        )
+        for name, one in listed.items()
+    }, attributes
 
 
 def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Return the arrays of an HDF5 file by their paths, and the attributes of its root."""
+    """List the arrays of an HDF5 file by their paths."""
     arrays: dict[str, FileArray] = {}
     stored = path.stat().st_size
 
+    def read(name: str, part: Any) -> NDArray[Any]:
+        with h5py.File(path, "r") as file:
+            return read_hdf5(file[name], part)
+
     def visit(name: str, item: Any) -> None:
-        """Add an array of numbers, or a single text such as GDAL's grid mapping."""
+        """Add an array of numbers, a single text such as GDAL's grid mapping, or a list of texts such as band names."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
         about = _plain(item.attrs)
-        is_text = item.dtype.kind in "SO" and not item.ndim
+        is_text = item.dtype.kind in "SO" and item.ndim < 2
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
-            dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
-            attributes = {**about, "_ARRAY_DIMENSIONS": dims} if any(dims) else about
+            dims = tuple(dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims)
             chunks = item.chunks or (1,) * item.ndim
-            read = partial(_read, path, name)
-            arrays[name] = FileArray(f"{path}:{name}", item.shape, item.dtype, attributes, read, chunks, stored)
+            named = dims if any(dims) else ()
+            where = f"{path}:{name}"
+            arrays[name] = FileArray(where, item.shape, item.dtype, about, partial(read, name), chunks, stored, named)
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone
+        if not any(one.ndim > 1 for one in arrays.values()) and (led := outside_links(file)):
+            raise SceneError(f"{path}: {led[0]}, which is not followed; copy what it leads to into the file (h5copy)")
         return arrays, _plain(file.attrs)
 
 
-def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
-    with h5py.File(path, "r") as file:
-        return np.asarray(file[name][part])
-
-
 def _plain(attributes: Any) -> dict[str, Any]:
-    """Return the attributes that can be read as Python's own texts and numbers, lists as arrays."""
+    """Return the attributes that can be read, texts as str and single numbers without an axis."""
     found = {}
     for name in attributes:
         try:
             value = attributes[name]
         except Exception:  # of a type that h5py does not know
             continue
-        if isinstance(value, np.ndarray | np.generic) and value.size == 1:
-            value = np.asarray(value).reshape(-1)[0]
-            value = value.item() if isinstance(value, np.generic) else value
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(-1)[0]
         found[str(name)] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
     return found
 
 
-def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
-    """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
-    groups = name.split("/")[:-1]
-    heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
-    return {
-        path.removeprefix(head): array
-        for head in heads
-        for path, array in arrays.items()
-        if path.startswith(head) and "/" not in path.removeprefix(head)
-    } | {path: array for path, array in arrays.items() if "/" in path}
+def find_zarr_store(path: Path) -> Path | None:
+    """Return the Zarr store at a path, or the ``cube.zarr`` in it."""
+    for folder in (path, path / "cube.zarr"):
+        if any((folder / name).is_file() for name in METADATA):
+            return within(path, folder)
+    return None
 
 
-def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:
-    """Return the bands (from 0) that a list of good bands marks by 0."""
-    for name, array in arrays.items():
-        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
-            return tuple(np.flatnonzero(array[...] == 0).tolist())
-    return ()
+def _zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """List the arrays of a store (SceneError: a codec is not allowed, a link leads out, or it is a survey's own)."""
+    _check_store(path)
+    node = zarr.open(CheckedStore(LocalStore(path, read_only=True)), mode="r")
+    if not isinstance(node, zarr.Group):
+        return {"": _zarr_array(path, node)}, {}
+    if "sweep" in node.attrs:
+        raise SceneError(f"{path} holds raw lines of a survey, which are on no map yet; survey them as --sweeps {path}")
+    if {"scores", "axes"} <= set(node.array_keys()):
+        raise SceneError(
+            f"{path} holds components of spectra; `spectralzoom export` writes its reflectance as an image, and "
+            "spectralzoom.open(ARCHIVE).latest.cube opens it in Python"
+        )
+    return {name: _zarr_array(path / name, array) for name, array in node.arrays()}, dict(node.attrs)
+
+
+def lost_chunks(array: zarr.Array[Any]) -> tuple[int, int]:
+    """Return how many chunks, or shards of chunks, have no file, of how many: zarr reads its fill value for them."""
+    shard = array.shards or array.chunks
+    count = math.prod(-(-size // one) for size, one in zip(array.shape, shard, strict=True))
+    return count - array.nchunks_initialized * math.prod(array.chunks) // math.prod(shard), count
+
+
+def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
+    """Return an array of a store, with its no-data value as CF, xarray or Zarr has it."""
+    about = dict(array.attrs)
+    named: Any = getattr(array.metadata, "dimension_names", None) or about.pop("_ARRAY_DIMENSIONS", ())
+    fill = about.get("_FillValue")
+    kind = array.dtype.kind
+    if isinstance(fill, str) and kind == "f":  # of Zarr v3
+        about["_FillValue"] = float(struct.unpack("<d", base64.standard_b64decode(fill))[0])
+    elif fill is None and array.metadata.zarr_format == 2 and named and kind in "buif" and array.fill_value is not None:
+        about["_FillValue"] = float(array.fill_value)  # xarray's of v2
+    held = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    lost, count = lost_chunks(array)
+    note = f"{path.name}: {lost} of {count} chunks have no file, and are read as {array.fill_value}"
+    dims = tuple("" if one is None else str(one) for one in named)
+    return FileArray(
+        str(path),
+        array.shape,
+        array.dtype,
+        about,
+        lambda part: np.asarray(array[part]),
+        array.chunks,
+        held,
+        dims,
+        notes=(note,) if lost else (),
+    )
+
+
+def _check_store(path: Path) -> None:
+    """Refuse links out of the store and special files (SceneError)."""
+    for place, folders, files in os.walk(path):
+        for entry in (Path(place, name) for name in (*folders, *files)):
+            if entry.is_symlink():
+                within(path, entry)
+            if entry.name in files and not entry.is_file():  # reading a pipe may never end
+                raise SceneError(f"{entry} is no file; take it out of the store")

@@ -15,12 +15,18 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
+import odc.geo.xr as odc_xr
+import xarray as xr
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.pipeline.source import References
+from spectralzoom.storage.readers.band_facts import Bands
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
@@ -72,6 +78,7 @@ def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None
 
 
 BLOCK_LINES = 64
+DIMS = ("y", "x", "band")
 MOST_MISSING = 1 << 14  # lines that a cube may claim beyond those in its file
 
 ReadLines = Callable[[int, int], NDArray[Any]]
@@ -88,15 +95,6 @@ class LineFacts:
 
 
 @dataclass(frozen=True)
-class Bands:
-    """Facts of the bands; None if not known."""
-
-    wavelength_nm: NDArray[np.float64] | None = None  # (band,)
-    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
-    origin: str = ""  # one sentence
-
-
-@dataclass(frozen=True)
 class CubeSource:
     """An open cube. ``read(start, stop)`` returns lines (line, sample, band) of ``dtype`` in native byte order."""
 
@@ -109,10 +107,13 @@ class CubeSource:
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
+    white_ms: float | None = None  # exposure of the white frame at the gain of the lines; None: that of every line
+    taken: Taken = field(default_factory=Taken)
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
+    acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     notes: tuple[str, ...] = ()
 
@@ -120,6 +121,55 @@ class CubeSource:
     def valid(self) -> NDArray[np.bool_]:
         """Return (line,) whether each line is whole in its file."""
         return np.ones(self.shape[0], np.bool_) if self.lines.valid is None else self.lines.valid
+
+    def data_array(self) -> xr.DataArray:
+        """Return the cube for xarray; values are read when they are needed."""
+        marked = np.isin(np.arange(self.shape[2]), self.bad_bands)
+        facts: dict[str, tuple[str | tuple[str, ...], Any, dict[str, str]]] = {
+            "wavelength": ("band", self.bands.wavelength_nm, {"units": "nm"}),
+            "fwhm": ("band", self.bands.fwhm_nm, {"units": "nm"}),
+            "bad_band": ("band", marked if marked.any() else None, {}),
+            "valid": ("y", self.lines.valid, {}),
+            "time_s": ("y", self.lines.time_s, {"units": "s"}),
+            "exposure_ms": ("y", self.lines.exposure_ms, {"units": "ms"}),
+            "dark": (("x", "band"), self.dark, {}),
+            "white": (("x", "band"), self.white, {}),
+            "void": (("y", "x"), self.void, {}),
+        }
+        known = {name: fact for name, fact in facts.items() if fact[1] is not None}
+        places = {} if self.geobox is None else odc_xr.xr_coords(self.geobox, dims=("y", "x"))
+        about: dict[str, Any] = {
+            "notes": self.notes,
+            "files": tuple(map(str, self.files)),
+            "wavelengths_from": self.bands.origin,
+        }
+        about |= {} if self.nodata is None else {"_FillValue": self.nodata}
+        about |= {} if self.acquired is None else {"acquired": self.acquired}
+        lines = indexing.LazilyIndexedArray(_Lines(self))
+        return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=self.name, attrs=about)
+
+
+class _Lines(BackendArray):
+    """Lines of a cube as xarray asks for them."""
+
+    def __init__(self, source: CubeSource) -> None:
+        self.source, self.shape, self.dtype = source, source.shape, source.dtype
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
+        basic = indexing.IndexingSupport.BASIC
+        return indexing.explicit_indexing_adapter(key, self.shape, basic, self._part)  # type: ignore[no-any-return]
+
+    def _part(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
+        """Return a part by whole numbers and slices."""
+        numbers = range(self.shape[0])[key[0]]
+        if isinstance(numbers, int):
+            return self.source.read(numbers, numbers + 1)[(0, *key[1:])]
+        if not numbers:
+            return np.empty((0, *self.shape[1:]), self.dtype)[(slice(None), *key[1:])]
+        first = min(numbers)
+        block: NDArray[Any] = self.source.read(first, max(numbers) + 1)
+        part: NDArray[Any] = block[np.array(numbers) - first][(slice(None), *key[1:])]
+        return part
 
 
 def check_cube_source(source: CubeSource) -> None:
@@ -182,8 +232,10 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
             return raw
         values = raw.astype(np.float32)
     else:
-        references = References(source.dark, source.white, np.ones(source.shape[2], np.float32))
-        values, usable = calibrate(raw, references, saturated_dn=np.inf)
+        white_reference = np.ones(source.shape[2], np.float32)
+        references = References(source.dark, source.white, white_reference, exposure_ms=source.white_ms)
+        exposure_ms = np.ones(len(raw)) if source.lines.exposure_ms is None else source.lines.exposure_ms[start:stop]
+        values, usable = calibrate(raw, references, saturated_dn=np.inf, exposure_ms=exposure_ms)
         values[~usable] = np.nan
         if source.nodata is not None:
             values[raw == source.nodata] = np.nan

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
 from spectralzoom.pipeline.rig.camera.frame_indices import (
     FRAME_INDEX,
     LONGEST_LINE,
@@ -32,13 +33,16 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     place_parts,
     times_of_lines,
 )
-from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from spectralzoom.storage.readers.image_files import bad_bands, place_of_envi, rescaled
+from spectralzoom.storage.readers.acquired import acquired_of
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts
+from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
+from spectralzoom.storage.readers.image_files import rescaled
+from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
-_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 
 @dataclass(frozen=True)
@@ -105,13 +109,13 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
             raise SceneError(
                 f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
             )
-        return path, data
+        return path, within(path, data)
     names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
     header = next((file for file in map(path.with_name, names) if file.is_file()), None)
     if header is None:
         wanted = " or ".join(dict.fromkeys(names[:2]))
         raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
-    return header, path
+    return within(path, header), path
 
 
 def load_envi_header(path: Path) -> EnviHeader:
@@ -178,7 +182,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     notes: list[str] = []
     opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        data = find_envi_pair(header)[1]
+        data = find_envi_pair(within(folder, header))[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
@@ -191,6 +195,8 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
     starts = place_parts(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
+    if any("map info" in cube.header.fields for cube in opened.values()):
+        notes.append("the map info of its parts is not read: lines of a folder are on no map; name one file")
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
     listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
@@ -201,13 +207,19 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         if number not in indices:
             notes.append(f"there is no frame index for {cube.path.name}")
             continue
-        index = load_frame_index(indices[number])
+        index = load_frame_index(within(folder, indices[number]))
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
     return replace(
         source, files=(*source.files, *indices.values()), lines=_timed(source.lines, times), notes=tuple(notes)
     )
+
+
+def bands_of_header(header: EnviHeader, where: str) -> Bands:
+    """Return (band,) wavelengths and widths of a header, of a library (sample,), or the notes on why there are none."""
+    count = header.samples if "spectral library" in header.kind.lower() else header.bands
+    return bands_of_texts(header.fields, [None] * count, where)
 
 
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
@@ -221,21 +233,21 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     height = last + len(cube.values) + lost
     native = cubes[0].values.dtype.newbyteorder("=")
     valid = np.zeros(height, np.bool_)
-    exposure: NDArray[np.float64] | None = None
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
-        known = finite_number(part.header.settings.get(_EXPOSURE, ""))
-        if known is not None and known > 0:
-            exposure = np.full(height, np.nan) if exposure is None else exposure
-            exposure[start : start + len(part.values)] = known
-    with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
-    bands = Bands()
-    if with_bands is not None:
-        header = with_bands.header
-        bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
+    taken, exposure_ms = _taken(parts, height, notes)
+    of_parts = [bands_of_header(one.header, one.header_path.name) for one in cubes]
+    bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
+    bad, doubts = bad_bands_of_texts(cubes[0].header.fields, count)
+    notes += [*bands.notes, *doubts]
+
+    acquired = acquired_of({**cubes[0].header.settings, **cubes[0].header.fields})
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
+        for begin, part in parts.items():
+            if begin <= start < stop <= begin + len(part.values):
+                return part.values[start - begin : stop - begin].astype(native, order="C")
         block = np.zeros((stop - start, samples, count), native)
         for begin, part in parts.items():
             low, high = max(start, begin), min(stop, begin + len(part.values))
@@ -249,12 +261,36 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         dtype=native,
         read=read,
         files=tuple(file for one in cubes for file in (one.header_path, one.path)),
-        lines=LineFacts(valid, exposure_ms=exposure),
+        lines=LineFacts(valid, exposure_ms=exposure_ms),
+        taken=taken,
         bands=bands,
         nodata=cubes[0].header.nodata,
-        bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
-        notes=tuple(notes),
+        bad_bands=bad,
+        acquired=acquired.text,
+        notes=(*notes, *acquired.notes),
     )
+
+
+def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tuple[Taken, NDArray[np.float64] | None]:
+    """Return gain and binning of all parts, and (line,) exposures; those that no header states are the usual one.
+
+    Raises SceneError: parts were taken with another gain or binning.
+    """
+    every = {
+        start: taken_with(part.header_path.name, part.header.fields, part.header.settings)
+        for start, part in parts.items()
+    }
+    first = next(iter(every.values()))
+    exposure_ms = np.full(height, np.nan)
+    for start, one in every.items():
+        check_parts(one, first)
+        exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
+    if np.isnan(exposure_ms).all():
+        return first, None
+    usual = float(np.nanmedian(exposure_ms))
+    unknown = [one.where for one in every.values() if one.exposure_ms is None]
+    notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]
+    return first, np.nan_to_num(exposure_ms, nan=usual)
 
 
 def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
@@ -263,16 +299,6 @@ def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
     if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         return lines
     return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
-
-
-def find_reference(folder: Path, kind: str) -> Path | None:
-    """Return the header of the ``dark`` or ``white`` frame in a folder by its name (SceneError: there are several)."""
-    headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
-    found = [entry for entry in headers if entry.name.lower().startswith(kind)]
-    if len(found) > 1:
-        names = ", ".join(entry.name for entry in found)
-        raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
-    return found[0] if found else None
 
 
 def load_frame_index(path: Path) -> FrameIndex:

@@ -8,28 +8,23 @@ from __future__ import annotations
 
 import importlib
 import math
-import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import odc.geo.crs as odc_crs
-import odc.geo.geobox as odc_geobox
-import pyproj
 from numpy.typing import NDArray
-from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.envi_headers import finite_number, wavelengths_nm
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.acquired import acquired_of
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
     MOST_RATIO,
-    Bands,
     CubeSource,
     check_claim,
     check_memory,
@@ -37,6 +32,9 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
+from spectralzoom.storage.readers.orientation import orientation_of, upright
+from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
+from spectralzoom.storage.readers.places import place_of_file
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
@@ -50,15 +48,6 @@ ALPHA_NOTE = (
     "its alpha channel says where there are pixels, and is no band; if it is one, write so into the file"
     " (gdal_edit.py -colorinterp_4 undefined)"
 )
-RGB_NM = (640.0, 550.0, 460.0)
-NEAR_INFRARED_NM = 800.0
-GREY_NM = 550.0
-_COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
-    ("gray",): (GREY_NM,),
-    ("red", "green", "blue"): RGB_NM,
-    ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
-    ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
-}
 
 
 def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
@@ -70,7 +59,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     driver = _DRIVERS[path.suffix.lower()]
+    check_sidecars(path)
     with _opened(path) as file:
+        check_overviews(file, path)
         if len(file.subdatasets) > 1:
             raise SceneError(
                 f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
@@ -84,12 +75,17 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
+        of_all = _bands_of(file, range(file.count), kinds, path).wavelength_nm
+        if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
+            alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
-        known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path)
-        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
+        known = _bands_of(file, keep, kinds, path)
+        bad, doubts = bad_bands_of_texts(_tags_of(file, keep), len(keep))
+        acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
+        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
@@ -99,7 +95,6 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
                 planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
             return np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
 
-        bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
             shape=(height, width, len(keep)),
@@ -109,8 +104,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             bands=known,
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
-            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad),
+            bad_bands=bad,
             void=_void(file, alpha),
+            acquired=acquired.text,
             notes=tuple(notes),
         )
     read = source.read
@@ -123,7 +119,8 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
                 void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
             ),
         )
-    return source if not scaled or ((scale == 1).all() and (offset == 0).all()) else rescaled(source, scale, offset)
+    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
+    return upright(source if plain else rescaled(source, scale, offset), orientation_of(path))
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
@@ -180,97 +177,18 @@ def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
     return found if found.any() else None
 
 
-def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid on the earth of an open rasterio file, or None with a note."""
-    if file.transform.is_identity:
-        other = " and ".join([*(["ground control points"] if file.gcps[0] else []), *(["RPCs"] if file.rpcs else [])])
-        if other:
-            return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",)
-        lacks = "it has a CRS and no transform (gdal_edit -a_ullr), so that its place on the earth is not known"
-        return None, () if file.crs is None else (lacks,)
-    if file.crs is None or not file.transform.determinant:
-        lacks = "a transform and no CRS (gdal_edit -a_srs)" if file.crs is None else "a transform that is no grid"
-        return None, (f"it has {lacks}, so that its place on the earth is not known",)
-    try:
-        crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
-    except Exception as error:  # of PROJ and of GDAL
-        return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
-    if not (crs.is_projected or crs.is_geographic):
-        return None, (f"its CRS, {crs.name!r}, is not geographic or projected; its place is not known",)
-    code = crs.to_epsg()
-    return odc_geobox.GeoBox(file.shape, file.transform, odc_crs.CRS(crs.to_wkt() if code is None else code)), ()
+def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
+    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own."""
+    tags: dict[str, str | Sequence[str]] = {}
+    for name, value in (file.tags() | file.tags(ns="ENVI")).items():
+        words = split_list(value, file.count)
+        tags[name] = value if words is None else [words[band] for band in bands]
+    of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
+    names = dict.fromkeys(name for own in of_bands for name in own)
+    return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
 
 
-def place_of_envi(
-    header: Mapping[str, str], data: Path, shape: tuple[int, int]
-) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """Return the grid of an ENVI file with (line, sample) ``shape``, by its ``map info`` as GDAL reads it."""
-    if "map info" not in header:
-        return None, ()
-    rasterio = importlib.import_module("rasterio")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(data, driver="ENVI") as file:
-                found, notes = place_of_file(file)
-    except Exception as error:  # of GDAL and PROJ
-        return None, (f"its map info cannot be read: {error}",)
-    return (None if found is None else odc_geobox.GeoBox(shape, found.affine, found.crs)), notes
-
-
-_UNIT = "wavelength_units"
-_LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
-_DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)  # Band 12 (660.5 Nanometers)
-
-
-def _of_colours(colours_nm: Sequence[float]) -> Bands:
-    listed = ", ".join(f"{nm:g}" for nm in colours_nm)
-    return Bands(np.array(colours_nm), None, f"wavelengths assumed from the file's colours: {listed} nm")
-
-
-def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
-    """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
-    notes: list[str] = []
-    of_file = _file_tags(file)
-    of_bands = []
-    for band in keep:  # counted from 0; GDAL's own tags take precedence
-        tags = _lower(file.tags(band + 1))
-        imagery = file.tags(band + 1, ns="IMAGERY")
-        if "CENTRAL_WAVELENGTH_UM" in imagery:
-            tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
-            tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
-        of_bands.append(tags)
-    fields = {"wavelength units": next(iter(of_bands), {}).get(_UNIT) or of_file.get(_UNIT, "")}
-    for key in ("wavelength", "fwhm"):
-        values = [tags.get(key, "") for tags in of_bands]
-        if all(values):
-            fields[key] = ", ".join(values)
-        elif key in of_file:
-            words = [word for word in re.split(r"[,\s{}]+", of_file[key]) if word]
-            fields[key] = ", ".join([words[band] for band in keep] if len(words) == file.count else words)
-    centres, scale = wavelengths_nm(fields, len(keep), notes)
-    if centres is not None:
-        widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
-        known = len(widths) == len(keep) and all(width is not None and width > 0 for width in widths)
-        fwhm = np.array(widths, np.float64) * scale if known else None
-        return Bands(centres, fwhm, f"wavelengths from the tags of {path}"), tuple(notes)
-    named = [_DESCRIBED.search(file.descriptions[band] or "") for band in keep]
-    if named and None not in named:
-        nm = [float(one[1]) * (1.0 if one[2].lower().startswith("n") else 1000.0) for one in named if one is not None]
-        return Bands(np.array(nm), None, f"wavelengths from the band names of {path}"), tuple(notes)
-    colours_nm = _COLOURS_NM.get(tuple(kinds))
-    return Bands() if colours_nm is None else _of_colours(colours_nm), tuple(notes)
-
-
-def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
-    """Return the bands (from 0) that a list of ``count`` flags marks by 0, such as ``{1, 1, 0}``."""
-    flags = [finite_number(word) for word in re.split(r"[,\s{}]+", listed or "") if word]
-    return tuple(band for band, flag in enumerate(flags) if flag == 0) if len(flags) == count else ()
-
-
-def _file_tags(file: Any) -> dict[str, str]:
-    return _lower(file.tags()) | _lower(file.tags(ns="ENVI"))
-
-
-def _lower(tags: Mapping[str, str]) -> dict[str, str]:
-    return {"_".join(name.lower().split()): value for name, value in tags.items()}
+def _bands_of(file: Any, bands: Sequence[int], kinds: Sequence[str], path: Path) -> Bands:
+    """Return wavelengths and widths of some bands (from 0) of an open file by its tags, band names or colours."""
+    names, colours = ([of_file[band] for band in bands] for of_file in (file.descriptions, kinds))
+    return bands_of_texts(_tags_of(file, bands), names, str(path), colours)

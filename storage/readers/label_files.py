@@ -17,7 +17,8 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
-from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.readers.polygons import (
     POLYGON_ENDINGS,
     is_polygon_file,
@@ -28,21 +29,16 @@ from spectralzoom.storage.readers.polygons import (
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
 
 LABEL_WORDS = (
-    *("mask", "masks", "label", "labels", "annotation", "annotations"),
-    *("gt", "groundtruth", "truth", "seg"),
+    *("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg"),
     *("lulc", "landcover", "land_cover"),
 )
 LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
 IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
 SHOWN = 5  # names in a message
-
-
-def _word_at_an_end(words: Sequence[str]) -> re.Pattern[str]:
-    either = "|".join(words)
-    return re.compile(rf"^(?:{either})[_\-. ]+|[_\-. ]+(?:{either})$")
-
-
-_LABEL_WORD, _IMAGE_WORD = _word_at_an_end(LABEL_WORDS), _word_at_an_end(IMAGE_WORDS)
+_LABEL_WORD, _IMAGE_WORD = (
+    re.compile(rf"^(?:{'|'.join(words)})[_\-. ]+|[_\-. ]+(?:{'|'.join(words)})$")
+    for words in (LABEL_WORDS, IMAGE_WORDS)
+)
 
 
 @dataclass(frozen=True)
@@ -54,9 +50,13 @@ class MatchedFiles:
     alone: tuple[Path, ...]  # label files without an image
 
     @property
-    def bare(self) -> tuple[Path, ...]:
-        """Return the images without labels."""
-        return tuple(image for image in self.images if image not in self.labels)
+    def lacking(self) -> tuple[str, ...]:
+        """Return a line on each kind of file without a partner."""
+        bare = [image for image in self.images if image not in self.labels] if self.labels else []
+        none = "label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png"
+        left_out = f"labels of {len(bare)} image{'s' * (len(bare) > 1)}, left out: {listed_names(bare)}"
+        lone = f"the image of {len(self.alone)} label file{'s' * (len(self.alone) > 1)}: {listed_names(self.alone)}"
+        return tuple(line for line, there in ((none, not self.labels), (left_out, bare), (lone, self.alone)) if there)
 
 
 def read_labels(address: str | Path, shape: tuple[int, int], geobox: GeoBox | None, settings: SceneSettings) -> Labels:
@@ -94,7 +94,24 @@ def scene_entries(folder: Path) -> list[Path]:
 def image_folder(folder: Path) -> Path:
     """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
-    return min(inner, key=lambda entry: entry.name != "images", default=folder)
+    return within(folder, min(inner, key=lambda entry: entry.name != "images", default=folder))
+
+
+def find_files(path: Path) -> MatchedFiles:
+    """Match the images of a folder, or the one image, to their labels.
+
+    Raises SceneError: there is no image, or as `match_folder`.
+    """
+    if not path.exists():
+        raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
+    if not path.is_dir() or is_store(path):
+        label = None if is_label_name(path) else find_label(path)
+        return MatchedFiles((path,), {} if label is None else {path: label}, ())
+    found = match_folder(image_folder(path))
+    if not found.images:
+        way = f"give a folder of images, or with images/ in it{folders_within(path)}"
+        raise SceneError(f"{path} holds no image that is read; {way}")
+    return found
 
 
 def match_folder(folder: Path) -> MatchedFiles:
@@ -103,25 +120,23 @@ def match_folder(folder: Path) -> MatchedFiles:
     Raises SceneError: several files may be an image's labels, or one those of several images; both are named.
     """
     own = scene_entries(folder)
-    beside = [entry for entry in own if is_label_name(entry)]
-    if len(beside) == len(own):  # a folder of labels is read as images
-        beside = []
-    images = [entry for entry in own if entry not in beside]
-    pictures = [*beside, *_in_label_folders(folder)]
-    polygons = _polygons_near(folder)
+    images = [entry for entry in own if not is_label_name(entry)] or own  # a folder of labels is read as images
+    pictures, polygons = _labels_near(folder)
+    pictures = [entry for entry in pictures if entry not in images]
     matched = {image: _label_of(image, pictures) or _label_of(image, polygons) for image in images}
     labels = {image: found for image, found in matched.items() if found is not None}
     if len(images) == len(pictures) == 1:  # a single pair may have any names
         labels = dict(zip(images, pictures, strict=True))
     owner: dict[Path, Path] = {}
     for image, label in labels.items():
-        if label in owner:
+        if owner.setdefault(label, image) != image:
             raise SceneError(
                 f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
-        owner[label] = image
-    return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in set(labels.values())))
+    for entry in (*images, *labels.values()):
+        within(folder, entry, _home(folder))
+    return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in owner))
 
 
 def find_label(scene: Path) -> Path | None:
@@ -129,11 +144,16 @@ def find_label(scene: Path) -> Path | None:
     if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
     try:
-        beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
-        found = _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
-        return found or _label_of(scene, _polygons_near(scene.parent))
+        pictures, polygons = _labels_near(scene.parent)
     except PermissionError:  # the folder cannot be listed
         return None
+    found = _label_of(scene, [entry for entry in pictures if entry != scene]) or _label_of(scene, polygons)
+    return None if found is None else within(scene, found, _home(scene.parent))
+
+
+def _home(folder: Path) -> Path:
+    """Return the folder that images and labels share."""
+    return folder.parent if is_image_folder(folder) else folder
 
 
 def is_label_name(path: Path) -> bool:
@@ -159,26 +179,18 @@ def is_store(entry: Path) -> bool:
     return entry.suffix.lower() == ".zarr" and entry.is_dir()
 
 
-def _in_label_folders(folder: Path) -> list[Path]:
-    """Return all pictures in the folders of labels in or beside a folder."""
-    return [entry for inner in _label_folders(folder) for entry in scene_entries(inner)]
+def _labels_near(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the pictures and the polygons that may be labels of a folder's images, by the names of files and folders.
 
-
-def _label_folders(folder: Path) -> list[Path]:
+    They lie in the folder or in folders of labels there, and beside it if it has images.
+    """
     around = [folder, folder.parent] if is_image_folder(folder) else [folder]
-    found = [entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS]
-    return [inner for inner in found if inner.is_dir() and inner != folder]
-
-
-def _polygons_near(folder: Path) -> list[Path]:
-    """Return the files of polygons in a folder, in its folders of labels, or beside it if it has images."""
-    places = [folder, *([folder.parent] if is_image_folder(folder) else []), *_label_folders(folder)]
-    return [
-        entry
-        for place in dict.fromkeys(places)
-        for entry in sorted(place.iterdir())
-        if entry.suffix.lower() in POLYGON_ENDINGS and entry.is_file() and not entry.name.startswith(".")
-    ]
+    inside = [entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS]
+    inside = [entry for entry in inside if entry.is_dir() and entry != folder]
+    pictures = [entry for entry in scene_entries(folder) if is_label_name(entry)]
+    pictures += [entry for place in inside for entry in scene_entries(place)]
+    visible = [entry for place in [*around, *inside] for entry in sorted(place.glob("[!.]*"))]
+    return pictures, [entry for entry in visible if entry.suffix.lower() in POLYGON_ENDINGS and entry.is_file()]
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
@@ -209,6 +221,8 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
         return None, ""
     name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
     address = settings.path.parent / name
+    file, _ = split_variable(split_layer(name)[0])
+    stated_file(settings.path.parent, str(file), f"{settings.path}: labels")
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
@@ -16,10 +16,12 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, crs_name, shift_px
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_toml import ClassValue, Colour
 
 NO_VALUE = int(np.iinfo(np.int64).min)  # in codes
+TURNED = "orientation tag"  # in a note of the reader of pictures
+MOST_LABEL = 2**53  # floats hold larger numbers with gaps
 MOST_FOUND_CLASSES = 64
 MIXED = (
     "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
@@ -27,23 +29,16 @@ MIXED = (
 )
 _MANY_UNKNOWN = 16  # values that are no class: more are mixed colours, not forgotten classes
 
-# Eight colours that most people with colour blindness can distinguish (Okabe and Ito, 2008), in an order for maps.
-_EIGHT_COLOURS = (
-    (230, 159, 0),
-    (86, 180, 233),
-    (0, 158, 115),
-    (240, 228, 66),
-    (0, 114, 178),
-    (213, 94, 0),
-    (204, 121, 167),
+# Eight colours that most people with colour blindness can distinguish (Okabe and Ito, 2008), in an order for maps, and
+# hues, each far from the one before.
+DEFAULT_COLOURS: tuple[Colour, ...] = (
+    *((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167)),
     (90, 90, 90),
-)
-
-# and hues, far from the one before
-DEFAULT_COLOURS: tuple[Colour, ...] = _EIGHT_COLOURS + tuple(
-    (round(255 * red), round(255 * green), round(255 * blue))
-    for saturation, value in ((0.8, 0.95), (0.5, 0.95), (0.8, 0.6), (0.5, 0.6))
-    for red, green, blue in (colorsys.hsv_to_rgb(turn * 7 % 24 / 24, saturation, value) for turn in range(24))
+    *(
+        (round(255 * red), round(255 * green), round(255 * blue))
+        for saturation, value in ((0.8, 0.95), (0.5, 0.95), (0.8, 0.6), (0.5, 0.6))
+        for red, green, blue in (colorsys.hsv_to_rgb(turn * 7 % 24 / 24, saturation, value) for turn in range(24))
+    ),
 )
 
 
@@ -88,9 +83,11 @@ def load_labels(
     read = load_codes(address, geobox, classes=classes.values())
     codes = read.values
     if codes.shape != shape:
+        why = "; its sides are exchanged: turn the labels or the picture" * (codes.shape == shape[::-1])
+        why += "".join(f"; {note}" for note in read.notes if TURNED in note)
         raise SceneError(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
-            f"(y x x); give labels on the scene's own pixels"
+            f"(y x x){why}; give labels on the scene's own pixels"
         )
     if by_colour and not read.of_colours:
         raise SceneError(
@@ -100,13 +97,15 @@ def load_labels(
     none = None if unlabelled is None else _code(unlabelled)
     stated = dict(classes) or found_codes(codes, none, read.of_colours, str(address))
     negative = (codes < 0) & (codes != NO_VALUE) & ~np.isin(codes, [none or 0, *map(_code, stated.values())])
-    note = (f"{negative.sum()} px of labels {address} have negative values: unlabelled",) if negative.any() else ()
+    notes = [f"{negative.sum()} px of labels {address} have negative values: unlabelled"] if negative.any() else []
+    if not (by_colour or read.of_colours or map_values(tuple(stated.values()))) and stated:
+        notes.append("maps number the classes from 0, as a label is not 0 to 254")
     return Labels(
         index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address), of_colours=read.of_colours),
         names=tuple(stated),
         values=tuple(stated.values()),
         colours=class_colours(stated, colours),
-        notes=(*read.notes, *note),
+        notes=(*read.notes, *notes),
         regridded=read.regridded,
     )
 
@@ -139,9 +138,9 @@ def load_codes(
     A file with a place is resampled to ``geobox`` by nearest neighbour. Raises SceneError: the file cannot be read,
     holds fractions, or lies beside the geobox.
     """
-    source = open_cube(address, labels=True)
+    source = open_cube_source(address, labels=True)
     codes, of_colours = _whole_numbers(source.read(0, source.shape[0]), address)
-    notes: list[str] = []
+    notes = [f"labels {address}: {note}" for note in source.notes if TURNED in note]
     if source.nodata is not None and source.nodata.is_integer():
         void = codes == int(source.nodata) * (0x010101 if of_colours else 1)
         if void.any() and codes[void][0] not in map(_code, classes):
@@ -168,10 +167,10 @@ def _whole_numbers(values: NDArray[Any], address: str | Path) -> tuple[NDArray[n
         values = values[..., 0]
         if values.dtype.kind != "f":
             return values.astype(np.int64), False
-        rounded = np.where(np.isnan(values), NO_VALUE, values)
-        if not np.isfinite(rounded).all() or (rounded != np.rint(rounded)).any():
-            raise SceneError(f"labels {address} hold fractions, expected whole numbers; is it a scene?")
-        return rounded.astype(np.int64), False
+        known = values[~np.isnan(values)]
+        if (known != np.rint(known)).any() or (np.abs(known) > MOST_LABEL).any():
+            raise SceneError(f"labels {address} hold fractions or huge numbers, expected whole ones; is it a scene?")
+        return np.where(np.isnan(values), NO_VALUE, np.nan_to_num(values).astype(np.int64)), False
     if values.shape[2:] == (3,) and values.dtype == np.uint8:
         planes = values.astype(np.int64)
         return planes[..., 0] << 16 | planes[..., 1] << 8 | planes[..., 2], True
@@ -219,39 +218,42 @@ def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, whe
             f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes: "
             f"{MIXED}"
         )
-    if is_colour:
-        return {f"colour_{code:06x}": colour_of(code) for code in found}
-    return {f"class_{code}": code for code in found}
+    return {f"colour_{code:06x}": colour_of(code) for code in found} if is_colour else {f"class_{n}": n for n in found}
 
 
 def _index(
     codes: NDArray[np.int64], classes: Mapping[str, ClassValue], none: int | None, where: str, *, of_colours: bool
 ) -> NDArray[np.uint8]:
+    """Return the class indices of codes, 255 for none (SceneError: a code is no class, or two things at once)."""
+
+    def shown(code: int) -> str:
+        return f"colour {list(colour_of(code))}" if by_colour else f"value {code}"
+
+    by_colour = any(isinstance(value, tuple) for value in classes.values())
     values, inverse = np.unique(codes, return_inverse=True)
     table = {_code(value): index for index, value in enumerate(classes.values())}
     if none is not None and none in table:
         name = tuple(classes)[table[none]]
-        raise SceneError(f"scene.toml has {_shown(none, classes)} as unlabelled and as class {name}; keep one")
+        raise SceneError(f"scene.toml has {shown(none)} as unlabelled and as class {name}; keep one")
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, NO_VALUE)]
+    if unknown and of_colours and not by_colour:
+        raise SceneError(
+            f"labels {where} have colours, such as {list(colour_of(unknown[0]))}, and the classes are numbers; "
+            "write the colour of each class into [classes], or give labels of numbers"
+        )
     if unknown:
         count = int((codes == unknown[0]).sum())
-        if of_colours and not any(isinstance(value, tuple) for value in classes.values()):
-            raise SceneError(
-                f"labels {where} have colours, such as {list(colour_of(unknown[0]))}, and the classes are numbers; "
-                "write the colour of each class into [classes], or give labels of numbers"
-            )
         others = f" (and {len(unknown) - 1} more such values)" if len(unknown) > 1 else ""
         cure = MIXED if len(unknown) > _MANY_UNKNOWN else "add it to [classes] or state it as unlabelled in scene.toml"
-        raise SceneError(
-            f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class{others}; {cure}"
-        )
+        raise SceneError(f"labels {where} have {count} px of {shown(unknown[0])}, which is no class{others}; {cure}")
     index = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
     return index[inverse.reshape(codes.shape)]
 
 
-def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
-    colours = any(isinstance(value, tuple) for value in classes.values())
-    return f"colour {list(colour_of(code))}" if colours else f"value {code}"
+def map_values(values: Sequence[ClassValue]) -> tuple[int, ...]:
+    """Return the numbers of classes in maps: the values of the label files, empty unless all are 0 to 254."""
+    numbers = tuple(value for value in values if isinstance(value, int) and 0 <= value < UNLABELLED)
+    return numbers if len(numbers) == len(values) else ()
 
 
 def class_colours(classes: Mapping[str, ClassValue], stated: Mapping[str, Colour] | None = None) -> NDArray[np.uint8]:

@@ -2,39 +2,36 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.array_cubes import UNNAMED, cube_source, find_cube
-from spectralzoom.storage.readers.array_files import (
-    ARRAY_ENDINGS,
-    HDF_ENDINGS,
+from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text, taken_with
+from spectralzoom.storage.readers.acquired import acquired_of
+from spectralzoom.storage.readers.array_cubes import (
+    UNNAMED,
     check_picture,
+    cube_source,
+    find_cube,
     in_scope,
-    list_arrays,
-    load_npy,
     marked_bands,
 )
-from spectralzoom.storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
-from spectralzoom.storage.readers.envi_files import (
-    DATA_ENDINGS,
-    find_envi_pair,
-    find_reference,
-    open_envi_cube,
-    open_envi_source,
-    open_headwall_cube,
-)
+from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, FileArray, find_zarr_store, list_arrays
+from spectralzoom.storage.readers.band_facts import Bands
+from spectralzoom.storage.readers.cube_sources import CubeSource, check_cube_source, reading
+from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_source, open_headwall_cube
+from spectralzoom.storage.readers.frames import find_reference, load_frame, taken_of
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
-from spectralzoom.storage.readers.zarr_files import find_zarr_store, zarr_arrays
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
@@ -73,7 +70,22 @@ def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image
     return "envi" if of_envi else "none"
 
 
-def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
+def open_cube(address: str | Path) -> xr.DataArray:
+    """Open a cube (y, x, band); values are read when they are needed.
+
+    ``address`` is an image, .npy, .mat, ENVI, NetCDF or HDF5 file, a Zarr store or the folder of a Headwall camera; it
+    may name an array: ``FILE.mat:ARRAY``. Scale and offset of the file are applied. Coordinates, where the file has
+    them: ``wavelength`` and ``fwhm`` [nm] and ``bad_band`` along band; ``x``, ``y`` and ``spatial_ref`` of the place;
+    ``valid``, ``time_s`` and ``exposure_ms`` of each line; ``void`` of transparent and masked pixels; the frames
+    ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out, ``files``,
+    ``wavelengths_from``, ``acquired`` (a day or a moment in UTC, ISO 8601) and ``_FillValue``. Raises SceneError: there
+    is no such file, it is damaged, or its kind or shape cannot be used.
+    """
+    source = open_cube_source(address)
+    return with_wavelengths(source, address, None).data_array()
+
+
+def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource:
     """Open a cube; only headers, and coordinates of arrays, are read.
 
     ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
@@ -105,12 +117,25 @@ def open_cube(address: str | Path, *, labels: bool = False) -> CubeSource:
 
 def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     """Return a Headwall cube with the dark and white frames of its folder, if there are some."""
-    for kind in ("dark", "white"):
-        if (named := find_reference(folder, kind)) is not None:
-            values, more = load_frame(named)
-            notes = (*source.notes, f"{kind} frame from {named.name}")
-            source = replace(source, **{kind: values}, files=(*source.files, *more), notes=notes)  # type: ignore[arg-type]
-    return source
+    found = {kind: find_reference(folder, kind) for kind in ("dark", "white")}
+    frames = {kind: load_frame(file, kind) for kind, file in found.items() if file is not None}
+    stated_ms = source.lines.exposure_ms
+    lines_ms = np.ones(1) if stated_ms is None else stated_ms
+    notes = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]
+    white_ms = None
+    if len(frames) == 2:
+        white_ms, more = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
+        notes += more
+    else:
+        notes = [f"{note} is not used: values over white need a dark and a white frame" for note in notes]
+        notes += [] if all_alike(lines_ms) else [f"numbers of {span_text(lines_ms)} are not scaled to one exposure"]
+    return replace(
+        source,
+        **{kind: frame.values for kind, frame in frames.items()},  # type: ignore[arg-type]
+        white_ms=white_ms,
+        files=(*source.files, *(file for frame in frames.values() for file in frame.files)),
+        notes=(*source.notes, *notes),
+    )
 
 
 def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource:
@@ -123,50 +148,41 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
     ending = path.suffix.lower()
     guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
     with guard():
-        arrays, about = zarr_arrays(path) if path.is_dir() else list_arrays(path)
+        arrays, about = list_arrays(path)
         cube = find_cube(arrays, variable, path, labels=labels)
         near = in_scope(arrays, cube.name)
         source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
         unit = str(cube.array.attrs.get("units", "")).strip()
         notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
-        notes += [f"{cube.name or path.name}: {cube.array.lost}"] if cube.array.lost else []
+        acquired = acquired_of({**about, **cube.array.attrs, **_time_of(near)})
+        notes += acquired.notes
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
-        source = replace(source, bad_bands=marked_bands(near, source.shape[2]), notes=(*notes, *plain))
+        bad, doubts = marked_bands(cube, near, source.shape[2])
+        source = replace(source, bad_bands=bad, acquired=acquired.text, notes=(*notes, *plain, *doubts))
+        taken = taken_with(path.name, about, cube.array.attrs)
+        if taken.exposure_ms is not None:
+            exposure_ms = np.full(source.shape[0], taken.exposure_ms)
+            source = replace(source, lines=replace(source.lines, exposure_ms=exposure_ms))
+        source = replace(source, taken=taken)
         if path.is_dir():
             source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
         return source
 
 
+def _time_of(near: Mapping[str, FileArray]) -> dict[str, Any]:
+    """Return the value of a coordinate ``time`` with one element, by its units; empty where there is none."""
+    found = near.get("time")
+    if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
+        return {}
+    about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
+    time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
+    return {"time": xr.decode_cf(time)["time"].values}
+
+
 def load_labels_array(address: str | Path) -> NDArray[Any]:
     """Read a file of labels or a mask without its scale, (y, x, band) (SceneError)."""
-    source = open_cube(address, labels=True)
+    source = open_cube_source(address, labels=True)
     return source.read(0, source.shape[0])
-
-
-def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ...]]:
-    """Read one reference frame, (sample, band), as the mean of its lines, and return its files too.
-
-    Raises SceneError: the file cannot be read or holds no real numbers.
-    """
-    path, _ = split_variable(address)
-    kind = reader_of(address)
-    if kind in ("zarr", "headwall"):
-        raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
-    files: tuple[Path, ...] = (path,)
-    if path.suffix.lower() == ".npy":
-        with reading(path, ".npy"):
-            values = load_npy(path)
-    elif kind == "envi":
-        files = find_envi_pair(path)
-        values = open_envi_cube(path).values
-    else:
-        source = open_cube(address)
-        values = source.read(0, source.shape[0])
-    values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
-    if values.dtype.kind not in "uif":
-        raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
-    frame = values[None] if values.ndim == 2 else values
-    return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
 
 
 def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[float] | None) -> CubeSource:

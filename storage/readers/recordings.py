@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,28 +29,24 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
 from spectralzoom.pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
+from spectralzoom.pipeline.exposures import all_alike, span_text
 from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
-from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, scan_positions
+from spectralzoom.pipeline.geometry.scan import Floats, Sweep, scan_positions
 from spectralzoom.pipeline.ground.georeference import geobox_of_record
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
+from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.envi_files import find_envi_pair, load_envi_header
-from spectralzoom.storage.readers.open_cubes import reader_of
-from spectralzoom.storage.readers.recorded_files import (
+from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.pointing_tables import (
     ENDINGS,
     WITHOUT_MIRROR,
     LinePointing,
-    RecordedFile,
-    find_cubes,
     find_pointing,
-    find_references,
-    load_pointing_table,
-    open_recorded_cube,
-    with_bits,
+    load_pointing,
 )
-from spectralzoom.storage.readers.zarr_files import lost_chunks
+from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256
@@ -84,15 +80,16 @@ class Recording:
     camera: LineCamera
     notes: tuple[str, ...]
     light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
+    acquired: str | None = None  # when the first lines were captured, by files: a day or a moment in UTC, ISO 8601
 
     def key(self) -> dict[str, Any]:
         """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
         arrays: list[NDArray[Any]] = []
         for one in self.sweeps:
             known = one.references
-            frames = (known.dark, known.white, known.white_reference, known.bad)
+            frames = (known.dark, known.white, known.white_reference, known.bad, known.exposure_ms)
             arrays += [one.position, one.time_s, one.exposure_ms, one.valid_line]
-            arrays += [np.zeros(0) if frame is None else frame for frame in frames]
+            arrays += [np.zeros(0) if frame is None else np.asarray(frame) for frame in frames]
         return {
             "light": list(self.light),
             "sweeps": [asdict(one.sweep) for one in self.sweeps],
@@ -110,42 +107,43 @@ class Recording:
         return RecordedSource(self.sweeps, self.camera, self.wavelength_nm, field_shape, notes=self.notes)
 
 
-@dataclass(frozen=True)
-class RecordedWith:
-    """Flags on the files of a recording; None is looked for beside them, or assumed with a note."""
-
-    pointing: Path | None = None  # a table, or a folder with one for each cube
-    dark: Path | None = None
-    white: Path | None = None
-    wavelengths: Sequence[float] | None = None  # of all bands [nm]
-    white_reference: ArrayLike = 1.0  # value of the white reference, one or (band,)
-    mounting: Mounting = STRAIGHT  # of the device whose positions the pointing has
-
-    @property
-    def frames(self) -> dict[str, Path | None]:
-        """Return the files of reference frames by their kind."""
-        return {"dark": self.dark, "white": self.white}
-
-
 def open_recording(
-    address: str | Path, camera: LineCamera | None = None, given: RecordedWith | None = None
+    address: str | Path,
+    camera: LineCamera | None = None,
+    *,
+    pointing: Path | None = None,
+    dark: Path | None = None,
+    white: Path | None = None,
+    wavelengths: Sequence[float] | None = None,
+    white_reference: ArrayLike = 1.0,
+    mounting: Mounting = STRAIGHT,
 ) -> Recording:
     """Open a recording, by default with the default camera.
 
-    Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
+    For files, ``pointing`` is a table or a folder with one for each cube; it and the frames ``dark`` and ``white`` are
+    looked for beside the cubes, or assumed with a note. ``wavelengths`` [nm] are of all bands, ``white_reference`` is
+    the value of the white reference, one or (band,), and ``mounting`` is of the device whose positions the pointing
+    has. Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
     wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
     be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
     """
     camera = camera or LineCamera()
-    given = given or RecordedWith()
     stores = find_raw_cubes(address)
+    flags = {"pointing": pointing, "dark": dark, "white": white, "wavelengths": wavelengths}
     if stores is None:
-        return _open_files(Path(address), camera, given)
-    for name in ("pointing", "dark", "white", "wavelengths"):
-        if getattr(given, name) is not None:
-            raise SettingsError(
-                f"--{name} is for files, and {address} holds raw cubes, which have their own; leave --{name} out"
-            )
+        paths = find_cubes(Path(address))
+        opened = [open_file_cube(one, wavelengths, {"dark": dark, "white": white}) for one in paths]
+        cubes = [_point(one, pointing, mounting, len(paths) == 1) for one in opened]
+        return _recording_of(str(address), dict(zip(paths, cubes, strict=True)), camera, white_reference)
+    if (flag := next((name for name, value in flags.items() if value is not None), None)) is not None:
+        raise SettingsError(
+            f"--{flag} is for files, and {address} holds raw cubes, which have their own; leave --{flag} out"
+        )
+    return _stored_recording(str(address), stores, camera)
+
+
+def _stored_recording(address: str, stores: Sequence[Path], camera: LineCamera) -> Recording:
+    """Open raw cubes, or condensed sweeps, of an archive."""
     for folder in {path.parent for path in stores if (path.parent / MANIFEST).is_file()}:
         check_store(folder)
     cubes = [open_lines(path) for path in stores]
@@ -169,7 +167,7 @@ def open_recording(
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
     notes = (RESTORED,) if any(isinstance(cube, RestoredCube) for cube in cubes) else ()
-    return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, notes, light)
+    return Recording(address, sweeps, first.wavelength_nm, first.fwhm_nm, camera, notes, light)
 
 
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
@@ -183,64 +181,72 @@ def _stamps(files: Iterable[Path]) -> list[str]:
     return [f"{file.name}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
 
 
-def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recording:
-    """Open cubes of files with their pointing and reference frames."""
-    cubes = [open_recorded_cube(one, given.wavelengths) for one in find_cubes(path)]
+def _recording_of(
+    address: str, files: Mapping[Path, FileCube], camera: LineCamera, white_reference: ArrayLike
+) -> Recording:
+    """Return cubes of files as a recording."""
+    paths, cubes = list(files), list(files.values())
     bands = cubes[0].source.bands
     assert bands.wavelength_nm is not None
-    for cube in cubes[1:]:
+    for one, cube in files.items():
         if not np.array_equal(np.asarray(cube.source.bands.wavelength_nm), bands.wavelength_nm):
-            raise SceneError(f"{cube.path} has other wavelengths than {cubes[0].path}; survey them one by one")
-    notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
+            raise SceneError(f"{one} has other wavelengths than {paths[0]}; survey them one by one")
+    notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin, *cube.notes) if note]
     samples = max(cube.source.shape[1] for cube in cubes)  # the widest are not binned
-    camera = with_bits(replace(camera, samples=samples), cubes, given.frames, notes)
-    pointing = [_point(cube, given, notes, alone=len(cubes) == 1) for cube in cubes]
-    without = [one is None or one.kind in WITHOUT_MIRROR for one in pointing]
-    if any(without) and len(cubes) > 1:
-        cube = cubes[without.index(True)]
-        what = "no pointing" if pointing[without.index(True)] is None else "places along a scan without a mirror"
-        raise SceneError(
-            f"{cube.path} has {what}, and how {len(cubes)} cubes lie beside each other is not known; give mirror "
-            "positions or viewing angles for each cube, or name one cube"
-        )
-    if any(without):
-        camera, pointing = _without_mirror(cubes[0], pointing[0], camera, notes)
-    camera = _timed(camera, cubes, pointing, notes)
-    sweeps = [
-        sweep
-        for cube, one in zip(cubes, pointing, strict=True)
-        if one is not None
-        for sweep in _sweeps_of(cube, one, camera, given, notes)
+    camera, more = with_bits(replace(camera, samples=samples), cubes)
+    notes += more
+    without = [
+        number for number, one in enumerate(cubes) if one.pointing is None or one.pointing.kind in WITHOUT_MIRROR
     ]
-    unique = tuple(dict.fromkeys(notes))
+    if without and len(cubes) > 1:
+        pointing = cubes[without[0]].pointing
+        raise SceneError(
+            f"{paths[without[0]]} has {'no pointing' if pointing is None else 'places along a scan without a mirror'}, "
+            f"and how {len(cubes)} cubes lie beside each other is not known; give mirror positions or viewing angles "
+            "for each cube, or name one cube"
+        )
+    if without:
+        camera, cubes[0], more = _without_mirror(cubes[0], camera)
+        notes += more
+    camera, more = _timed(camera, cubes)
+    notes += more
+    sweeps: list[RecordedSweep] = []
+    for cube in cubes:
+        found, more = _sweeps_of(cube, camera, white_reference)
+        sweeps += found
+        notes += more
     light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
-    return Recording(str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light)
+    unique = tuple(dict.fromkeys(notes))
+    acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
+    return Recording(address, tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light, acquired)
 
 
-def _point(cube: RecordedFile, given: RecordedWith, notes: list[str], *, alone: bool) -> LinePointing | None:
-    """Return the pointing of a cube by the file given, else by one with the cube's name, else None."""
-    file = given.pointing
+def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -> FileCube:
+    """Return a cube with its pointing by the file given, else by one with the cube's name, if there is one."""
     if file is not None and file.is_dir():
         folder = file
         names = [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
-        file = next((folder / name for name in names if (folder / name).is_file()), None)
+        file = next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
         if file is None:
             raise SceneError(f"{folder} has no pointing for {cube.name}; add {names[0]}, or name one table for all")
+    file = find_pointing(cube.folder, cube.name) if file is None else file
     if file is None:
-        file = find_pointing(cube.folder, cube.name)
-    if file is None:
-        return None
+        return cube
     if not file.is_file():
         raise SceneError(f"there is no pointing table {file}; check the name (seen from {Path.cwd()})")
-    notes.append(f"{cube.name}: pointing from {file.name}")
-    return load_pointing_table(file).of_cube(cube.name, cube.source.shape[0], given.mounting, alone=alone)
+    pointing = load_pointing(file, cube.name, cube.source.shape[0], mounting, alone=alone)
+    notes = [f"{cube.name}: pointing from {file.name}"]
+    stated, pointed = cube.exposure_ms, pointing.exposure_ms
+    if stated is not None and pointed is not None and not all(map(all_alike, zip(stated, pointed, strict=True))):
+        both = f"{span_text(pointed)}, count; the files state {span_text(stated)}"
+        notes.append(f"{cube.name}: the exposures of {file.name}, {both}")
+    return replace(cube, pointing=pointing, notes=tuple(notes))
 
 
-def _without_mirror(
-    cube: RecordedFile, pointing: LinePointing | None, camera: LineCamera, notes: list[str]
-) -> tuple[LineCamera, list[LinePointing | None]]:
-    """Return the camera and pointing of a straight scan without a mirror, centred on the field."""
+def _without_mirror(cube: FileCube, camera: LineCamera) -> tuple[LineCamera, FileCube, list[str]]:
+    """Return camera and cube of a straight scan without a mirror, centred on the field, and notes."""
     lines = cube.source.shape[0]
+    pointing, notes = cube.pointing, []
     if pointing is None:
         notes.append(f"{cube.name} has no pointing: taken as an even straight scan along y with one pixel a line")
         pointing = LinePointing("px", np.arange(lines, dtype=np.float64)[:, None], np.ones(lines, np.bool_))
@@ -254,60 +260,49 @@ def _without_mirror(
         scan_px = scan_px / line_m
     scan_px = scan_px - (scan_px.min() + scan_px.max()) / 2
     camera = flat_camera(camera, float(np.abs(scan_px).max()))
-    return camera, [replace(pointing, position=scan_positions(0.0, scan_px, camera))]
+    pointing = replace(pointing, position=scan_positions(0.0, scan_px, camera))
+    return camera, replace(cube, pointing=pointing), notes
 
 
-def _timed(
-    camera: LineCamera, cubes: Sequence[RecordedFile], pointing: Sequence[LinePointing | None], notes: list[str]
-) -> LineCamera:
-    """Return the camera with the exposure and period of the recording, if known."""
-    exposures: list[float] = []
+def _timed(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera, list[str]]:
+    """Return the camera with the exposure and period of the recording, if known, and notes."""
+    exposures = [float(np.median(one.exposure_ms)) for one in cubes if one.exposure_ms is not None]
     periods: list[float] = []
-    for cube, one in zip(cubes, pointing, strict=True):
-        known = cube.source.lines.exposure_ms if one is None or one.exposure_ms is None else one.exposure_ms
-        if known is not None and np.isfinite(known).any():
-            exposures.append(float(np.nanmedian(known)))
-        times = cube.source.lines.time_s if one is None or one.time_s is None else one.time_s
+    for cube in cubes:
+        stated_s = None if cube.pointing is None else cube.pointing.time_s
+        times = cube.source.lines.time_s if stated_s is None else stated_s
         if times is not None and np.count_nonzero(np.isfinite(times)) > 1:
             at = np.flatnonzero(np.isfinite(times))
             periods += [one for one in [float(np.median(np.diff(times[at]) / np.diff(at))) * 1e3] if one > 0]
     if not exposures and periods and periods[0] < camera.exposure_ms:  # an exposure ends before the next one begins
         exposures = [periods[0]]
     camera = _exposing(camera, exposures)
-    if periods and abs(periods[0] - camera.frame_ms) > SAME_PERIOD * camera.frame_ms:
-        period = max(periods[0], camera.exposure_ms)
-        camera = replace(
-            camera, readout_ms=period - camera.exposure_ms, max_rate_hz=max(camera.max_rate_hz, 1000 / period)
-        )
-        notes.append(f"lines follow each other every {period:.6g} ms, by their times")
-    return camera
+    if not periods or abs(periods[0] - camera.frame_ms) <= SAME_PERIOD * camera.frame_ms:
+        return camera, []
+    period = max(periods[0], camera.exposure_ms)
+    rate_hz = max(camera.max_rate_hz, 1000 / period)
+    camera = replace(camera, readout_ms=period - camera.exposure_ms, max_rate_hz=rate_hz)
+    return camera, [f"lines follow each other every {period:.6g} ms, by their times"]
 
 
-def _sweeps_of(
-    cube: RecordedFile, pointing: LinePointing, camera: LineCamera, given: RecordedWith, notes: list[str]
-) -> list[RecordedSweep]:
-    """Return the sweep of one cube, or the sweeps that its pointing table cuts it into."""
-    source = cube.source
+def _sweeps_of(cube: FileCube, camera: LineCamera, white_reference: ArrayLike) -> tuple[list[RecordedSweep], list[str]]:
+    """Return the sweep of one cube, or the sweeps that its pointing table cuts it into, and notes."""
+    source, pointing = cube.source, cube.pointing
+    assert pointing is not None
     valid = source.valid & pointing.valid
-    time_s = _middle_s(source, pointing.time_s, camera, notes)
-    known_ms = source.lines.exposure_ms if pointing.exposure_ms is None else pointing.exposure_ms
-    if known_ms is None:
+    time_s, notes = _middle_s(source, pointing.time_s, camera)
+    exposure_ms = cube.exposure_ms
+    if exposure_ms is None:
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
-        known_ms = np.full(source.shape[0], camera.exposure_ms)
-    exposure_ms = np.where(np.isfinite(known_ms), known_ms, np.nanmedian(known_ms))
-    white = np.asarray(given.white_reference, np.float32)
-    stem = cube.folder / cube.name
-    references = find_references(source, stem, camera, notes, stated=given.frames, white_reference=white)
+        exposure_ms = np.full(source.shape[0], camera.exposure_ms)
+    references, more = references_of(cube, camera, exposure_ms, white_reference)
+    notes += more
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
-    fields = load_envi_header(find_envi_pair(cube.path)[0]).fields if reader_of(cube.path) == "envi" else {}
-    if (axis := fields.get("line axis", "x").strip()) not in ("x", "y"):
-        raise SceneError(f"{cube.path} has line axis = {axis!r}, expected x or y; correct the header")
-    along: Axis = "y" if axis == "y" else "x"
     sweeps: list[RecordedSweep] = []
     for name in names:
         own = np.flatnonzero(np.array(pointing.part or (name,) * source.shape[0]) == name)
         position = pointing.position[own]
-        scan = fit_sweep(position, camera, name=name, samples=source.shape[1], along=along, valid=valid[own])
+        scan = fit_sweep(position, camera, name=name, samples=source.shape[1], along=cube.along, valid=valid[own])
         exposed = float(np.median(exposure_ms[own]))
         sweep: Sweep = replace(scan.sweep, exposure_ms=None if exposed == camera.exposure_ms else exposed)
         if abs(scan.distance_px - sweep.step) > 1e-3 * sweep.step:
@@ -315,7 +310,7 @@ def _sweeps_of(
         notes += [f"{name}: {scan.note}"] if scan.note else []
         lines = position, time_s[own], exposure_ms[own], valid[own]
         sweeps.append(RecordedSweep(sweep, references, *lines, _line_reader(source, own)))
-    return sweeps
+    return sweeps, notes
 
 
 def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray[np.intp]], NDArray[np.uint16]]:
@@ -336,23 +331,24 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
     return read_lines
 
 
-def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, notes: list[str]) -> Floats:
+def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera) -> tuple[Floats, list[str]]:
     """Return (line,) times of mid exposure since the first exposure began [s]: as stated, by stamps, or even."""
     at = np.arange(source.shape[0])
+    notes: list[str] = []
     if stated_s is None and source.lines.time_s is not None:
         known_ms = camera.exposure_ms if source.lines.exposure_ms is None else source.lines.exposure_ms
         stated_s = source.lines.time_s + np.nanmedian(known_ms) * 5e-4
         notes.append("frames are taken to be stamped as their exposure begins")
     if stated_s is None or not np.isfinite(stated_s).any():
         notes.append(f"nothing says when lines were taken: one every {camera.frame_ms:g} ms is assumed")
-        return np.asarray(camera.mid_exposure_s(at.astype(np.float64)))
+        return np.asarray(camera.mid_exposure_s(at.astype(np.float64))), notes
     known = np.flatnonzero(np.isfinite(stated_s))
     filled = np.interp(at, known, stated_s[known])
     first, last = known[0], known[-1]
     period_s = np.median(np.diff(stated_s[known]) / np.diff(known)) if len(known) > 1 else camera.frame_ms * 1e-3
     filled[:first] += (at[:first] - first) * period_s  # beyond the known ones a line a period
     filled[last:] += (at[last:] - last) * period_s
-    return filled
+    return filled, notes
 
 
 def find_raw_cubes(address: str | Path) -> list[Path] | None:
@@ -367,7 +363,9 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
         return None
-    found = [path] if _is_raw_cube(path) else sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one))
+    found = (
+        [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr") if _is_raw_cube(one))
+    )
     return found or None
 
 
@@ -381,16 +379,8 @@ def _is_raw_cube(path: Path) -> bool:
         return False
 
 
-class RecordedRun(NamedTuple):
-    """Run whose lines are a recording, with the field's (y, x) size and place on the earth, if known."""
-
-    run: Run
-    shape: tuple[int, int] | None
-    geobox: GeoBox | None
-
-
-def find_recorded_run(address: str | Path) -> RecordedRun | None:
-    """Return the run of an address; None if the address is no archive's.
+def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None, GeoBox | None] | None:
+    """Return the run of an address, and size (y, x) and place of its field, if known; None if it is no archive's.
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
@@ -405,9 +395,9 @@ def find_recorded_run(address: str | Path) -> RecordedRun | None:
     frame = params.get("frame", {})
     grid = frame.get("grid", {})
     if not {"height", "width"} <= set(grid):
-        return RecordedRun(run, None, None)
+        return run, None, None
     shape = int(grid["height"]), int(grid["width"])
-    return RecordedRun(run, shape, geobox_of_record(frame, shape))
+    return run, shape, geobox_of_record(frame, shape)
 
 
 def _named_run(address: str | Path) -> tuple[str, str | None] | None:

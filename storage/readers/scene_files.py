@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,17 +19,11 @@ from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
-from spectralzoom.storage.readers.cube_sources import (
-    BLOCK_LINES,
-    Bands,
-    CubeSource,
-    check_memory,
-    scene_lines,
-    unpacked,
-)
+from spectralzoom.storage.readers.band_facts import Bands, bands_text
+from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, check_memory, scene_lines, unpacked
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
-from spectralzoom.storage.readers.open_cubes import open_cube, split_variable
+from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
 from spectralzoom.storage.readers.scene_toml import (
     SETTINGS_NAME,
     ClassValue,
@@ -65,6 +60,7 @@ class SceneFile:
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))  # (class, 3)
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     pixel_m: float | None = None  # side of a pixel on the ground, by scene.toml, if there is no geobox
+    acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     regridded: bool = False  # labels were resampled from another grid
     kept: NDArray[np.float32] | None = field(default=None, repr=False)  # all values, if they were kept in memory
 
@@ -94,10 +90,12 @@ def open_scene_file(
     WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(address)
-    source = open_cube(address)
+    source = open_cube_source(address)
     settings = find_scene_settings(file)
     height, width, count = source.shape
-    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
+    stated = wavelengths is not None or settings.wavelengths_nm is not None or settings.wavelengths_file is not None
+    known = [band for band in range(count) if stated or band not in source.bands.unknown]
+    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands, known)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
@@ -105,7 +103,7 @@ def open_scene_file(
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
     missing, filled_px, void, gaps = _find_gaps(file, values, kept)
-    found, label_note = _labels_of(file, source.shape[:2], source.geobox, labels, settings, classes or {})
+    found, label_note = _labels_of(file, source, labels, settings, classes or {})
     content = _content_hash(file, source.files)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     how, of_mask = values.notes(settings.path)
@@ -123,6 +121,7 @@ def open_scene_file(
         provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps, *label_note),
         geobox=source.geobox,
         pixel_m=None if source.geobox is not None else settings.pixel_m,
+        acquired=source.acquired,
         kept=kept,
     )
     if found is None:
@@ -167,16 +166,21 @@ def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
 
 
 def _chosen_bands(
-    bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
+    bands: Sequence[int] | None,
+    settings: SceneSettings,
+    count: int,
+    path: Path,
+    bad: Sequence[int],
+    known: Sequence[int],
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Return the chosen bands, else all that the file does not mark as bad, and a note."""
+    """Return the chosen bands, else those of known wavelength that the file does not mark as bad, and a note."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
-        good = [band for band in range(count) if band not in set(bad)]
-        if len(good) == count or not good:
-            return list(range(count)), ()
-        everything, left_out = bands_text(range(count)), bands_text(sorted(bad))
+        good = [band for band in known if band not in set(bad)]
+        if not bad or not good:
+            return list(known), ("every band is marked as bad: the marks are ignored",) if bad else ()
+        everything, left_out = bands_text(known), bands_text(sorted(bad))
         return good, (f"bands {left_out} are left out: the file marks them as bad; --bands {everything} takes all",)
     wrong = [band for band in chosen if not 0 <= band < count]
     if wrong or not chosen:
@@ -184,15 +188,14 @@ def _chosen_bands(
             f"{where}: {f'band {wrong[0]}' if wrong else 'an empty list'}, but {path} has bands 0..{count - 1} "
             f"(counted from 0); correct it"
         )
-    if len(set(chosen)) < len(chosen):
-        raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
+    if twice := sorted(band for band, times in Counter(chosen).items() if times > 1):
+        raise SceneError(f"{where} names bands {bands_text(twice)} twice; name each once")
     return [int(band) for band in chosen], ()
 
 
 def _labels_of(
     scene: Path,
-    shape: tuple[int, int],
-    geobox: GeoBox | None,
+    source: CubeSource,
     stated: str | Path | None,
     settings: SceneSettings,
     classes: Mapping[str, ClassValue],
@@ -202,21 +205,31 @@ def _labels_of(
     address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
     if address is None:
         return None, (why_none,) if why_none else ()
-    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
     try:
-        found = read_labels(address, shape, geobox, known)
+        found, notes = _read(address, source.shape[:2], source.geobox, settings, classes)
     except SceneError as error:
-        raise SceneError(f"{error}{FOUND}" if by_name else str(error)) from error
+        turned = "".join(f"; {note}" for note in source.notes if "orientation tag" in note)
+        raise SceneError(f"{error}{turned}{FOUND if by_name else ''}") from error
+    return found, ((f"{notes[0]}, found by its name" if by_name else notes[0]), *notes[1:])
+
+
+def _read(
+    address: str | Path,
+    shape: tuple[int, int],
+    geobox: GeoBox | None,
+    settings: SceneSettings,
+    classes: Mapping[str, ClassValue],
+) -> tuple[Labels, tuple[str, ...]]:
+    """Read labels, and return notes on where they and their classes come from (SceneError: they do not fit)."""
+    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
+    found = read_labels(address, shape, geobox, known)
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    return found, (f"labels from {address}{', found by its name' if by_name else ''}, {how}", *found.notes)
+    return found, (f"labels from {address}, {how}", *found.notes)
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
     """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
-    file, _ = split_variable(address)
-    found, notes = _labels_of(file, shape, None, address, find_scene_settings(file), {})
-    assert found is not None
-    return found, notes
+    return _read(address, shape, None, find_scene_settings(split_variable(address)[0]), {})
 
 
 def _digest(*parts: object) -> str:
@@ -340,17 +353,25 @@ def _find_gaps(
         without, rest = (
             [int(band) for band, there in zip(chosen, seen, strict=True) if there == wanted] for wanted in (False, True)
         )
-        take = f"take the others: bands = {rest} in a scene.toml beside it, or survey --bands {bands_text(rest)}"
-        raise SceneError(f"{path} has no value anywhere in bands {bands_text(without)} (from 0); {take}")
+        take = f'take the others: bands = "{bands_text(rest)}" in a {SETTINGS_NAME} beside it, or survey --bands'
+        raise SceneError(
+            f"{path} has no value anywhere in bands {bands_text(without)} (from 0); {take} {bands_text(rest)}"
+        )
     if absent:
         notes.append(f"missing samples: {absent} of {missing.size * len(chosen)}")
     return missing, filled_px, void, tuple(notes)
 
 
-def bands_text(bands: Sequence[int]) -> str:
-    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
-    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+def empty_bands(source: CubeSource, settings: SceneSettings) -> tuple[int, ...]:
+    """Return the bands (from 0) without a value anywhere; reading ends where each band has had one (SceneError)."""
+    height, _, count = source.shape
+    values = FileValues.of(source, list(range(count)), settings)
+    empty = np.ones(count, np.bool_)
+    for rows in cuts(height, BLOCK_LINES):
+        if not empty.any():
+            break
+        empty &= ~np.isfinite(values.converted(rows.start, rows.stop)[1]).any(axis=(0, 1))
+    return tuple(np.flatnonzero(empty).tolist())
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from spectralzoom.flows.evaluate.frames import observe_frame
+from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.tasks.scene import scene_of_file
 from spectralzoom.flows.training.data import load_data_set
 from spectralzoom.flows.training.train import train_weights
@@ -37,7 +38,6 @@ from spectralzoom.models.network.machine import one_thread
 from spectralzoom.models.policies.policies import score_patches
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns, segment
 from spectralzoom.models.training.examples import electrons_of
-from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.models.weights.files import Weights, load_weights
 from spectralzoom.pipeline.geometry.camera import LineCamera, expose, footprint
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
@@ -48,7 +48,6 @@ SCENE, MASK = "Indian_pines_corrected.npy", "indianpines_disjoint_dset.mat"
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # classes of the labels by the mask's numbers
 WINDOW = 5  # px a side of the means in the second round of the peers
 FRACTIONS = (0.0, 0.1, 0.2, 0.35, 1.0)  # of the patches, by entropy
-SETTINGS = TrainingSettings(steps=300, minutes=120)
 
 Values = NDArray[np.float32]
 Labels = NDArray[np.uint8]
@@ -163,7 +162,9 @@ def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[s
 
 def _trained(folder: Path, out: Path) -> Path:
     path = out / "pines.safetensors"
-    train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=SETTINGS))
+    classes = ",".join(map(str, MASK_CLASSES))
+    flags = TrainFlags(train_mask=str(folder / MASK), mask_classes=classes, steps=300, minutes=120)
+    train_weights(TrainRequest(str(folder / SCENE), path, flags))
     return path
 
 

@@ -16,9 +16,10 @@ from measure import ROOT
 from numpy.typing import NDArray
 from torch import Tensor
 
+from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.tasks.scene import scene_of_file
 from spectralzoom.flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
-from spectralzoom.flows.training.train_scenes import Common, TrainRequest, network_config
+from spectralzoom.flows.training.train_scenes import Common, network_config
 from spectralzoom.models.network.spectral import LineSpec, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import CaptureAugmentation, ColumnNoise, with_capture
 from spectralzoom.models.training.examples import measured_normalisation, normalised, observe
@@ -78,7 +79,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     normalisation = measured_normalisation(seen)
     examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
     common = Common(basis, first.class_names, first.class_colours, patch, first.wavelength_nm)
-    config = network_config(TrainRequest(name, Path(), patch=patch), common)
+    config = network_config(TrainFlags(patch=patch), common)
     start = linear_classifier(LabelledPixels.drawn(examples, rng), config.classes)
     if config.deep:
         start |= load_encoder()

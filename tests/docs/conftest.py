@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.docs.instrument_files import write_instrument_files
 from tests.prior_work import without_effects
 
 CAMERA = "[camera]\nsamples = 320\n"  # narrow, as most time of a small survey goes into samples outside of the field
@@ -52,6 +53,7 @@ def surveyed(
     for file, name in {"north": "north", "south": "south", "survey": "north"}.items():
         (folder / f"{file}.toml").write_text(SETTINGS.format(name=name))
     (folder / "camera.toml").write_text(CAMERA)
+    write_instrument_files(folder)
     with without_effects():
         for given in ({"budget": "0.6"}, {"accuracy": False}):
             survey_png(folder / "archive", name="north", **{"camera.samples": 320}, **given)

@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from spectralzoom.pipeline.errors import PipelineError
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from tests.envi_files import listed, write_cube
 
 SHAPE = (20, 12, 5)
@@ -176,7 +176,7 @@ def try_reading(address: Path) -> Reading:
     wrong = None
     try:
         with at_most(LONGEST_S):
-            source = open_cube(address)
+            source = open_cube_source(address)
             held = int(source.valid.sum())
             source.read(0, min(held, 64))
             source.read(max(held - 64, 0), held)

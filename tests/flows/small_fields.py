@@ -18,7 +18,7 @@ from tests.models.conftest import make_weights
 
 FRAMES = ("001", "002", "003")
 NAMES = ("soil", "crop")
-QUICK: dict[str, Any] = {"fractions": (0.25, 0.5), "policies": ("entropy", "random")}
+QUICK: dict[str, Any] = {"fractions": "0.25,0.5"}
 
 
 def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[str] = FRAMES, *, seed: int = 0) -> Path:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, write_class_tile
+from spectralzoom.storage.arrays.class_maps import ClassMap, create_class_map, write_class_tile
 from spectralzoom.storage.arrays.georeference import AngularGrid
 from spectralzoom.storage.runs import verify_everything
 from spectralzoom.storage.store import Archive, Ref, manifest_text
@@ -95,5 +95,5 @@ def problems(archive: Archive) -> list[str]:
 
 def write_class_map(path: Path, found: ClassMap, grid: AngularGrid | None = None) -> None:
     """Store a whole class map at once; stages write it tile by tile."""
-    create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=grid)
+    create_class_map(path, found.classes.shape, found.legend, grid=grid)
     write_class_tile(path, (0, 0), found.classes, found.confidence)

@@ -78,7 +78,7 @@ def test_training_leaves_out_a_tile_without_values(tiles: Path, tmp_path: Path, 
     assert "note: 1 scene without any value left out: 002" in ended.err
     assert "note: most values of 003 are negative, thus without light; add an offset" in ended.err
     assert "most values of 001" not in ended.err
-    judged = command_line("evaluate", tiles, "--weights", out, "--policies", "random", "--fractions", "0.5")
+    judged = command_line("evaluate", tiles, "--weights", out, "--fractions", "0.5")
     assert judged.code == 0, judged.err
     assert "note: 1 scene without any value left out: 002" in judged.err
     for number in ("001", "003", "004"):
@@ -94,7 +94,7 @@ def test_the_advised_evaluation_command_works(tiles: Path, tmp_path: Path, comma
     said = " ".join(ended.err.split())
     if held_out:
         assert f"spectralzoom evaluate {tiles} --weights {out}" in said
-        assert command_line("evaluate", tiles, "--weights", out, "--policies", "random").code == 0
+        assert command_line("evaluate", tiles, "--weights", out).code == 0
     else:
         assert f"spectralzoom evaluate OTHER_SCENES --weights {out}; or train with some held out" in said
 

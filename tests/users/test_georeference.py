@@ -16,6 +16,7 @@ import rioxarray  # noqa: F401 - registers the accessor
 import xarray as xr
 from affine import Affine
 from odc.geo.geobox import GeoBox
+from pyproj import CRS
 from rasterio.enums import ColorInterp
 
 import spectralzoom.models.reading.prior_map as prior_map
@@ -70,10 +71,22 @@ def envi(folder: Path) -> tuple[Path, Affine]:
         return folder / "a.hdr", file.transform
 
 
+def in_km(folder: Path) -> tuple[Path, Affine]:
+    """Write NetCDF with coordinates in km and a CRS in metres."""
+    rows, columns = np.arange(SHAPE[0]) + 0.5, np.arange(SHAPE[1]) + 0.5
+    axes = {"y": (NORTH_UP.f + NORTH_UP.e * rows) / 1e3, "x": (NORTH_UP.c + NORTH_UP.a * columns) / 1e3}
+    about = {"crs": ((), 0, CRS.from_epsg(32632).to_cf()), "wavelength": ("band", np.array(RGB_NM), {"units": "nm"})}
+    image = {"v": (("y", "x", "band"), PIXELS, {"grid_mapping": "crs"}), **about}
+    content = xr.Dataset(image, {name: (name, one, {"units": "km"}) for name, one in axes.items()})
+    content.to_netcdf(folder / "a.nc", engine="h5netcdf")
+    return folder / "a.nc", NORTH_UP
+
+
 KINDS: dict[str, Callable[[Path], tuple[Path, Affine]]] = {
     "GeoTIFF": lambda folder: (write_geotiff(folder / "a.tif", NORTH_UP), NORTH_UP),
     "turned GeoTIFF": lambda folder: (write_geotiff(folder / "a.tif", TURNED), TURNED),
     "turned ENVI": envi,
+    "NetCDF in km": in_km,
 }
 
 
@@ -103,7 +116,8 @@ def corners_px(found: Any, wanted: Affine, shape: tuple[int, int]) -> float:
 def test_products_have_the_position_of_their_scene(tmp_path: Path, weights: Path, kind: str) -> None:
     """All corners lie within 0.1 px of the source's, in stores (odc-geo, rioxarray) and exports (GDAL)."""
     scene, transform = KINDS[kind](tmp_path)
-    run = survey(scene, weights, tmp_path / "archive", **FILE_ALONE if kind == "turned ENVI" else {})
+    run = survey(scene, weights, tmp_path / "archive", **{} if "GeoTIFF" in kind else FILE_ALONE)
+    assert sum(run.receipt["areas"]["ha"].values()) == pytest.approx(np.prod(SHAPE) * 0.05**2 / 1e4, rel=2e-3)
     for product, name in (("class_map", "classes"), ("mosaic", "scores")):
         found = opened(run, product)[name]
         shape = (found.sizes["y"], found.sizes["x"])

@@ -12,7 +12,7 @@ import pytest
 from affine import Affine
 from PIL import Image
 
-from spectralzoom.flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
+from spectralzoom.flows.evaluate.frames import open_candidates, open_frames, sort_frames
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.flows.training.data import load_data_set, open_training_data
@@ -85,6 +85,60 @@ def test_init_lists_unusable_files_and_missing_facts(made: Path, command_line: A
     (made / "scene.toml").unlink()
 
 
+def stripes(*numbers: int, gap: int | None = 0) -> np.ndarray:
+    """Return a picture with a stripe for each number, between stripes of the gap."""
+    return np.tile(np.repeat([one for n in numbers for one in (n, gap) if one is not None], 4), (24, 1)).astype(
+        np.uint8
+    )
+
+
+@pytest.mark.parametrize(
+    ("labels", "unlabelled", "words"),
+    [
+        (
+            stripes(1, 2, 3, 4, 5, 6),
+            0,
+            r"label 0 \(50.0% of the pixels\) means no class; if it is one, remove unlabelled",
+        ),
+        (
+            stripes(0, 1, 2, 3, gap=None),
+            None,
+            r"label 0 .* is a class; if it means none, write unlabelled = 0 and remove",
+        ),
+        (stripes(1, 2), None, "label 0 .* is a class"),  # soil, crop and weed
+        (stripes(0, 1, 2, 255, gap=None), 255, r"label 255 \(25.0% of the pixels\) means no class"),
+        (stripes(255), None, r"label 255 .* is a class"),
+        (
+            np.array([[0] * 3, [0, 255, 0], [255, 0, 0]], np.uint8)[stripes(1, 2)],
+            None,
+            r"label \[0, 0, 0\] .* is a class",
+        ),
+        (stripes(1, 2, gap=None), None, "next: spectralzoom train"),
+    ],
+)
+def test_init_ends_with_its_assumption(
+    labels: np.ndarray, unlabelled: int | None, words: str, tmp_path: Path, command_line: Any
+) -> None:
+    """Labels such as 0 may mean no class: the last line says what scene.toml takes them for, and how to change it."""
+    Image.fromarray(labels).save(tmp_path / "a_mask.png")
+    Image.fromarray(np.zeros((*labels.shape[:2], 3), np.uint8)).save(tmp_path / "a.png")
+    last = command_line("init", tmp_path / "a.png").out.strip().splitlines()[-1]
+    assert re.search(words, last)
+    found = load_scene_settings(tmp_path / "scene.toml")
+    assert found.unlabelled == unlabelled
+    assert unlabelled not in found.classes.values()
+
+
+def test_init_keeps_what_scene_toml_says_of_label_0(tmp_path: Path, command_line: Any) -> None:
+    """With --force a value that was a class stays one, and one that was none stays none."""
+    np.save(tmp_path / "a.npy", np.zeros((24, 48, 3)))
+    np.save(tmp_path / "a_gt.npy", stripes(1, 2, 3, 4, 5, 6))
+    for text, classes in (("[classes]\nsoil = 0\n", range(7)), ("unlabelled = 0\n", range(1, 7))):
+        (tmp_path / "scene.toml").write_text(text)
+        assert command_line("init", tmp_path / "a.npy", "--force").code == 0
+        assert list(load_scene_settings(tmp_path / "scene.toml").classes.values()) == list(classes)
+
+
 def test_init_asks_for_repair_of_labels_of_another_size(tmp_path: Path, command_line: Any) -> None:
     """If no label file fits, the next step is the same command with --force."""
     for name, size in (("001", 32), ("001_mask", 24)):
@@ -118,7 +172,7 @@ def test_training_and_evaluation_note_shifted_labels(tmp_path: Path, command_lin
     ended = command_line("train", folder, "-o", out, "--validation", "1", "--hold-out", "003", *SMALL)
     assert ended.code == 0, ended.err
     assert re.findall(r"note: labels of (.*) have another place", ended.err) == ["002"]
-    judged = command_line("evaluate", folder, "--weights", out, "--policies", "random", "--fractions", "0.5")
+    judged = command_line("evaluate", folder, "--weights", out, "--fractions", "0.5")
     assert judged.code == 0, judged.err + judged.out
     assert re.findall(r"note: labels of (.*) have another place", judged.err) == ["003"]
 
@@ -142,5 +196,5 @@ def test_an_evaluation_notes_frames_of_a_single_class(made: Path, weights: Path)
     """The note asks whether the value of that class means unlabelled."""
     candidates = open_candidates((weights,))
     data = open_frames(str(made / "soil"), (), None, LineCamera(), {"labels": None, "bands": None, "wavelengths": None})
-    jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)
+    jobs = sort_frames(data, candidates, lambda *words: None)
     assert jobs.notes[0].startswith("all labels are class_0 in 001, 002; if its value")

@@ -7,8 +7,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import geopandas
 import numpy as np
+import pandas as pd
 import pytest
+import rasterio
 import rioxarray  # noqa: F401 - registers the accessor that users have
 import xarray as xr
 from rasterio.transform import from_origin
@@ -23,6 +26,7 @@ __all__ = ["command_line"]
 
 SENTINEL_NM = (443, 490, 560, 665, 705, 740, 783, 842, 865, 945, 1375, 1610, 2190)  # none between 1610 and 2190
 SIDE = 32
+NUMBERS = np.array([3, 7, 200], np.uint8)  # of the classes in the label files
 SMALL = ["--steps", "2", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
 PLAIN = ["--engine", "plain"]
 
@@ -37,7 +41,7 @@ def write_tile(folder: Path, number: int) -> None:
     with write(folder / "images" / f"t{number}.tif", np.moveaxis(values, 2, 0), **place) as file:
         for band, centre in enumerate(SENTINEL_NM, 1):
             file.update_tags(band, wavelength=str(centre), wavelength_units="nm")
-    write(folder / "labels" / f"t{number}.tif", labels[None], **place).close()
+    write(folder / "labels" / f"t{number}.tif", NUMBERS[labels][None], **place).close()
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +89,29 @@ def test_a_training_scene_and_lacking_bands_are_marked(made: Path, tmp_path: Pat
     assert "spectral features" not in said
     assert "training_scene" not in receipt
     assert "*" not in command_line("ls", tmp_path / "b").out
+
+
+def test_maps_and_exports_have_the_numbers_of_the_label_files(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """The GeoTIFF compares with the label file pixel by pixel; legend, areas, polygons and Python have its numbers."""
+    survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "a")
+    ended = command_line("export", tmp_path / "a", "-o", tmp_path / "maps", "--polygons")
+    assert ended.code == 0, ended.err
+    run = open_archive(tmp_path / "a").latest
+    with rasterio.open(tmp_path / "maps" / run.folder.name / "class_map.tif") as file:
+        drawn, tags, colours = file.read(1), file.tags(1), file.colormap(1)
+    with rasterio.open(made / "field" / "labels" / "t0.tif") as file:
+        assert (file.read(1) == drawn).mean() > 0.8
+    assert {name: tags[name] for name in tags if name.startswith("CLASS")} == {
+        f"CLASS_{n}": f"class_{n}" for n in (3, 7, 200)
+    }
+    table = pd.read_csv(tmp_path / "maps" / run.folder.name / "areas.csv")
+    assert dict(zip(table["class"], table["value"], strict=True)) == {f"class_{n}": n for n in (3, 7, 200)}
+    assert table["pixels"].tolist() == [(drawn == n).sum() for n in (3, 7, 200)]
+    regions = geopandas.read_file(tmp_path / "maps" / run.folder.name / "classes.gpkg")
+    assert {(n, f"class_{n}") for n in (3, 7, 200)} == set(zip(regions["class"], regions["name"], strict=True))
+    assert {"#" + bytes(colours[7][:3]).hex()} == set(regions["colour"][regions["class"] == 7])
+    np.testing.assert_array_equal(run.class_map, drawn)
+    assert run.class_map.attrs["flag_values"] == [3, 7, 200]
 
 
 def test_products_of_a_run_are_written_as_netcdf_and_zarr(made: Path, tmp_path: Path, command_line: Any) -> None:

@@ -279,6 +279,28 @@ def test_a_straight_scan_is_surveyed_as_a_recording(
     assert published.receipt["recording"]["lines_read"] == 96
 
 
+def mosaic_of(archive: Path, published: Published) -> NDArray[np.floating]:
+    """Return the values of a mosaic as means of 4 x 4 px, without its rim."""
+    return block_means(open_mosaic(archive / published.receipt["products"]["mosaic"]).values(), 4)[2:20, 2:14]
+
+
+def test_lines_are_scaled_by_their_own_exposure(tmp_path: Path, pushbroom: Pushbroom, weights: Path) -> None:
+    """Lines of 5 and 10 ms below a white frame of 10 ms give one field, also from the signal that a run stored."""
+    folder, values = pushbroom
+    expected = mosaic_of(tmp_path / "a", survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights)))
+    ms = np.where(np.arange(96) // 12 % 2, 5, 10)
+    numbers = np.rint(60 + (values.astype(np.float64) - 60) * ms[:, None, None] / 10).astype(np.uint16)
+    write_envi_cube(folder / "scan.img", numbers, wavelength="{640, 550, 460}")
+    table(folder, "position_px,exposure_ms", [f"{line},{one}" for line, one in enumerate(ms)])
+    header = folder / "scan.white.hdr"
+    header.write_text(header.read_text() + "exposure (ms) = 10\n")
+    scaled = survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights))
+    assert any("the lines with 5 to 10 ms: values are scaled" in note for note in scaled.receipt["settings"]["notes"])
+    again = survey_sweeps(tmp_path / "c", scaled.folder)
+    for archive, published in ((tmp_path / "b", scaled), (tmp_path / "c", again)):
+        np.testing.assert_allclose(mosaic_of(archive, published), expected, atol=2e-3)
+
+
 def test_a_line_may_have_fewer_samples_than_a_scan_has_steps(tmp_path: Path, make_weights: WeightsMaker) -> None:
     """Scans of more steps than samples are not offered, as their overlap would refuse the survey."""
     folder = write_pushbroom(tmp_path / "drone", np.full((96, 1, 3), 900, np.uint16))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.envi_headers import EnviHeader, parse_envi_header
 from spectralzoom.pipeline.errors import RigError, SceneError, ShapeError
+from spectralzoom.pipeline.exposures import Taken, match_exposures, taken_with
 from spectralzoom.pipeline.rig.camera.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.pipeline.signal.calibrate import find_bad_elements
 from spectralzoom.pipeline.source import References
@@ -33,6 +34,7 @@ class CubeLines:
 
     values: NDArray[np.uint16]  # (line, sample, band), a view of the bytes
     lost: int
+    taken: Taken = field(default_factory=Taken)
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
     stated = found.offset + (found.lines or 0) * found.line_bytes
     if len(data) > stated:
         raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {stated}; is it another file's?")
-    return cube_lines(found, data)
+    return replace(cube_lines(found, data), taken=taken_with(by_name[name], found.fields, found.settings))
 
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
@@ -145,6 +147,7 @@ class MeanFrame:
 
     mean: NDArray[np.float32]  # (sample, band) DN
     stuck: NDArray[np.bool_]  # (sample, band) the same number in every frame while the others change
+    taken: Taken = field(default_factory=Taken)
 
 
 def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
@@ -160,12 +163,15 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
     return MeanFrame((lines.sum(axis=0, dtype=np.int64) / len(lines)).astype(np.float32), stuck)
 
 
-def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0) -> References:
-    """Join dark and white into the references of a sweep.
+def as_references(
+    dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0, exposure_ms: float | None = None
+) -> tuple[References, list[str]]:
+    """Join dark and white into the references of a sweep, and return notes.
 
     An element is bad where its dark frame is stuck, or `pipeline.signal.calibrate.find_bad_elements` finds it bad.
-    ``white_reference`` is the value of the white reference, one or (band,). Raises RigError: the frames are of two
-    sizes, swapped or without light.
+    ``white_reference`` is the value of the white reference, one or (band,). ``exposure_ms`` is that of the lines; a
+    frame without a stated exposure has it. Raises RigError: the frames are of two sizes, swapped or without light, or
+    the dark frame was taken with an exposure that does not fit.
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
@@ -175,4 +181,12 @@ def as_references(dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLi
             f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
         )
     values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
-    return References(dark.mean, white.mean, values, find_bad_elements(dark.mean, white.mean) | dark.stuck)
+    found = References(dark.mean, white.mean, values, find_bad_elements(dark.mean, white.mean) | dark.stuck)
+    stated = {kind: (one.mean, one.taken) for kind, one in (("dark", dark), ("white", white)) if one.taken.exposures}
+    if exposure_ms is None or not stated:
+        return found, []
+    try:
+        white_ms, notes = match_exposures(stated, Taken(), np.array([exposure_ms]), stated=True)
+    except SceneError as error:
+        raise RigError(f"{error}; take both again") from error
+    return replace(found, exposure_ms=white_ms), notes

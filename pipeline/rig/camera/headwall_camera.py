@@ -11,6 +11,7 @@ import logging
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from spectralzoom.pipeline.errors import RigError
@@ -171,7 +172,7 @@ class HeadwallCamera:
         files = [file for file in self._finished(folder) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
         cubes = read_references([file.name for file in files], _reader(kept))
-        return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
+        return {kind: replace(mean_frame(cube.values), taken=cube.taken) for kind, cube in cubes.items()}
 
     def close(self) -> None:
         """Send exit and close the connection. A capture continues; nothing is raised."""

@@ -143,10 +143,12 @@ class RasterScene:
     fwhm_nm: NDArray[np.float64] | None = None  # (band,) widths; None where not known
     class_names: tuple[str, ...] = ()
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    class_values: tuple[int, ...] = ()  # number of each class in maps, 0 to 254; empty: 0, 1, 2, ...
     filled_px: int = 0  # pixels that came without a value in a band
     missing: NDArray[np.bool_] | None = None  # (y, x) pixels without a value in most bands; None: no such pixel
     geobox: GeoBox | None = None  # place of the pixels on the earth; None where the scene's file has none
     pixel_m: float | None = None  # size of a pixel on the ground of a scene without a place, where its law states it
+    acquired: str | None = None  # when the light of its file was captured: a day or a moment in UTC, ISO 8601
     regridded: bool = False  # the labels came on another grid and were brought to the scene's
     content: tuple[str, ...] = ()  # hashes of the files that it was read from, whatever bands of them are taken
     light_fraction: float = 1.0  # over a clear sky's light; electrons have it in them, scene values do not

@@ -139,8 +139,8 @@ def test_the_catalogue_is_valid_and_leads_to_every_file(exports: list[Exported])
     ("source", "visit", "observed"),
     [
         ("rig", "2026-06-21", ("2026-06-21T08:00:00Z", "2026-06-21T08:05:00Z")),
-        ("rig", "2026-06-20", ("2026-06-20T00:00:00+00:00",) * 2),
-        ("raster", "2026-06-21", ("2026-06-21T00:00:00+00:00",) * 2),
+        ("rig", "2026-06-20", ("2026-06-20T00:00:00+00:00", "2026-06-20T23:59:59+00:00")),
+        ("raster", "2026-06-21", ("2026-06-21T00:00:00+00:00", "2026-06-21T23:59:59+00:00")),
         ("raster", None, ("2026-06-21T08:00:00Z", "2026-06-21T08:05:00Z")),
     ],
 )
@@ -219,10 +219,10 @@ def test_missing_runs_and_bad_folders_are_refused(posed: Exported, tmp_path: Pat
 
 
 def test_a_missing_store_is_reported(posed: Exported, tmp_path: Path) -> None:
-    """The message has product and remedy, and no catalogue is written."""
+    """The message has the store and a remedy, and no catalogue is written."""
     archive = Path(shutil.copytree(posed.archive, tmp_path / "field-a"))
     shutil.rmtree((archive / posed.receipt["products"]["attention"]).parent)
-    with pytest.raises(IncompleteStoreError, match=r"the attention of run .* does not; run its survey again"):
+    with pytest.raises(IncompleteStoreError, match=r"is damaged: it is not there; restore it from a copy"):
         run_export(archive, posed.id, tmp_path / "out", console=QUIET)
     assert not (tmp_path / "out" / "collection.json").exists()
 

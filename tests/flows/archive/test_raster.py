@@ -15,6 +15,7 @@ import xarray
 from affine import Affine
 from numpy.typing import NDArray
 
+import spectralzoom
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.archive.export_layers import ProductFlags
 from spectralzoom.flows.settings.load import load_settings
@@ -153,7 +154,7 @@ def test_areas_need_no_geographic_place(surveyed: Raster, tmp_path: Path, pixel_
 
 
 def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
-    """Reflectance and NDVI are the file's as rasterio reads it, on its grid and CRS."""
+    """Reflectance, by rising wavelength, and NDVI are the file's as rasterio reads it, on its grid and CRS."""
     values = (patchy_scene((50, 70), 3, seed=7)[0] / 255).astype(np.float32)
     source = write_tif(tmp_path / "field.tif", values)
     published = surveyed(source, wavelengths="670,550,800", weights=str(make_weights((550.0, 670.0, 800.0))))
@@ -162,7 +163,7 @@ def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, make_weights: We
     folder = tmp_path / "out" / published.folder.name
     with rasterio.open(folder / "reflectance.tif") as exported, rasterio.open(source) as own:
         assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)
-        np.testing.assert_allclose(exported.read(), own.read(), atol=rounding(values))
+        np.testing.assert_allclose(exported.read(), own.read([2, 1, 3]), atol=rounding(values))
     ndvi = (values[..., 2] - values[..., 0]) / (values[..., 2] + values[..., 0])
     with rasterio.open(folder / "NDVI.tif") as exported:
         assert np.sqrt(np.mean((exported.read(1) - ndvi) ** 2)) < 0.01
@@ -201,3 +202,23 @@ def test_tiles_are_refused(surveyed: Raster, tmp_path: Path, address: str) -> No
     write_tif(tmp_path / "tiles" / "a.tif", patchy_scene((16, 16), 3, seed=1)[0])
     with pytest.raises(SceneError, match=r"make one file first: rio merge tiles/\*\.tif field\.tif"):
         surveyed(tmp_path / address, wavelengths="640,550,460")
+
+
+def test_bands_of_two_detectors_leave_sorted(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
+    """Opened cube, its Zarr copy and the exported image have rising wavelengths and the detector of each band."""
+    centres = [500.0, 600.0, 700.0, 650.0, 700.0, 800.0]
+    values = (patchy_scene((32, 40), 6, seed=3)[0] / 255).astype(np.float32)
+    source = write_tif(tmp_path / "field.tif", values, None)
+    surveyed(source, wavelengths=",".join(map(str, centres)), weights=str(make_weights(tuple(centres))))
+    cube = spectralzoom.open(tmp_path / "archive").latest.mosaic
+    cube.to_dataset(name="values").to_zarr(tmp_path / "copy.zarr", zarr_format=3, consolidated=False)
+    copy = xarray.open_zarr(tmp_path / "copy.zarr", consolidated=False)["values"].set_xindex("wavelength")
+    for one in (cube, copy):
+        near = one.sel(wavelength=660, method="nearest")
+        np.testing.assert_allclose(near, values[..., 3], atol=rounding(values))
+        assert one.detector.values.tolist() == [0, 0, 1, 0, 1, 1]
+    done = run_export(tmp_path / "archive", None, tmp_path / "out", QUIET, ProductFlags(reflectance=True))
+    with rasterio.open(tmp_path / "out" / done["files"]["reflectance"]) as file, rasterio.open(source) as own:
+        np.testing.assert_allclose(file.read(), own.read([1, 2, 4, 3, 5, 6]), atol=rounding(values))
+        assert [file.tags(band)["detector"] for band in file.indexes] == list("001011")
+        assert file.descriptions[2:4] == ("650.0 nm, detector 1", "700.0 nm, detector 0")

@@ -13,14 +13,14 @@ from rich.console import Console
 
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
-from spectralzoom.flows.evaluate.frames import EvaluateRequest, observe_frame, open_candidates
+from spectralzoom.flows.evaluate.frames import observe_frame, open_candidates
 from spectralzoom.flows.evaluate.judge import ALL, NONE, Choice, Row, counts_of, judge_frame, seeds_of, summarise
+from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import farm_test_data
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
-from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.models.weights.files import load_weights, save_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -35,42 +35,39 @@ def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any
     return next(row for row in content["rows"] if (row["policy"], row["fraction"]) == (policy, fraction))
 
 
-TRIAL = EvaluateRequest("field", (), fractions=(0.5,), policies=("entropy",))
-
-
 def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
     """Rows hold the mean over the seeds, its spread and costs; the folder holds evaluation.json alone."""
     request, content = judged
     keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
-    policies = [(policy, fraction) for policy in ("entropy", "random") for fraction in (0.25, 0.5)]
+    policies = [(policy, fraction) for policy in ("gain", "random") for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
     assert {path.name for path in request.out.iterdir()} == {"evaluation.json"}
     assert json.loads((request.out / "evaluation.json").read_text())["rows"][1]["miou"] == content["rows"][1]["miou"]
-    row = _row(content, "entropy", 0.25)
+    row = _row(content, "gain", 0.25)
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
     assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
     assert len(row["by_seed"]) == 2
     for column in ("patches", "multiply_adds"):  # more patches cost more
-        assert row["cost"][column]["done"] < _row(content, "entropy", 0.5)["cost"][column]["done"]
+        assert row["cost"][column]["done"] < _row(content, "gain", 0.5)["cost"][column]["done"]
     assert _row(content, "all", 1.0)["cost"]["patches"]["ratio"] == 1.0
 
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Trained weights are judged on the frames that were held out or kept for validation."""
-    settings = TrainingSettings(steps=1, batch=1, crop=16)
+    quick = TrainFlags(hold_out="003", validation=1, patch=8, dim=16, steps=1, batch=1, crop=16)
     out = tmp_path / "w.safetensors"
-    train_weights(TrainRequest(str(data), out, ("003",), 1, patch=8, width=4, settings=settings))
+    train_weights(TrainRequest(str(data), out, quick))
     split = load_weights(out).record["split"]
-    content = evaluate_weights(EvaluateRequest(str(data), (out,), **QUICK))
+    content = evaluate_weights(str(data), EvaluateFlags(weights=(out,), **QUICK))
     assert content["weights"][0]["left_out"] == sorted(split["train"])
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["left_out"] == sorted(split["train"])
     with pytest.raises(SceneError, match="frames trained on are refused"):
-        evaluate_weights(EvaluateRequest(str(data), (out,), frames=tuple(split["train"])))
+        evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=",".join(split["train"])))
     with pytest.raises(SceneError, match=rf"no weights are left for {next(iter(split['train']))}: "):
-        evaluate_weights(EvaluateRequest(str(data), (out,), frames=FRAMES))
+        evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=",".join(FRAMES)))
 
 
 def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
@@ -78,13 +75,13 @@ def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
     scenes = {name: scene_at(data, name).key for name in FRAMES}
     first = write_weights(tmp_path / "a.safetensors", 0, split={"train": {"001": scenes["001"]}})
     second = write_weights(tmp_path / "b.safetensors", 1, split={"train": {n: scenes[n] for n in ("002", "003")}})
-    content = evaluate_weights(EvaluateRequest(str(data), (first, second), **QUICK))
+    content = evaluate_weights(str(data), EvaluateFlags(weights=(first, second), **QUICK))
     assert [(one["frames"], one["left_out"]) for one in content["weights"]] == [(2, ["001"]), (1, ["002", "003"])]
     assert content["frames"] == list(FRAMES)
     assert sum(content["support"].values()) == 3 * 24 * 40
     assert content["seeds"] == [["a.safetensors", "b.safetensors"]]
     assert content["rows"][0]["spread"] is None
-    alone = evaluate_weights(EvaluateRequest(str(data), (first, second), frames=("001",), **QUICK))
+    alone = evaluate_weights(str(data), EvaluateFlags(weights=(first, second), frames="001", **QUICK))
     assert [weights["covers"] for weights in alone["weights"]] == [[], ["001"]]
 
 
@@ -95,10 +92,10 @@ def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path
     for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
         split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": {validated: keys[validated]}}
         paths.append(write_weights(tmp_path / f"{number}.safetensors", number, data="field", split=split))
-    content = evaluate_weights(EvaluateRequest(str(data), tuple(paths), **QUICK))
+    content = evaluate_weights(str(data), EvaluateFlags(weights=tuple(paths), **QUICK))
     assert [one["covers"] for one in content["weights"]] == [["001"], ["002"]]
     assert content["seeds"] == [["0.safetensors", "1.safetensors"]]
-    alone = evaluate_weights(EvaluateRequest(str(data), (paths[0],), **QUICK))
+    alone = evaluate_weights(str(data), EvaluateFlags(weights=(paths[0],), **QUICK))
     assert alone["frames"] == ["001", "002"]
     assert "thresholds by 002: scores of these" in " ".join(alone["data_notes"])
 
@@ -118,17 +115,16 @@ def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Pat
         for number, half in enumerate((halves[0], halves[1], halves[0]))
     ]
     with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
-        evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[1]), frames=("001",), **QUICK))
-    content = evaluate_weights(EvaluateRequest(str(data), (paths[0], paths[2]), frames=("001",), **QUICK))
+        evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[1]), frames="001", **QUICK))
+    content = evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[2]), frames="001", **QUICK))
     assert sum(content["support"].values()) == 12 * 40
 
 
 def test_training_frames_are_recognised_in_other_bands(data: Path, tmp_path: Path):
     """The content of the files identifies a frame, not the bands that are read."""
     split = {"train": {"001": "of other bands"}, "content": list(scene_at(data).content)}
-    quick = {**QUICK, "policies": (), "fractions": ()}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
-    assert evaluate_weights(EvaluateRequest(str(data), weights, **quick))["left_out"] == ["001"]
+    assert evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))["left_out"] == ["001"]
 
 
 def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
@@ -137,7 +133,7 @@ def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
     split = {"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(np.ones(scene.shape, bool))}}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
     with pytest.raises(SceneError, match="no labelled pixel is left on the 1 frames"):
-        evaluate_weights(EvaluateRequest(str(data), weights, frames=("001",), **QUICK))
+        evaluate_weights(str(data), EvaluateFlags(weights=weights, frames="001", **QUICK))
 
 
 def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
@@ -160,12 +156,12 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     kept: list[bool] = []
     monkeypatch.setattr("spectralzoom.flows.evaluate.command.keep_freed_memory", lambda: kept.append(True))
     weights = (write_weights(tmp_path / "w.safetensors"),)
-    request = EvaluateRequest(str(data), weights, frames=("001",), **QUICK)
-    row = run_evaluate(request, Console(stderr=True))["rows"][0]
+    flags = EvaluateFlags(weights=weights, frames="001", **QUICK)
+    row = run_evaluate(str(data), flags, Console(stderr=True))["rows"][0]
     assert kept == [True]
     loaded = load_weights(weights[0])
-    scan_pass = observe_frame(scene_at(data), "001", loaded, LineCamera(), 0)
-    (counts,) = judge_frame(TRIAL, scan_pass, loaded)[NONE].counts
+    frame = observe_frame(scene_at(data), "001", loaded, LineCamera(), 0)
+    (counts,) = judge_frame(*frame, 3, loaded, (), 0)[NONE].counts
     assert row["pixel_accuracy"] == overall_accuracy(counts)
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
@@ -176,7 +172,7 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
 def test_miou_of_frames_comes_from_their_summed_counts():
     """The order of the frames has no effect."""
     run = _judged("abcd", np.random.default_rng(0))
-    there, back = (summarise([dict(order)], ("a", "b"), TRIAL) for order in (run.items(), [*run.items()][::-1]))
+    there, back = (summarise([dict(order)], ("a", "b"), (0.5,)) for order in (run.items(), [*run.items()][::-1]))
     assert json.dumps(there["rows"][0], sort_keys=True) == json.dumps(back["rows"][0], sort_keys=True)
     assert there["rows"][0]["miou"] == mean_iou(counts_of([run], NONE).sum(axis=(0, 1, 2)))
 
@@ -185,7 +181,7 @@ def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, caps
     """The mean is taken over the classes of all frames' labels."""
     counts = [[[8, 0, 2], [1, 9, 0], [0, 0, 0]], [[7, 3, 0], [0, 10, 0], [0, 0, 0]]]
     run = {str(number): dict.fromkeys(CHOICES, Row(np.array([one]), 2, 3)) for number, one in enumerate(counts)}
-    found = summarise([run], ("soil", "crop", "weed"), TRIAL)
+    found = summarise([run], ("soil", "crop", "weed"), (0.5,))
     row = found["rows"][0]
     assert row["miou"] == pytest.approx(np.mean([15 / 21, 19 / 23]))
     assert row["false_classes"] == {"weed": 2}
@@ -194,7 +190,7 @@ def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, caps
     assert "2 px false" in capsys.readouterr().out
 
 
-CHOICES: tuple[Choice, ...] = (NONE, ("entropy", 0.5), ALL)
+CHOICES: tuple[Choice, ...] = (NONE, ("gain", 0.5), ("random", 0.5), ALL)
 
 
 def _judged(names: str, rng: np.random.Generator) -> dict[str, dict[Choice, Row]]:
@@ -219,8 +215,7 @@ def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("spectralzoom.models.training.examples.chosen_effects", lambda *_: USUAL)
     weights = tmp_path / "w.safetensors"
     save_weights(replace(make_weights(classes=len(CLASSES), columns=6), class_names=CLASSES), weights)
-    quick = {**QUICK, "policies": ("entropy",), "fractions": (0.25,)}
-    content = evaluate_weights(EvaluateRequest("farm", (weights,), scenes=2, **quick))
+    content = evaluate_weights("farm", EvaluateFlags(weights=(weights,), scenes=2, fractions="0.25"))
     assert content["frames"] == [*farm_test_data(2, LineCamera()).train]
     assert 0 <= _row(content, "none", 0.0)["miou"] <= 1
 
@@ -228,29 +223,28 @@ def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"fractions": (10.0,)}, "--fractions are fractions of the patches from 0 to 1"),
-        ({"policies": ("mask",)}, "'mask' cannot be judged"),
+        ({"fractions": "10"}, "--fractions are fractions of the patches from 0 to 1"),
         ({"seed": -1}, "--seed must be at least 0"),
         ({"scenes": 2}, "--scenes is for built-in scenes"),
-        ({"frames": ("099",)}, "has no frame 099; it has 001, 002, 003"),
+        ({"frames": "099"}, "has no frame 099; it has 001, 002, 003"),
     ],
 )
 def test_invalid_requests_are_refused(data: Path, tmp_path: Path, change: dict[str, Any], words: str):
     """The message names the flag, or lists the existing frames."""
-    request = EvaluateRequest(str(data), (write_weights(tmp_path / "w.safetensors"),), **QUICK)
+    flags = EvaluateFlags(weights=(write_weights(tmp_path / "w.safetensors"),), **QUICK | change)
     with pytest.raises(SettingsError, match=words):
-        evaluate_weights(replace(request, **change))
+        evaluate_weights(str(data), flags)
 
 
 def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path):
     """Rows, classes and notes are printed from the stored evaluation; --json prints one object on stdout."""
-    run_evaluate(judged[0], Console(stderr=True))
+    run_evaluate(str(data), judged[0], Console(stderr=True))
     shown = capsys.readouterr()
-    for words in ("entropy", "MACs", "crop", "standard deviation over seeds"):
+    for words in ("gain", "MACs", "crop", "standard deviation over seeds"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
     weights = write_weights(tmp_path / "w.safetensors")
-    words = ["evaluate", str(data), "--weights", str(weights), "--fractions", "0.5", "--policies", "entropy", "--json"]
+    words = ["evaluate", str(data), "--weights", str(weights), "--fractions", "0.5", "--json"]
     with pytest.raises(SystemExit) as left:
         main([*words, "--frames", "001"])
     assert left.value.code == 0

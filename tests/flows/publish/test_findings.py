@@ -17,7 +17,7 @@ from spectralzoom.models.evaluation.expected_scores import MapScores, expected_c
 from spectralzoom.models.weights.files import MAP_SCORES, TRAINED_ON, _add_part, load_weights, save_weights, with_record
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import NoPlace
-from spectralzoom.storage.arrays.class_maps import ClassMap
+from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames
 from tests.conftest import CLASSES, Survey
 from tests.flows.tasks.test_unlike_training import SEEN, of_other_scenes
 
@@ -34,7 +34,7 @@ def test_changed_hectares_are_listed_by_pair_of_classes() -> None:
     names = "soil", "crop", "weed", *(f"class_{number}" for number in range(3, 16))  # one pair has the number 255
     legend = names, np.zeros((16, 3), np.uint8)
     beyond = {("soil", "crop"): 1.0, ("soil", "weed"): 0.5}
-    found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend), beyond)
+    found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), ClassNames(*legend)), beyond)
     assert [(round(area, 6), *pair) for area, *pair in found] == [(0.02, "soil", "crop"), (0.005, "soil", "weed")]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
-from spectralzoom.flows.evaluate.frames import EvaluateRequest
+from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.tasks.field_work import WeightsFile
 from spectralzoom.flows.tasks.survey_model import shipped_weights
 from spectralzoom.flows.training.train import train_weights
@@ -36,9 +36,9 @@ def test_a_survey_on_an_absent_device_is_refused(survey_png: Survey, tmp_path: P
 def test_trainings_and_evaluations_refuse_an_absent_device(tmp_path: Path) -> None:
     """They write no file."""
     with pytest.raises(SettingsError, match=REFUSED):
-        train_weights(TrainRequest("farm", tmp_path / "w.safetensors", device="mps"))
+        train_weights(TrainRequest("farm", tmp_path / "w.safetensors", TrainFlags(device="mps")))
     with pytest.raises(SettingsError, match=REFUSED):
-        evaluate_weights(EvaluateRequest("farm", (shipped_weights(),), device="mps"))
+        evaluate_weights("farm", EvaluateFlags(weights=(shipped_weights(),), device="mps"))
     assert list(tmp_path.iterdir()) == []
 
 

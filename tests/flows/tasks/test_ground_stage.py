@@ -63,7 +63,7 @@ def inputs(tmp_path: Path) -> Inputs:
     classes[:, 80:] = 1
     classes[:30, 80:] = UNLABELLED
     confidence = np.where(classes == UNLABELLED, np.nan, 0.25 + 0.5 * (classes == 1)).astype(np.float32)
-    found = class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours)
+    found = class_maps.ClassMap(classes, confidence, LEGEND)
     write_class_map(tmp_path / "map" / "class_map.zarr", found)
     believe(tmp_path / "map", np.zeros(SHAPE, np.float32))
     values = np.linspace(0.1, 0.9, SHAPE[0])[:, None, None] * np.ones((*SHAPE, 4))

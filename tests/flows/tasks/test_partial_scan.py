@@ -186,7 +186,7 @@ def test_a_prior_map_read_in_swaths_equals_the_whole_one(
     store: Any = SimpleNamespace(read=lambda rows: tuple(image[rows] for image in images))
     monkeypatch.setattr(extent_choice, "ProbabilityStore", lambda path: store)
     prior: Any = SimpleNamespace(probabilities=SimpleNamespace(path=Path()), classes=(0, 1), days=5.0, day_of_year=None)
-    weights: Any = SimpleNamespace(reader="there")
+    weights: Any = SimpleNamespace(reader="there", config=SimpleNamespace(untaught=()))
     parts, ages = zip(*extent_choice._swaths(prior, SceneGrid(95, 63, 4), weights, recorded), strict=True)
     assert len(parts) > 1
     assert np.array_equal(np.concatenate(ages), images[1] + 5)

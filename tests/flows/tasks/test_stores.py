@@ -33,18 +33,26 @@ from tests.storage.plain_mosaic import KillOnce
 
 @pytest.mark.parametrize("order", [(1.0, 16.0), (16.0, 1.0)], ids=["short pass first", "long pass first"])
 @pytest.mark.parametrize("dark", [0, 5])
-def test_few_bands_are_stored_in_steps_of_the_longest_exposure(order: tuple[float, float], dark: int) -> None:
+@pytest.mark.parametrize("shared", [False, True], ids=["own white frames", "one white frame"])
+def test_few_bands_are_stored_in_steps_of_the_longest_exposure(
+    order: tuple[float, float], dark: int, shared: bool
+) -> None:
     """One DN of a long exposure is a smaller scene value than one of a short exposure, so no pass loses a DN.
 
-    Bands without light do not count.
+    Bands without light do not count. Each pass has a white frame of its exposure, or all have one of 1 ms.
     """
     found = SignalStatistics(4 + dark, 64)
     lit = np.append(np.ones(4, np.float32), np.full(dark, np.nan, np.float32))
     found.add(np.random.default_rng(0).uniform(0.1, 0.9, (8, 8, 1)).astype(np.float32) * lit, np.ones((8, 8), np.bool_))
     zero = np.zeros((8, 4 + dark), np.float32)
     white = zero + 100 * np.nan_to_num(lit)
-    frames = [References(zero, one * white, np.ones(4 + dark, np.float32)) for one in order]
-    cubes: Any = [SimpleNamespace(references=one, wavelength_nm=np.arange(4.0 + dark)) for one in frames]
+    values, bands = np.ones(4 + dark, np.float32), np.arange(4.0 + dark)
+    common = References(zero, white, values, exposure_ms=1.0)
+    frames = [common if shared else References(zero, one * white, values) for one in order]
+    cubes: Any = [
+        SimpleNamespace(references=one, wavelength_nm=bands, exposure_ms=np.full(8, ms))
+        for one, ms in zip(frames, order, strict=True)
+    ]
     np.testing.assert_allclose(components_of(found, cubes, SignalChoice()).noise, lit / 1600)
 
 

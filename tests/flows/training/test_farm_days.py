@@ -146,7 +146,6 @@ def test_each_scene_has_a_noise_stream_of_its_own(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr("spectralzoom.flows.training.train_scenes.observe_scene", imaged)
     monkeypatch.setattr("spectralzoom.flows.training.train_scenes.trained_pixels", lambda scene: np.ones(1, bool))
-    monkeypatch.setattr("spectralzoom.flows.training.train_scenes.only_class", lambda scene: None)
     data = open_training_data("farm", 2, 2, LineCamera())
     observe_all(TrainRequest("farm", Path()), data, lambda what, done, figure: None)
     assert len(set(streams)) == len(streams) == 4

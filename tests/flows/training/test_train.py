@@ -16,9 +16,9 @@ from PIL import Image
 from rich.console import Console
 
 from spectralzoom.flows.cli.main import main
-from spectralzoom.flows.cli.model_verbs import TrainFlags
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.training import figures, train_scenes
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
@@ -29,7 +29,6 @@ from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.network.spectral import SpectralBasis
 from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.training.examples import Example
-from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.models.weights.files import TrainedOn, describe_weights, load_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -38,7 +37,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
 
-SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
+QUICK: dict[str, Any] = {"steps": 1, "batch": 1, "crop": 16, "patch": 8, "dim": 16}
 NUMBERS = ("001", "002", "003", "004")  # of frames
 
 
@@ -61,14 +60,14 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "w.safetensors"
 
 
-def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:
-    return TrainRequest(str(folder), out, **{"patch": 8, "width": 4, "settings": SETTINGS, **choices})
+def _request(folder: Path, out: Path, command: str = "", **flags: Any) -> TrainRequest:
+    return TrainRequest(str(folder), out, TrainFlags(**QUICK | flags), command)
 
 
 def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
     """It has scenes (none of validation, none held out) and ranges of the training data, and the calibration."""
     field = write_field(tmp_path / "field", (32, 32), NUMBERS)
-    record = train_weights(_request(field, out, validation=1, hold_out=("003",)))
+    record = train_weights(_request(field, out, validation=1, hold_out="003"))
     assert "scans" not in record  # of a single exposure
     assert describe_weights(out).map_scores is None
     split = record["split"]
@@ -81,7 +80,7 @@ def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
     assert 0 <= record["calibration"]["expected_error"] <= 1
 
 
-@pytest.mark.parametrize("sizes", [{"patch": 24}, {"tokens": {"dim": 18}}])
+@pytest.mark.parametrize("sizes", [{"patch": 24}, {"dim": 18}])
 def test_impossible_network_sizes_are_refused_before_imaging(
     folder: Path, out: Path, sizes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ):
@@ -124,7 +123,7 @@ def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: boo
     nm = np.linspace(500, 800, 4)
     common = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), patch, nm)
     assert suggested_patch(shape, built_in=built_in) == patch
-    assert network_config(TrainRequest("d", Path()), common).deep == (min(shape) >= 512 and not built_in)
+    assert network_config(TrainFlags(), common).deep == (min(shape) >= 512 and not built_in)
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
@@ -188,7 +187,7 @@ def test_baselines_separate_classes_of_different_spectra(validation: bool) -> No
 
 def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
     """A held-out scene gets no warning."""
-    train_weights(_request(folder, out, hold_out=("002",), validation=0))
+    train_weights(_request(folder, out, hold_out="002", validation=0))
     notes = {}
     for number in ("001", "002"):
         scene = folder / "images" / f"{number}_image.png"
@@ -203,13 +202,13 @@ def _masked(folder: Path, rows: slice | None, out: Path, **more: Any) -> TrainRe
     labels = np.random.default_rng(4).integers(1, 3, (40, 40)).astype(np.uint8)
     np.save(folder / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
     np.save(folder / "labels.npy", labels)
-    given = {"labels": str(folder / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
+    given = {"labels": str(folder / "labels.npy"), "wavelengths": "500,600,700,800"}
     if rows is not None:
         mask = np.zeros_like(labels)
         mask[rows] = labels[rows]
         np.save(folder / "mask.npy", mask)
         given["train_mask"] = str(folder / "mask.npy")
-    return _request(folder / "cube.npy", out, choices=given, **more)
+    return _request(folder / "cube.npy", out, **given, **more)
 
 
 def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
@@ -236,8 +235,8 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
     values = (labels[..., None] * np.ones(4)).astype(np.float32)
     np.save(tmp_path / "cube.npy", values)
     np.save(tmp_path / "labels.npy", labels)
-    choices = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
-    train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
+    choices = {"labels": str(tmp_path / "labels.npy"), "wavelengths": "500,600,700,800"}
+    train_weights(_request(tmp_path / "cube.npy", out, **choices))
     np.save(tmp_path / "other.npy", factor * values[..., : len(bands)])
     asked = {"scene": str(tmp_path / "other.npy"), "wavelengths": bands, "source": "raster", "weights": str(out)}
     notes = " ".join(open_field(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
@@ -247,7 +246,7 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
 
 def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Path):
     """It holds mIoU and expected scores by step and exposure."""
-    record = train_weights(_request(folder, out, validation=2, settings=replace(SETTINGS, darkest_ms=6.0)))
+    record = train_weights(_request(folder, out, validation=2, min_exposure_ms=6.0))
     scans = describe_weights(out).record["scans"]
     assert scans == record["scans"]
     assert (scans["steps"], scans["exposures_ms"], scans["scenes"]) == ([1, 2, 4, 8], [100.0, 50.0, 25.0, 12.0, 6.0], 2)
@@ -263,7 +262,7 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
 def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
     """Weights have none without validation scenes; after short exposures training reports that, and its baselines."""
     shown = io.StringIO()
-    request = _request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms))
+    request = _request(folder, out, validation=0, min_exposure_ms=darkest_ms)
     assert "scans" not in run_train(request, Console(file=shown, width=100))
     assert ("the file has no scan performance" in shown.getvalue()) == said
     assert "of a random half of the training pixels, on the other half: LDA " in shown.getvalue()
@@ -273,7 +272,7 @@ def test_whitening_uses_the_noise_of_short_exposures(folder: Path, out: Path):
     """Weights for short exposures give less weight to directions in which noise dominates."""
     sizes = []
     for darkest_ms in (100.0, 3.0):
-        train_weights(_request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms)))
+        train_weights(_request(folder, out, validation=0, min_exposure_ms=darkest_ms))
         sizes.append(np.linalg.norm(load_weights(out).normalisation.whitening, 2))
     assert sizes[1] < sizes[0]
 
@@ -284,7 +283,7 @@ def test_training_resumes_from_a_file(folder: Path, out: Path, tmp_path: Path, m
     trained = flow.train
     ends: list[Any] = []
     monkeypatch.setattr(flow, "train", lambda *given, **options: ends.append(trained(*given, **options)) or ends[0])
-    request = _request(folder, tmp_path / "b.safetensors", validation=0, start=out, settings=replace(SETTINGS, seed=1))
+    request = _request(folder, tmp_path / "b.safetensors", validation=0, start=out, seed=1)
     record = train_weights(request)
     first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
     assert record["started_from"] == "first"
@@ -313,22 +312,20 @@ def test_continued_training_may_have_more_scenes(folder: Path, out: Path, first:
     assert second["train"].items() > first[1]["split"]["train"].items()
 
 
-def test_continued_training_has_a_lower_learning_rate(out: Path) -> None:
-    """Its rate is a third unless a flag sets it; `--start` names the file."""
-    anew, on = (TrainFlags(start=start).request("farm", out, "") for start in (None, Path("first.safetensors")))
-    assert 3 * on.settings.learning_rate == pytest.approx(anew.settings.learning_rate)
-    assert (anew.start, on.start) == (None, Path("first.safetensors"))
-    assert TrainFlags(learning_rate=2e-3).request("farm", out, "").settings.learning_rate == 2e-3
+def test_continued_training_has_a_lower_learning_rate() -> None:
+    """Its rate is a third unless a flag sets it."""
+    anew, on = (TrainFlags(start=start).settings for start in (None, Path("first.safetensors")))
+    assert 3 * on.learning_rate == pytest.approx(anew.learning_rate)
+    assert TrainFlags(learning_rate=2e-3).settings.learning_rate == 2e-3
 
 
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
         ({}, "training scenes"),  # others of the same names
-        ({"hold_out": ("003",)}, "training scenes"),
+        ({"hold_out": "003"}, "training scenes"),
         ({"validation": 2}, "training scenes"),
-        ({"columns": 2}, "bands"),
-        ({"width": 8}, "sizes of the network"),
+        ({"dim": 8}, "sizes of the network"),
     ],
 )
 def test_continued_training_refuses_changed_input(
@@ -373,4 +370,4 @@ def test_scenes_that_cannot_validate_are_left_out(folder: Path, out: Path, tmp_p
 def test_impossible_minimum_exposures_are_refused(folder: Path, out: Path, darkest_ms: float):
     """One message gives the limits: above 0 and at most the 100 ms of the training images."""
     with pytest.raises(SettingsError, match=r"--min-exposure-ms must be above 0 and at most 100"):
-        run_train(_request(folder, out, settings=replace(SETTINGS, darkest_ms=darkest_ms)), QUIET)
+        run_train(_request(folder, out, min_exposure_ms=darkest_ms), QUIET)

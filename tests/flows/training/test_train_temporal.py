@@ -12,9 +12,11 @@ import pytest
 import torch
 
 import spectralzoom.flows.training.train_temporal as remember
-from spectralzoom.flows.cli.model_verbs import TrainFlags, run_training
+from spectralzoom.flows.cli.model_verbs import run_training
+from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.tasks.survey_model import shipped_weights
-from spectralzoom.flows.training.train_temporal import TemporalRequest, _moments, run_remember, train_temporal
+from spectralzoom.flows.training.train_scenes import TrainRequest
+from spectralzoom.flows.training.train_temporal import _moments, run_remember, train_temporal
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou
 from spectralzoom.models.network.sizes import TemporalSizes
 from spectralzoom.models.reading.prior_map import CurrentVisit, PriorMap, first_probabilities, fuse
@@ -24,7 +26,7 @@ from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.simulator.render import USUAL
 from tests.conftest import QUIET
 
-QUICK = TemporalTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
+QUICK: dict[str, Any] = {"minutes": 0.5, "steps": 2, "scenes": 1}
 
 
 def test_reader_learns_to_distrust_a_prior_map() -> None:
@@ -84,7 +86,7 @@ def test_the_command_trains_and_writes_its_record(tmp_path: Path, monkeypatch: p
         monkeypatch.setattr(remember, name, value)
     out = tmp_path / "farm.safetensors"
     weights = shipped_weights()
-    request = TemporalRequest("farm", weights, out, 1, QUICK, "spectralzoom train")
+    request = TrainRequest("farm", out, TrainFlags(train_temporal=weights, **QUICK), "spectralzoom train")
     record = run_remember(request, QUIET)
     assert describe_weights(out).key == describe_weights(weights).key
     assert dict(describe_weights(out).reader.record) == record
@@ -109,13 +111,13 @@ def test_untrainable_requests_are_refused(
     """Data other than the farm and a missing or read-only folder are refused before imaging."""
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
     with pytest.raises(SettingsError, match=why):
-        train_temporal(TemporalRequest(dataset, shipped_weights(), tmp_path / out))
+        train_temporal(TrainRequest(dataset, tmp_path / out, TrainFlags(train_temporal=shipped_weights())))
 
 
 def test_weights_of_other_classes_are_refused(tmp_path: Path, weights: Path) -> None:
     """The reader is trained on the farm, so the weights need the farm's classes."""
     with pytest.raises(SettingsError, match="expected weights of the farm's classes, soil, maize"):
-        train_temporal(TemporalRequest("farm", weights, tmp_path / "x.safetensors"))
+        train_temporal(TrainRequest("farm", tmp_path / "x.safetensors", TrainFlags(train_temporal=weights)))
 
 
 def test_the_shipped_weights_have_a_reader() -> None:

@@ -197,16 +197,6 @@ def test_unlabelled_pixels_do_not_change_the_loss():
     assert same.item() == pytest.approx(loss.item(), abs=1e-6)
 
 
-def test_absent_classes_are_never_the_likeliest():
-    """Two of three classes have pixels and are separated; the third has a logit of -20 everywhere."""
-    labels = np.repeat(np.array([0, 2], np.uint8), 50)
-    features = (np.random.default_rng(0).normal(0, 1, (100, 4)) + 5 * labels[:, None]).astype(np.float32)
-    found = linear_classifier(LabelledPixels(features, labels), 3)
-    logits = features @ found["spectral.weight"][:, :, 0, 0].numpy().T + found["spectral.bias"].numpy()
-    assert (logits.argmax(axis=1) == labels).all()
-    assert (logits[:, 1] == -20).all()
-
-
 def test_few_very_bright_pixels_do_not_mislead_the_linear_classifier() -> None:
     """Discriminants alone get 64 % of these pixels right; the logistic regression repairs them."""
     labels = np.repeat(np.array([0, 1], np.uint8), 200)

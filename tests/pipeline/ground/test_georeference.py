@@ -43,6 +43,34 @@ def test_areas_are_on_the_ellipsoid(epsg: int, step: float) -> None:
     assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
 
 
+EARTH_M2 = 5.1006562172e14  # of the ellipsoid of WGS 84
+
+
+@pytest.mark.parametrize(
+    ("transform", "shape", "fraction"),
+    [
+        (Affine(1, 0, -180, 0, -1, 90), (180, 360), 1.0),
+        (Affine(1, 0, -180, 0, -1, 90.5), (181, 360), 1.0),  # half a pixel beyond each pole
+        (Affine(1, 0, 0, 0, -1, 90), (90, 180), 0.25),
+    ],
+)
+def test_areas_at_the_poles(transform: Affine, shape: tuple[int, int], fraction: float) -> None:
+    """The whole earth in degrees has its area; nothing lies beyond a pole."""
+    areas = np.sum(list(pixel_rows_m2(GeoBox(shape, transform, "EPSG:4326"))))
+    assert areas == pytest.approx(EARTH_M2 * fraction, rel=3e-4)
+
+
+def test_pixels_beside_the_earths_disk_have_no_area() -> None:
+    """The corners of an image of a whole hemisphere by a satellite show space."""
+    satellite = pyproj.CRS.from_proj4("+proj=geos +h=35786023 +lon_0=-75 +sweep=x").to_wkt()
+    areas = np.array(
+        list(pixel_rows_m2(GeoBox((100, 100), Affine(108_800, 0, -5.44e6, 0, -108_800, 5.44e6), satellite)))
+    )
+    assert (areas[[0, 0, -1, -1], [0, -1, 0, -1]] == 0).all()
+    assert areas[50, 50] == pytest.approx(108_800**2, rel=1e-3)
+    assert 0.35 < areas.sum() / EARTH_M2 < 0.45
+
+
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))
 def test_a_coarser_grid_has_the_same_origin(height: int, width: int, factor: int, turn: float) -> None:
     """Coarse pixel (y, x) begins where fine pixel (factor y, factor x) does, also on a turned grid."""

@@ -106,7 +106,8 @@ def test_drift_between_captured_sweeps_is_removed():
     def read(start: int, stop: int, samples: slice) -> np.ndarray:
         return np.rint((other.read(start, stop) - dark) * light * 0.8 + dark).astype(np.uint16)[:, samples]
 
-    told = {name: getattr(other, name) for name in ("sweep", "references", "position", "time_s", "valid_line")}
+    names = ("sweep", "references", "position", "time_s", "exposure_ms", "valid_line")
+    told = {name: getattr(other, name) for name in names}
     placed = [place(plain, camera), place(SimpleNamespace(**told, read=read), camera)]  # type: ignore[arg-type]
     low, high = sweeps[1].swath_px - 59, sweeps[0].swath_px + 59
     (ratio,) = overlap_light(placed, camera, [Window(0, 1, (low, high), (-45.0, 45.0))])

@@ -36,6 +36,7 @@ def place_lines(sweep: Sweep, source: str = "sim") -> Any:
         references=References(FRAME, FRAME + 1, FRAME[0] + 1),
         position=line_positions(sweep, CAMERA),
         time_s=0.1 * np.arange(sweep.lines),
+        exposure_ms=np.full(sweep.lines, 100.0),
         valid_line=np.ones(sweep.lines, np.bool_),
         usable=np.ones((sweep.lines, CAMERA.samples), np.bool_),
         read=lambda start, stop, samples: places[start:stop, samples],

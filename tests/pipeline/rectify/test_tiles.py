@@ -35,6 +35,11 @@ class Taken:
     position: NDArray[np.float64]
     asked: list[tuple[int, ...]] = field(default_factory=list)
 
+    @property
+    def exposure_ms(self) -> NDArray[np.float64]:
+        """Return the exposures of the camera."""
+        return np.full(len(self.raw), CAMERA.exposure_ms)
+
     def read(self, start: int, stop: int, samples: slice = slice(None)) -> NDArray[np.uint16]:
         """Return samples of some lines."""
         self.asked.append((start, stop, samples.start, samples.stop))

@@ -114,6 +114,11 @@ class MadeLines:
         """Return times at ten lines a second."""
         return 0.1 * np.arange(len(self.raw))
 
+    @property
+    def exposure_ms(self) -> Floats:
+        """Return the exposures of the camera."""
+        return np.full(len(self.raw), CAMERA.exposure_ms)
+
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Return raw numbers of some lines."""
         return self.raw[start:stop]

@@ -154,12 +154,13 @@ def test_coordinates_and_grid_mapping_follow_cf(tmp_path: Path) -> None:
         assert "spatial_ref" in content["height"].coords
 
 
-def test_a_geographic_crs_has_longitude_and_latitude(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("epsg", "unit"), [(4326, "degrees_north"), (4807, "grad")])
+def test_a_geographic_crs_has_longitude_and_latitude(tmp_path: Path, epsg: int, unit: str) -> None:
     """The axes have the standard names and units of CF, and the grid is read as it was written."""
-    geobox = GeoBox((20, 30), Affine(1e-5, 0, 7.5, 0, -1e-5, 52), "EPSG:4326")
+    geobox = GeoBox((20, 30), Affine(1e-5, 0, 7.5, 0, -1e-5, 52), f"EPSG:{epsg}")
     with xr.open_zarr(write(tmp_path / "a.zarr", geobox), consolidated=False) as content:
         assert content.x.attrs["standard_name"] == "longitude"
-        assert (content.y.attrs["standard_name"], content.y.attrs["units"]) == ("latitude", "degrees_north")
+        assert (content.y.attrs["standard_name"], content.y.attrs["units"]) == ("latitude", unit)
         assert content.odc.geobox == georeference.load_geobox(tmp_path / "a.zarr") == geobox
 
 
@@ -220,7 +221,7 @@ def test_class_map_tiles_equal_the_map_written_at_once(tmp_path: Path) -> None:
     """Tiles of whole shards, in any order, give the same files byte by byte."""
     classes, confidence = _drawn()
     grid = georeference.AngularGrid(1e-4, SHAPE)
-    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours), grid)
+    write_class_map(tmp_path / "one.zarr", class_maps.ClassMap(classes, confidence, LEGEND), grid)
     class_maps.create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
     begun = class_maps.load_class_map(tmp_path / "tiles.zarr")
     assert (begun.classes == 255).all()  # unwritten tiles
@@ -241,10 +242,17 @@ def test_write_class_tile_refuses_wrong_input(tmp_path: Path) -> None:
         class_maps.write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
 
 
+def test_legends_have_the_numbers_of_the_label_files() -> None:
+    """A name that has its number already, and maps that count from 0, need none."""
+    legend = class_maps.ClassNames(("weed", "class_9"), LEGEND.colours, (4, 9))
+    assert legend.titles == ("weed (4)", "class_9")
+    assert LEGEND.titles == LEGEND.names
+
+
 def test_blank_pixels_clears_only_the_chosen_pixels(tmp_path: Path) -> None:
     """The pixels may lie in any shard; if none is chosen, the files keep their bytes."""
     classes, confidence = _drawn()
-    write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
+    write_class_map(tmp_path / "m.zarr", class_maps.ClassMap(classes, confidence, LEGEND))
     before = _contents(tmp_path / "m.zarr")
     gone = np.zeros(SHAPE, np.bool_)
     layout.blank_pixels(tmp_path / "m.zarr", gone, layout.NO_CLASS)
@@ -256,13 +264,16 @@ def test_blank_pixels_clears_only_the_chosen_pixels(tmp_path: Path) -> None:
     np.testing.assert_allclose(left.confidence, np.where(gone, np.nan, confidence), atol=class_maps.CONFIDENCE_STEP / 2)
 
 
-def test_class_map_round_trip(tmp_path: Path) -> None:
-    """Classes, names and colours are read as written; xarray reads CF flags and whole numbers, 255 for no class."""
+@pytest.mark.parametrize("numbers", [(), (7, 0, 254)])
+def test_class_map_round_trip(tmp_path: Path, numbers: tuple[int, ...]) -> None:
+    """Classes, names and colours are read as written; xarray reads CF flags and label values, 255 for no class."""
     classes = np.random.default_rng(0).integers(0, 3, (50, 70), dtype=np.uint8)
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
     colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
-    made = class_maps.ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours)
+    made = class_maps.ClassMap(
+        classes, confidence, class_maps.ClassNames(("bare soil", "crop", "weed"), colours, numbers)
+    )
     write_class_map(tmp_path / "c.zarr", made)
     found = class_maps.load_class_map(tmp_path / "c.zarr")
     np.testing.assert_array_equal(found.classes, classes)
@@ -271,6 +282,8 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     assert found.names == ("bare soil", "crop", "weed")
     with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
         assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"
-        assert data["classes"].attrs["flag_values"] == [0, 1, 2]
+        values = data["classes"].attrs["flag_values"]
+        assert values == list(numbers or range(3))
+        np.testing.assert_array_equal(data["classes"], np.append(values, [255] * 253)[np.minimum(classes, 3)])
         assert data["classes"].dtype == np.uint8
         assert int((data["classes"] == data["classes"].attrs["nodata"]).sum()) == 9

@@ -12,18 +12,17 @@ import numpy as np
 import pytest
 import rasterio
 import rasterio.shutil
+from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import ClassNames
-from spectralzoom.storage.arrays.georeference import AngularGrid
-from spectralzoom.storage.export.image_files import CogImage, angular_geobox, write_cog
+from spectralzoom.storage.export.image_files import CogImage, write_cog
 from tests.storage.export.stac_rules import is_cog
 
 LEGEND = ClassNames(("sugar beet", "soil & stones", "maïs"), np.array([[9, 200, 30], [120, 90, 60], [0, 0, 255]], "u1"))
-GRID = AngularGrid(1e-4, (1300, 1100))
 FEW = (90, 70)
 
 
@@ -31,6 +30,11 @@ def on_map(shape: tuple[int, int], crs: str = "EPSG:32632") -> GeoBox:
     """Return a grid of 0.5 m somewhere in Germany."""
     height, width = (size / 2 for size in shape)
     return GeoBox.from_bbox((500000, 5770000, 500000 + width, 5770000 + height), crs=crs, resolution=0.5)
+
+
+def angular(shape: tuple[int, int]) -> GeoBox:
+    """Return a grid in tangents of angles."""
+    return GeoBox(shape, Affine(1e-4, 0, -0.05, 0, 1e-4, -0.06), None)
 
 
 def classes_of(shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -70,7 +74,7 @@ def test_rasterio_reads_values_and_tags_as_written(tmp_path: Path, crs: str) -> 
 def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
     """GDAL finds the COG layout with three bands: tiles of 512 px, and halving overviews down to one tile."""
     values = np.random.default_rng(1).integers(0, 200, (1100, 600, 3)).astype(dtype)
-    image = CogImage(angular_geobox(GRID, (1100, 600)), dtype, ("r", "g", "b"), 0)
+    image = CogImage(angular((1100, 600)), dtype, ("r", "g", "b"), 0)
     write_cog(tmp_path / "a.tif", image, rows_of(values))
     assert is_cog(tmp_path / "a.tif")
     with rasterio.open(tmp_path / "a.tif") as file:
@@ -92,24 +96,26 @@ def test_overviews_of_confidence_ignore_nan(tmp_path: Path) -> None:
     """The mean of two known pixels and two NaN is the mean of the known."""
     values = np.full((1300, 1100), 0.25, np.float32)
     values[1::2] = np.nan
-    image = CogImage(angular_geobox(GRID, values.shape), "float32", ("confidence",), np.nan)
+    image = CogImage(angular(values.shape), "float32", ("confidence",), np.nan)
     write_cog(tmp_path / "a.tif", image, rows_of(values))
     with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
         assert (file.read(1) == 0.25).all()
 
 
-def test_classes_have_colours_and_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize("numbers", [(0, 1, 2), (4, 1, 2)])
+def test_classes_have_colours_and_names(tmp_path: Path, numbers: tuple[int, ...]) -> None:
     """The file has a colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
-    write_cog(tmp_path / "a.tif", class_image(on_map(FEW)), rows_of(classes_of(FEW)))
+    image = replace(class_image(on_map(FEW)), legend=replace(LEGEND, values=numbers))
+    write_cog(tmp_path / "a.tif", image, rows_of(classes_of(FEW)))
     with rasterio.open(tmp_path / "a.tif") as file:
         table = file.colormap(1)
         tags = file.tags(1)
-    assert [table[number][:3] for number in range(3)] == [tuple(colour) for colour in LEGEND.colours.tolist()]
-    assert [tags[f"CLASS_{number}"] for number in range(3)] == list(LEGEND.names)
+    assert [table[number][:3] for number in numbers] == [tuple(colour) for colour in LEGEND.colours.tolist()]
+    assert [tags[f"CLASS_{number}"] for number in numbers] == list(LEGEND.names)
     assert tags["flag_meanings"] == "sugar_beet soil_&_stones maïs"
     rasterio.shutil.copy(str(tmp_path / "a.tif"), str(tmp_path / "a.vrt"), driver="VRT")
     names = ElementTree.parse(tmp_path / "a.vrt").getroot().findall(".//CategoryNames/Category")
-    assert [name.text for name in names] == list(LEGEND.names)
+    assert [names[number].text for number in numbers] == list(LEGEND.names)
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])

@@ -10,18 +10,14 @@ from unittest.mock import Mock
 import h5py
 import numpy as np
 import pytest
-import rasterio
-import rasterio.shutil
-import rasterio.transform
 import rioxarray  # noqa: F401 - registers the accessor that writes a place
 import xarray as xr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.storage.readers.cube_sources import read_by_chunks
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_files import load_scene_file
-from tests.storage.readers.test_raster_tags import write as write_bands
 
 RNG = np.random.default_rng(5)
 NM = np.array([450.0, 550.0, 660.0, 800.0, 900.0])
@@ -52,7 +48,7 @@ def emit_file(path: Path) -> NDArray[np.float32]:
 def test_emit_reflectance_is_read(tmp_path: Path) -> None:
     """Values, wavelengths, widths and bad bands are EMIT's; pixels in the sensor's geometry have no map grid."""
     values = emit_file(tmp_path / "emit.nc")
-    source = open_cube(tmp_path / "emit.nc")
+    source = open_cube_source(tmp_path / "emit.nc")
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
     scene = load_scene_file(tmp_path / "emit.nc")
     np.testing.assert_array_equal(scene.wavelength_nm, NM[[0, 1, 3, 4]])
@@ -131,7 +127,7 @@ NO_CUBE_AXES = xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))
 @pytest.mark.parametrize(
     ("write", "words"),
     [
-        (lambda path: path.write_text("text"), "cannot be read as NetCDF or HDF5: it does not begin as HDF5.*nccopy"),
+        (lambda path: path.write_text("text"), "cannot be read as NetCDF or HDF5: it begins as neither; copy it again"),
         (
             partial(NO_CUBE_AXES.to_netcdf, engine="h5netcdf"),
             r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them",
@@ -146,18 +142,9 @@ def test_unusable_hdf_files_raise_one_error(write: Any, words: str, tmp_path: Pa
         load_scene_file(tmp_path / "bad.h5")
 
 
-def test_rows_from_south_to_north_have_gdals_position(tmp_path: Path) -> None:
-    """GDAL writes the southern row first, under the GeoTransform of the upright image."""
-    values = np.arange(12, dtype=np.float32).reshape(3, 4)
-    upright = rasterio.transform.from_origin(500_000, 5_000_030, 10, 10)
-    write_bands(tmp_path / "a.tif", values[None], crs="EPSG:32632", transform=upright).close()
-    rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.nc", driver="netCDF", FORMAT="NC4")
-    cube = open_cube(f"{tmp_path / 'a.nc'}:Band1")
-    assert cube.geobox.affine.to_gdal() == (500_000, 10, 0, 5_000_000, 0, 10)
-    assert np.array_equal(cube.read(0, 3)[::-1, :, 0], values)
-
-
 SCALED, NAN = {"scale_factor": 0.01}, float("nan")
+UNSIGNED = {"_Unsigned": "true"}
+BYTES = np.int8([0, 100, -128, -1])
 COUNTS = np.int16([0, 101, -3, -9])
 
 
@@ -171,14 +158,43 @@ COUNTS = np.int16([0, 101, -3, -9])
         (COUNTS, {"_FillValue": np.int16(-9), "valid_range": np.int16([0, 100])}, np.int16([0, -9, -9, -9])),
         (COUNTS, {"valid_range": np.int16([0, 100])}, [0, NAN, NAN, NAN]),
         (np.float32(COUNTS), {"_FillValue": np.float32(NAN), "missing_value": -3.0}, [0, 101, NAN, -9]),
+        (BYTES, {**UNSIGNED, **SCALED, "valid_range": np.int8([0, -2])}, [0, 1, 1.28, NAN]),
+        (BYTES, {**UNSIGNED, **SCALED, "valid_range": np.uint8([0, 254])}, [0, 1, 1.28, NAN]),
+        (BYTES, {**UNSIGNED, **SCALED, "valid_range": np.int64([0, 254])}, [0, 1, 1.28, NAN]),
+        (BYTES, {**UNSIGNED, "valid_max": 254, "_FillValue": np.uint8(255)}, np.uint8([0, 100, 128, 255])),
+        (BYTES, {**UNSIGNED, "_FillValue": np.int16(-1)}, np.uint8([0, 100, 128, 255])),
+        (BYTES, {"_Unsigned": b"TRUE"}, np.uint8([0, 100, 128, 255])),
+        (BYTES.view("u1"), {"_Unsigned": "false", "valid_min": np.int8(-100)}, [0, 100, NAN, -1]),
+        (COUNTS, {"scale_factor": -0.01, "valid_range": np.int16([-5, 200])}, [0, -1.01, 0.03, NAN]),
+        (COUNTS, {**SCALED, "valid_range": [-0.05, 1.0]}, [0, NAN, -0.03, NAN]),
+        (
+            COUNTS,
+            {"scale_factor": np.int8(2), "add_offset": np.int16([1]), "_FillValue": np.int16(-9)},
+            [1, 203, -5, NAN],
+        ),
+        (COUNTS, {"valid_range": np.int64([-(2**40), 2**40]), "_FillValue": np.int16(-9)}, COUNTS),
+        (COUNTS, {"_FillValue": np.int32(70000), "scale_factor": 1.0}, COUNTS),
+        (np.float32([0, 1, 2, NAN]), {"valid_range": [0.5, 1.5]}, [NAN, 1, NAN, NAN]),
     ],
-    ids=["unsigned", "least and most", "range", "two fills", "filled", "not filled", "floats"],
 )
 def test_netcdf_packing_is_decoded(tmp_path: Path, stored: Any, about: dict[str, Any], read: Any) -> None:
     """Unsigned numbers, valid ranges and fill values are decoded; whole numbers with a fill value stay whole."""
     with h5py.File(tmp_path / "a.nc", "w") as file:
         file["values"] = stored.reshape(1, 4, 1)
         file["values"].attrs.update(about)
-    cube = open_cube(f"{tmp_path / 'a.nc'}:values")
+    cube = open_cube_source(f"{tmp_path / 'a.nc'}:values")
     assert cube.dtype == (np.float32 if isinstance(read, list) else read.dtype)
     np.testing.assert_allclose(cube.read(0, 1)[0, :, 0], read, rtol=1e-6 if "scale_factor" in about else 0)
+
+
+def test_netcdf_3_is_read(tmp_path: Path) -> None:
+    """The classic format has the same values, wavelengths and place as NetCDF 4 of the same data."""
+    packed = {"cube": {"dtype": "i2", "scale_factor": 0.5, "_FillValue": -1}}
+    data = xr.Dataset({"cube": (("y", "x", "band"), CUBE * 0.5)}).assign_coords(
+        wavelength=("band", NM, {"units": "nm"})
+    )
+    for name, engine in (("3.nc", "scipy"), ("4.nc", "h5netcdf")):
+        data.to_netcdf(tmp_path / name, engine=engine, encoding=packed)
+    three, four = (load_scene_file(tmp_path / name) for name in ("3.nc", "4.nc"))
+    np.testing.assert_array_equal(three.values, four.values)
+    np.testing.assert_array_equal(three.wavelength_nm, NM)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.rig.camera.frame_indices import times_of_lines
 from spectralzoom.storage.readers.envi_files import load_frame_index
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from tests.storage.readers.test_envi_cubes import write_envi
 
 DROPPED = "1 frames between the first and the last were dropped by the camera"
@@ -39,7 +39,7 @@ def test_parts_are_joined_in_order_of_their_frames(tmp_path: Path, lines: NDArra
         write_part(tmp_path, f"raw_{first}", lines[first:last])
         rows = [f"{frame}{between}{1000 + 10 * frame}" for frame in range(first, last)]
         (tmp_path / f"frameIndex_{first}.txt").write_text("\r\n".join([f"Frame#{between}Timestamp", *rows]))
-    source = open_cube(tmp_path)
+    source = open_cube_source(tmp_path)
     assert (source.shape, source.dtype, source.valid.all(), source.notes) == ((30, 4, 3), np.uint16, True, ())
     np.testing.assert_array_equal(source.read(0, 30), lines)
     np.testing.assert_array_equal(source.read(6, 22), lines[6:22])
@@ -53,14 +53,14 @@ def test_constant_timestamps_are_ignored(tmp_path: Path, lines: NDArray[np.uint1
     """A camera without a clock repeats one timestamp."""
     write_part(tmp_path, "raw_0", lines)
     (tmp_path / "frameIndex_0.txt").write_text("\n".join(["Frame#\tTimestamp", *(f"{n}\t7" for n in range(30))]))
-    assert open_cube(tmp_path).lines.time_s is None
+    assert open_cube_source(tmp_path).lines.time_s is None
 
 
 def test_missing_lines_are_flagged(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A truncated or missing part leaves a gap; the last part's lost lines are at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)
     write_part(tmp_path, "raw_10", lines[10:20], lines=12)
-    source = open_cube(tmp_path)
+    source = open_cube_source(tmp_path)
     missing = [6, 7, 8, 9, 20, 21]
     assert source.shape[0] == 22
     assert np.flatnonzero(~source.lines.valid).tolist() == missing
@@ -74,7 +74,7 @@ def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) ->
     write_part(tmp_path, "raw_0", lines[:6])
     write_part(tmp_path, "raw_6", lines[:0], lines=10)
     for name in ("raw_6", "raw_6.bin"):  # with either name of the data file
-        source = open_cube(tmp_path)
+        source = open_cube_source(tmp_path)
         assert (source.shape[0], source.notes) == (6, (f"{name} is empty and left out",))
         (tmp_path / "raw_6").rename(tmp_path / "raw_6.bin") if name == "raw_6" else None
 
@@ -84,7 +84,7 @@ def test_references_are_found_by_name(tmp_path: Path, lines: NDArray[np.uint16])
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), **NO_NM)
     write_part(tmp_path, "WhiteReference_01", lines[5:6], **NO_NM)
-    source = open_cube(tmp_path)
+    source = open_cube_source(tmp_path)
     np.testing.assert_array_equal(source.dark, lines[1])
     np.testing.assert_array_equal(source.white, lines[5])
     assert source.notes == ("dark frame from darkReference.hdr", "white frame from WhiteReference_01.hdr")
@@ -95,10 +95,10 @@ def test_unsuitable_references_are_refused(tmp_path: Path, lines: NDArray[np.uin
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", lines[:1, :2], **NO_NM)
     with pytest.raises(SceneError, match=r"dark frame is \(2, 3\) \(sample, band\), .* is \(4, 3\)"):
-        open_cube(tmp_path)
+        open_cube_source(tmp_path)
     write_part(tmp_path, "darkReference_2", lines[:1], **NO_NM)
     with pytest.raises(SceneError, match=r"several dark frames .* name one with --dark"):
-        open_cube(tmp_path)
+        open_cube_source(tmp_path)
 
 
 def test_parts_that_do_not_fit_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -109,17 +109,17 @@ def test_parts_that_do_not_fit_are_refused(tmp_path: Path, lines: NDArray[np.uin
     write_part(tmp_path / "far", "raw_99999999999", lines)
     for name, words in (("size", "have frames of"), ("far", "are in no file, more than")):
         with pytest.raises(SceneError, match=words):
-            open_cube(tmp_path / name)
+            open_cube_source(tmp_path / name)
 
 
 def test_folders_without_lines_are_refused(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """A folder without parts and one with only empty parts have different messages."""
     expected = "is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
     with pytest.raises(SceneError, match=expected):
-        open_cube(tmp_path)
+        open_cube_source(tmp_path)
     write_part(tmp_path, "raw_0", lines[:0])
     with pytest.raises(SceneError, match=r"every part of .* is empty"):
-        open_cube(tmp_path)
+        open_cube_source(tmp_path)
 
 
 def test_folders_and_pipes_are_ignored_as_parts(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -127,11 +127,11 @@ def test_folders_and_pipes_are_ignored_as_parts(tmp_path: Path, lines: NDArray[n
     write_part(tmp_path, "raw_0", lines[:5])
     (tmp_path / "raw_5").mkdir()
     os.mkfifo(tmp_path / "frameIndex_0.txt")
-    assert open_cube(tmp_path).shape[0] == 5
+    assert open_cube_source(tmp_path).shape[0] == 5
     os.mkfifo(tmp_path / "pipe.hdr")
     (tmp_path / "pipe").touch()
     with pytest.raises(SceneError, match="is no file; name an ENVI header"):
-        open_cube(tmp_path / "pipe.hdr")
+        open_cube_source(tmp_path / "pipe.hdr")
 
 
 def _index(folder: Path, text: str) -> Path:

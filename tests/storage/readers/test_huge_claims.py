@@ -20,14 +20,14 @@ import tifffile
 from PIL import Image
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.open_cubes import load_labels_array, open_cube
+from spectralzoom.storage.readers.open_cubes import load_labels_array, open_cube_source
 
 FEW = 8 << 20  # bytes: what libraries take when they are first used
 
 
 def read_all(path: Path) -> Any:
     """Read all lines of a cube."""
-    source = open_cube(path)
+    source = open_cube_source(path)
     return source.read(0, source.shape[0])
 
 
@@ -83,7 +83,7 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "cell.mat", {"cube": np.array([{"a": 1}], object)})  # objects are skipped
     for name in ("bare.npy", "object.npy", "bare.mat", "cell.mat"):
         with pytest.raises(SceneError, match=r"Python objects|cannot be read|has no (single )?array"):
-            open_cube(tmp_path / name)
+            open_cube_source(tmp_path / name)
     assert not (tmp_path / "trapped").exists()
 
 
@@ -153,7 +153,7 @@ def test_truncated_tiffs_are_refused(tmp_path: Path, compression: str | None, fr
     whole = (tmp_path / "a.tif").read_bytes()
     (tmp_path / "a.tif").write_bytes(whole[: int(len(whole) * fraction)])
     with pytest.raises(SceneError, match="cannot be read as TIFF"):
-        open_cube(tmp_path / "a.tif").read(0, 200)
+        open_cube_source(tmp_path / "a.tif").read(0, 200)
 
 
 def test_a_tiff_of_several_images_is_refused(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_a_tiff_of_several_images_is_refused(tmp_path: Path) -> None:
         for _ in range(5):
             file.write(np.ones((7, 9), np.uint8), contiguous=False)
     with pytest.raises(SceneError, match=r"a\.tif holds 5 images, expected one with all bands; write them as"):
-        open_cube(tmp_path / "a.tif")
+        open_cube_source(tmp_path / "a.tif")
 
 
 VRT = """<VRTDataset rasterXSize="4" rasterYSize="3"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
@@ -175,4 +175,4 @@ def test_a_vrt_named_as_tiff_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "secret.tif", np.full((3, 4), 7, np.uint8))
     (tmp_path / "a.tif").write_text(VRT)
     with pytest.raises(SceneError, match=r"a\.tif cannot be read as TIFF"):
-        open_cube(tmp_path / "a.tif")
+        open_cube_source(tmp_path / "a.tif")

@@ -12,7 +12,7 @@ import skimage
 from PIL import Image
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.labels import DEFAULT_COLOURS, class_colours, load_labels
+from spectralzoom.storage.readers.labels import DEFAULT_COLOURS, class_colours, load_labels, map_values
 
 COLOURS = {"soil": (0, 0, 0), "crop": (0, 255, 0), "weed": (255, 0, 0)}
 
@@ -85,6 +85,22 @@ def test_classes_are_found_where_none_are_stated(tmp_path: Path) -> None:
     assert len(set(DEFAULT_COLOURS)) == len(DEFAULT_COLOURS) >= 64
 
 
+@pytest.mark.parametrize(
+    ("values", "numbers"), [((6, 0, 254), (6, 0, 254)), ((0, 255), ()), ((1, 300), ()), (((0, 0, 0), (9, 9, 9)), ())]
+)
+def test_maps_have_label_values_where_a_byte_holds_all(values: Any, numbers: tuple[int, ...]) -> None:
+    """255 is no class in maps, and colours are no numbers: then maps count from 0."""
+    assert map_values(values) == numbers
+
+
+def test_a_note_says_where_maps_cannot_have_the_labels_values(tmp_path: Path) -> None:
+    """A label above 254 does not fit the byte of a map."""
+    np.save(tmp_path / "a.npy", np.array([[1, 300]]))
+    found = load_labels(tmp_path / "a.npy", (1, 2), classes={})
+    assert found.values == (1, 300)
+    assert found.notes == ("maps number the classes from 0, as a label is not 0 to 254",)
+
+
 def test_class_colours_are_distinct() -> None:
     """Stated colours and those of the file win; others get the default colours that are free, in their order."""
     colours = class_colours({str(number): number for number in range(8)})
@@ -103,7 +119,37 @@ def test_negative_values_are_unlabelled_unless_stated(tmp_path: Path, classes: d
     np.save(tmp_path / "a.npy", np.array([[-1.0, 5.0], [np.nan, 1.0]]))
     found = load_labels(tmp_path / "a.npy", (2, 2), classes=classes)
     assert (found.index == 255).tolist() == [["lost" not in classes, False], [True, False]]
-    assert len(found.notes) == ("lost" not in classes)
+    assert any("negative" in note for note in found.notes) == ("lost" not in classes)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            np.zeros((3, 2)),
+            "are 3 x 2 px, the scene is 2 x 3 px .*its sides are exchanged: turn the labels or the picture",
+        ),
+        (np.zeros((3, 3)), r"are 3 x 3 px, the scene is 2 x 3 px \(y x x\); give labels"),
+        (np.full((2, 3), np.inf), "huge numbers"),
+        (np.full((2, 3), 1e20), "huge numbers"),
+    ],
+)
+def test_labels_that_do_not_fit_are_refused(tmp_path: Path, values: Any, words: str) -> None:
+    """The message says where only the sides are exchanged."""
+    np.save(tmp_path / "a.npy", values)
+    with pytest.raises(SceneError, match=words):
+        load_labels(tmp_path / "a.npy", (2, 3), classes={})
+
+
+def test_the_orientation_tag_of_labels_is_named(tmp_path: Path) -> None:
+    """Labels are turned as pictures are: a note says so, and the refusal of their size."""
+    (exif := Image.Exif())[274] = 6
+    Image.fromarray(np.array([[1, 2, 3], [1, 2, 3]], np.uint8)).save(tmp_path / "a.png", exif=exif)
+    found = load_labels(tmp_path / "a.png", (3, 2), classes={})
+    assert found.index.tolist() == [[0, 0], [1, 1], [2, 2]]
+    assert "its orientation tag 6" in found.notes[0]
+    with pytest.raises(SceneError, match=r"sides are exchanged.*orientation tag 6"):
+        load_labels(tmp_path / "a.png", (2, 3), classes={})
 
 
 @pytest.mark.parametrize(

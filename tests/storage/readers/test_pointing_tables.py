@@ -10,7 +10,7 @@ import pytest
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.mirror import REST_TANGENT, Mounting, direction_to_scene, position_to_direction
-from spectralzoom.storage.readers.recorded_files import find_pointing, load_pointing_table
+from spectralzoom.storage.readers.pointing_tables import find_pointing, load_pointing
 
 MIRROR = "line,time,mirror_x,mirror_y\n0,0.05,0.1,0\n1,0.15,0.2,0\n2,0.25,0.3,0\n"
 
@@ -26,7 +26,7 @@ def test_mirror_positions_are_read_from_any_layout(tmp_path: Path) -> None:
     rows = MIRROR.splitlines()
     swapped = "\ufeff" + "\n".join([rows[0].upper(), rows[3], "", rows[1], rows[2]]).replace(",", ";")
     for text in (MIRROR, swapped, MIRROR.replace(",", "\t")):
-        found = load_pointing_table(_table(tmp_path, text)).of_cube("c", 3)
+        found = load_pointing(_table(tmp_path, text), "c", 3)
         np.testing.assert_array_equal(found.position, [[0.1, 0], [0.2, 0], [0.3, 0]])
         np.testing.assert_array_equal(found.time_s, [0.05, 0.15, 0.25])
         assert (found.valid.all(), found.exposure_ms, found.part) == (True, None, None)
@@ -36,7 +36,7 @@ def test_positions_are_read_bit_by_bit(tmp_path: Path) -> None:
     """A float64 written by repr is read as the same float64."""
     values = np.random.default_rng(1).uniform(-0.5, 0.5, (200, 2))
     text = "mirror_x,mirror_y\n" + "".join(f"{x!r},{y!r}\n" for x, y in values.tolist())
-    np.testing.assert_array_equal(load_pointing_table(_table(tmp_path, text)).of_cube("c", 200).position, values)
+    np.testing.assert_array_equal(load_pointing(_table(tmp_path, text), "c", 200).position, values)
 
 
 def test_positions_of_a_device_are_those_of_its_mounting(tmp_path: Path) -> None:
@@ -44,16 +44,16 @@ def test_positions_of_a_device_are_those_of_its_mounting(tmp_path: Path) -> None
     mounting = Mounting("y,-x", 2.0, 0.01, -0.02)
     given = np.array([[0.1, 0.2], [0.0, 0.3]])
     rows = "".join(f"{x!r},{y!r}\n" for x, y in mounting.to_device(given).tolist())
-    table = load_pointing_table(_table(tmp_path, "mirror_x,mirror_y\n" + rows))
-    np.testing.assert_allclose(table.of_cube("c", 2, mounting).position, given, atol=1e-12)
+    table = _table(tmp_path, "mirror_x,mirror_y\n" + rows)
+    np.testing.assert_allclose(load_pointing(table, "c", 2, mounting).position, given, atol=1e-12)
 
 
 def test_angles_are_converted_to_positions(tmp_path: Path) -> None:
     """Two angles give that viewing direction; a single angle is along the scan."""
-    two = load_pointing_table(_table(tmp_path, "angle_x_deg,angle_y_deg\n5,-10\n5,10\n")).of_cube("c", 2)
+    two = load_pointing(_table(tmp_path, "angle_x_deg,angle_y_deg\n5,-10\n5,10\n"), "c", 2)
     seen = np.rad2deg(np.arctan(direction_to_scene(position_to_direction(two.position))))
     np.testing.assert_allclose(seen, [[5, -10], [5, 10]], atol=1e-10)
-    one = load_pointing_table(_table(tmp_path, "angle_deg\n-10\n20\n")).of_cube("c", 2)
+    one = load_pointing(_table(tmp_path, "angle_deg\n-10\n20\n"), "c", 2)
     expected = -np.tan(np.deg2rad([-10, 20])) / REST_TANGENT
     np.testing.assert_allclose(one.position, np.stack([expected, [0, 0]], axis=-1), atol=1e-12)
 
@@ -61,8 +61,8 @@ def test_angles_are_converted_to_positions(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", [",,,0,", "99,-99,0,0,-1"])
 def test_invalid_lines_need_no_numbers(tmp_path: Path, line: str) -> None:
     """Positions and exposures of invalid lines are interpolated from their neighbours; their times are NaN."""
-    text = f"mirror_x,mirror_y,time,valid,exposure_ms\n0.1,0,0.1,1,5\n{line}\n0.3,0.2,0.3,true,7\n"
-    found = load_pointing_table(_table(tmp_path, text)).of_cube("c", 3)
+    text = f"mirror_x,mirror_y,time,valid,exposure_ms\n0.1,0,0.1,1,5\n{line}\n0.3,0.2,0.3,1,7\n"
+    found = load_pointing(_table(tmp_path, text), "c", 3)
     np.testing.assert_allclose(found.position, [[0.1, 0], [0.2, 0.1], [0.3, 0.2]])
     assert found.valid.tolist() == [True, False, True]
     np.testing.assert_array_equal(found.time_s, [0.1, np.nan, 0.3])
@@ -71,13 +71,13 @@ def test_invalid_lines_need_no_numbers(tmp_path: Path, line: str) -> None:
 
 def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
     """Rows belong to the cube that they name; for a single cube of another name they name its sweeps."""
-    table = load_pointing_table(_table(tmp_path, "sweep,position_px,time\na,0,0\na,1,1\nb,5,0\nb,4,1\nb,3,2\n"))
-    assert table.of_cube("a", 2).position[:, 0].tolist() == [0, 1]
-    assert table.of_cube("b", 3).position[:, 0].tolist() == [5, 4, 3]
-    assert table.of_cube("whole", 5, alone=True).part == ("a", "a", "b", "b", "b")
-    assert table.of_cube("a", 2, alone=True).part is None
+    table = _table(tmp_path, "sweep,position_px,time\na,0,0\na,1,1\nb,5,0\nb,4,1\nb,3,2\n")
+    assert load_pointing(table, "a", 2).position[:, 0].tolist() == [0, 1]
+    assert load_pointing(table, "b", 3).position[:, 0].tolist() == [5, 4, 3]
+    assert load_pointing(table, "whole", 5, alone=True).part == ("a", "a", "b", "b", "b")
+    assert load_pointing(table, "a", 2, alone=True).part is None
     with pytest.raises(SceneError, match="has no row for the cube 'c'; its column 'sweep' names a, b"):
-        table.of_cube("c", 2)
+        load_pointing(table, "c", 2)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,8 @@ def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
         ("angle_deg,position_m\n0,0\n", "one kind of pointing, but it has 2 kinds"),
         ("angle_deg\n\nten\n", "row 3: angle_deg = 'ten' is no number"),
         ("angle_deg;time\n1,5;0\n", r"row 2: angle_deg = '1,5' is no number; write numbers with a decimal point"),
-        ("angle_deg,time\n1\n", "row 2 has 1 cells, the header in row 1 has 2"),
+        ("angle_deg,time\n1\n2,3\n3,4\n", "row 2: time = nan, expected a number"),
+        ("angle_deg\n0\n1,5\n", "cannot be read as a pointing table: expected 1 fields in line 3, saw 2; name"),
         ("angle_deg\n0\n1\n", "has 2 rows for cube, fewer than its 3 lines"),
         ("angle_deg\n0\n1\n2\n3\n", "has 4 rows for cube, more than its 3 lines"),
         (
@@ -119,7 +120,7 @@ def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
 def test_unusable_tables_are_refused(tmp_path: Path, text: str, message: str) -> None:
     """Columns, cells, numbers of rows, range, order and unknown values are checked; the first wrong row is named."""
     with pytest.raises(SceneError, match=re.escape(message)):
-        load_pointing_table(_table(tmp_path, text)).of_cube("cube", 3)
+        load_pointing(_table(tmp_path, text), "cube", 3)
 
 
 def test_pointing_is_found_by_the_cubes_name(tmp_path: Path) -> None:

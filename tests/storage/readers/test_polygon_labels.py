@@ -89,6 +89,8 @@ def test_polygons_use_the_classes_of_scene_toml(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.labels, TRUTH)
     found = load_scene_file(image, labels=written(tmp_path / "numbers.gpkg", code=[1, 9]))
     np.testing.assert_array_equal(found.labels, np.where(TRUTH == 1, 1, NONE))
+    found = load_scene_file(image, labels=written(tmp_path / "zeros.gpkg", code=["01", "03"]))
+    np.testing.assert_array_equal(found.labels, TRUTH)
     with pytest.raises(SceneError, match="have 1 polygons of crop = 'oats', which is no class"):
         load_scene_file(image, labels=written(tmp_path / "odd.gpkg", crop=["wheat", "oats"]))
 

@@ -6,21 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import odc.geo.xr  # noqa: F401 - registers the accessor
 import pytest
 import rasterio
-import xarray as xr
-from affine import Affine
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
-from rasterio.control import GroundControlPoint
 
-from spectralzoom.pipeline.setting_fields import numbers_of
-from spectralzoom.storage.readers.image_files import bad_bands
-from spectralzoom.storage.readers.scene_files import bands_text, load_scene_file
+from spectralzoom.storage.readers.scene_files import load_scene_file
 
-PLACE = Affine(0.5, 0, 400_000, 0, -0.5, 5_700_000)
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
 NM = [450.0, 550.0, 660.5, 800.0]
 
@@ -32,62 +23,6 @@ def write(path: Path, values: Any = VALUES, **profile: Any) -> rasterio.io.Datas
     file = rasterio.open(path, "w", **{"driver": "GTiff", "photometric": "MINISBLACK", **size, **profile})
     file.write(values)
     return file
-
-
-def say_in_bands(file: Any) -> None:
-    for band, centre in enumerate(NM):
-        file.update_tags(band + 1, WAVELENGTH=f"{centre / 1000}", WAVELENGTH_UNITS="Micrometers")
-
-
-def say_in_imagery(file: Any) -> None:
-    for band, centre in enumerate(NM):
-        file.update_tags(band + 1, ns="IMAGERY", CENTRAL_WAVELENGTH_UM=str(centre / 1000), FWHM_UM="0.006")
-
-
-def say_in_a_list(file: Any) -> None:
-    file.update_tags(wavelength="{" + ", ".join(map(str, NM)) + "}", wavelength_units="nm", fwhm="6 6 6 6")
-
-
-def say_in_names(file: Any) -> None:
-    file.descriptions = [f"Band {number} ({centre} Nanometers)" for number, centre in enumerate(NM)]
-
-
-@pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names])
-def test_wavelengths_are_read_from_several_kinds_of_tags(tmp_path: Path, say: Any) -> None:
-    """Tags of bands, GDAL's domain IMAGERY, a list of the file and band names are read; two kinds have widths."""
-    with write(tmp_path / "a.tif") as file:
-        say(file)
-    scene = load_scene_file(tmp_path / "a.tif")
-    assert scene.wavelength_nm.tolist() == pytest.approx(NM)
-    if say in (say_in_imagery, say_in_a_list):
-        assert scene.fwhm_nm.tolist() == pytest.approx([6.0] * 4)
-
-
-def test_a_geotiff_keeps_its_georeference(tmp_path: Path) -> None:
-    """CRS and transform are as written; one alone, or ground control points, give no georeference but a note."""
-    write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE).close()
-    scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
-    assert (scene.geobox.affine, scene.geobox.crs.epsg, tuple(scene.geobox.shape)) == (PLACE, 25832, (6, 7))
-    write(tmp_path / "b.tif", transform=PLACE).close()
-    points = [GroundControlPoint(0, 0, 7, 52), GroundControlPoint(6, 0, 7, 51.9), GroundControlPoint(0, 7, 7.1, 52)]
-    write(tmp_path / "c.tif", gcps=points, crs="EPSG:4326").close()
-    write(tmp_path / "d.tif", crs="EPSG:25832").close()
-    notes = {"b": "a transform and no CRS", "c": "control points, which are not read", "d": "a CRS and no transform"}
-    for name, words in notes.items():
-        scene = load_scene_file(tmp_path / f"{name}.tif", wavelengths=NM)
-        assert scene.geobox is None
-        assert any(words in note for note in scene.provenance)
-
-
-def test_bands_marked_as_bad_are_left_out(tmp_path: Path) -> None:
-    """A note names them, and `--bands` can still select them."""
-    with write(tmp_path / "a.tif") as file:
-        say_in_a_list(file)
-        file.update_tags(bbl="{1, 0, 1, 1}")
-    scene = load_scene_file(tmp_path / "a.tif")
-    assert scene.wavelength_nm.tolist() == [450.0, 660.5, 800.0]
-    assert any("bands 1 are left out: the file marks them as bad; --bands 0-3 takes" in one for one in scene.provenance)
-    assert load_scene_file(tmp_path / "a.tif", bands=[1]).wavelength_nm.tolist() == [550.0]
 
 
 @pytest.mark.parametrize("kind", ["mask", "RGBA", "RGB"])
@@ -113,37 +48,3 @@ def test_masked_and_transparent_pixels_are_nan(tmp_path: Path, kind: str) -> Non
         assert (np.isnan(scene.values) == (~there & gap)[..., None]).all()
         hashes.add(scene.light_hash)
     assert len(hashes) == 2
-
-
-def test_a_zarr_store_is_georeferenced_in_three_ways(tmp_path: Path) -> None:
-    """A grid mapping, coordinates with a CRS, and GeoZarr's attributes are read; coordinates alone do not suffice."""
-    values = ("y", "x", "band"), np.moveaxis(VALUES, 0, -1)
-    centres = {"y": 5_700_000 - 0.25 - 0.5 * np.arange(6), "x": 400_000.25 + 0.5 * np.arange(7)}
-    waves = {"wavelength": ("band", np.array(NM), {"units": "nm"})}
-    crs = xr.DataArray(0, attrs={"crs_wkt": rasterio.crs.CRS.from_epsg(25832).to_wkt()})
-    told = {"GeoTransform": "400000 0.5 0 5700000 0 -0.5", **crs.attrs}
-    geozarr = {"proj:code": "EPSG:25832", "spatial:transform": list(PLACE[:6])}
-    stores = {
-        "mapping": xr.Dataset({"v": (*values, {"grid_mapping": "crs"})}, {**waves, "crs": ((), 0, told)}),
-        "centres": xr.Dataset({"v": values}, {**waves, **centres, "spatial_ref": crs}),
-        "geozarr": xr.Dataset({"v": (*values, geozarr)}, waves),
-        "halves": xr.Dataset({"v": values}, {**waves, **centres}),
-    }
-    for name, store in stores.items():
-        store.to_zarr(tmp_path / f"{name}.zarr", zarr_format=3, consolidated=False)
-        geobox = load_scene_file(tmp_path / f"{name}.zarr:v").geobox
-        if name == "halves":
-            assert geobox is None
-        else:
-            assert geobox.crs.epsg == 25832
-            np.testing.assert_allclose(geobox.affine[:6], PLACE[:6])
-
-
-@given(st.lists(st.booleans(), min_size=1, max_size=40))
-def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
-    """The zeros of a list are the bad bands, and their text is read as the same bands."""
-    bad = bad_bands("{" + ", ".join(str(int(one)) for one in good) + "}", len(good))
-    assert list(bad) == [band for band, one in enumerate(good) if not one]
-    assert bad_bands("1, 1", len(good)) == () or len(good) == 2
-    if bad:
-        assert [int(str(one)) for part in bands_text(bad).split(",") for one in numbers_of(part)] == list(bad)

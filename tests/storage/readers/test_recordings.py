@@ -20,7 +20,7 @@ from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_t
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
-from spectralzoom.storage.readers.recordings import RecordedWith, _middle_s, open_recording
+from spectralzoom.storage.readers.recordings import _middle_s, open_recording
 from spectralzoom.storage.store import Archive
 from tests.envi_files import write_recorded_files
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
@@ -84,7 +84,7 @@ def test_recordings_open_from_folders_runs_and_archives(tmp_path: Path, archive:
     longer = replace(CAMERA, exposure_ms=2 * CAMERA.exposure_ms)
     assert open_recording(store, longer).camera.exposure_ms == full.exposure_ms[0]  # plans use the recorded exposure
     with pytest.raises(SettingsError, match=r"--dark is for files, and .* holds raw cubes"):
-        open_recording(store, CAMERA, RecordedWith(dark=store))
+        open_recording(store, CAMERA, dark=store)
     with pytest.raises(ArchiveError, match=f"has no run 'x'; its latest are {runs[0].name}, {runs[1].name}"):
         open_recording(archive.root / "runs" / "x", CAMERA)
     archive.clear(archive.ref("capture", store.name))
@@ -150,7 +150,7 @@ def test_a_scan_without_a_mirror_uses_its_positions(
     """For a stage, conveyor or drone, pixels are used as given, and metres are divided by the lines' distance."""
     table = tmp_path / "stage.csv"
     table.write_text(column + "\n" + "".join(f"{value!r}\n" for value in values.tolist()))
-    recording = open_recording(files, CAMERA, RecordedWith(pointing=table))
+    recording = open_recording(files, CAMERA, pointing=table)
     sweep = recording.sweeps[0]
     seen = direction_to_scene(position_to_direction(sweep.position)) / recording.camera.ifov_rad
     expected = (np.arange(80) - 39.5) * distance * (1 if values[1] > values[0] else -1)
@@ -168,7 +168,7 @@ def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
         x, y = cube.position[number if number < 42 else 80 - number].tolist()
         rows.append(f"{x!r},{y!r},{'there' if number < 40 else '' if number < 42 else 'back'}")
     (tmp_path / "turns.csv").write_text("\n".join(rows))
-    there, back = open_recording(files, CAMERA, RecordedWith(pointing=tmp_path / "turns.csv")).sweeps
+    there, back = open_recording(files, CAMERA, pointing=tmp_path / "turns.csv").sweeps
     assert (there.sweep.name, there.sweep.lines, there.sweep.start_px) == ("there", 40, pytest.approx(-39.5, abs=1e-5))
     assert (back.sweep.name, back.sweep.lines, back.sweep.start_px) == ("back", 38, -38.5)
     np.testing.assert_array_equal(back.read_lines(np.arange(38)), cube.read(42, 80))
@@ -220,7 +220,7 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
     (tmp_path / "c.img").unlink()  # a table alone may be another recording's
     (tmp_path / "tables").mkdir()
     with pytest.raises(SceneError, match=r"has no pointing for a; add a\.csv, or name one table for all"):
-        open_recording(tmp_path, given=RecordedWith(pointing=tmp_path / "tables"))
+        open_recording(tmp_path, pointing=tmp_path / "tables")
 
 
 def test_missing_wavelengths_of_npy_suggest_the_option(tmp_path: Path) -> None:
@@ -282,7 +282,7 @@ def test_the_key_of_a_recording_depends_on_its_content(files: Path, tmp_path: Pa
     moved = files.rename(tmp_path / "moved")
     assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
     np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
-    keys = [key, open_recording(moved, CAMERA, RecordedWith(dark=tmp_path / "dark.npy")).key()]
+    keys = [key, open_recording(moved, CAMERA, dark=tmp_path / "dark.npy").key()]
     text = (moved / "scan-0.pointing.csv").read_text()
     (moved / "scan-0.pointing.csv").write_text(text.replace("0.05,", "0.06,", 1))
     keys.append(open_recording(moved, CAMERA).key())
@@ -298,7 +298,7 @@ def test_the_white_frame_gives_the_bit_depth(tmp_path: Path) -> None:
     """Lines over dark ground reach 2000 only; the white frame's 12000 needs 14 bits."""
     write_envi(tmp_path / "a.raw", np.full((40, 8, 2), 2000, np.uint16))
     np.save(tmp_path / "a.white.npy", np.full((8, 2), 12_000, np.float32))
-    recording = open_recording(tmp_path / "a.hdr", None, RecordedWith(wavelengths=(500.0, 600.0)))
+    recording = open_recording(tmp_path / "a.hdr", wavelengths=(500.0, 600.0))
     assert recording.camera.bits == 14
     assert any("numbers reach 12000, so 14 bits" in note for note in recording.notes)
 
@@ -349,5 +349,5 @@ def test_nodata_values_are_invalid(tmp_path: Path, kind: str, void: int) -> None
 def test_missing_line_times_follow_the_period() -> None:
     """Times before the first and after the last follow it too: lines at one time would count as repeated."""
     source: Any = SimpleNamespace(shape=(6,))
-    times = _middle_s(source, np.array([np.nan, 1.0, np.nan, 3.0, np.nan, np.nan]), CAMERA, [])
+    times = _middle_s(source, np.array([np.nan, 1.0, np.nan, 3.0, np.nan, np.nan]), CAMERA)[0]
     assert times.tolist() == [0, 1, 2, 3, 4, 5]

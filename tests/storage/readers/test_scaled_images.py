@@ -12,7 +12,7 @@ import rasterio
 from affine import Affine
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.open_cubes import open_cube
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_files import load_scene_file, open_scene_file
 from tests.storage.readers.test_raster_tags import write
 
@@ -26,7 +26,7 @@ def test_jpeg_2000_is_read(tmp_path: Path) -> None:
     place = {"crs": "EPSG:32632", "transform": Affine(10, 0, 600_000, 0, -10, 5_700_000)}
     with rasterio.open(path, "w", "JP2OpenJPEG", 50, 70, 3, dtype="uint16", **place, **REVERSIBLE) as file:
         file.write(values)
-    source = open_cube(path)
+    source = open_cube_source(path)
     assert source.geobox is not None
     expected = np.moveaxis(values, 0, -1)
     np.testing.assert_array_equal(np.concatenate([source.read(0, 64), source.read(64, 70)]), expected)
@@ -51,7 +51,7 @@ def test_scale_and_offset_of_tiff_are_applied(tmp_path: Path) -> None:
     raw = np.moveaxis(np.arange(24).reshape(2, 3, 4) * 100, 0, -1)
     expected = np.where(raw == 0, np.nan, raw * [0.001, 0.002] + [0.5, 0.0])
     np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
-    np.testing.assert_allclose(open_cube(scaled).read(1, 3), expected[1:3], rtol=1e-6)
+    np.testing.assert_allclose(open_cube_source(scaled).read(1, 3), expected[1:3], rtol=1e-6)
     said = "values are the file's numbers times 0.001 plus 0.5 (others"
     assert any(note.startswith(said) for note in scene.provenance)
     sidecar = write_tiff(tmp_path / "sidecar.tif")
@@ -103,4 +103,4 @@ def test_envi_reflectance_scale_factor_is_applied(tmp_path: Path) -> None:
     (tmp_path / "a.bip").write_bytes(numbers.tobytes())
     scene = load_scene_file(tmp_path / "a.hdr", wavelengths=[500, 600])
     np.testing.assert_allclose(scene.values, np.where(numbers == 0, np.nan, numbers / 10_000), rtol=1e-6)
-    np.testing.assert_array_equal(open_cube(tmp_path / "a.hdr", labels=True).read(0, 3), numbers)
+    np.testing.assert_array_equal(open_cube_source(tmp_path / "a.hdr", labels=True).read(0, 3), numbers)

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import geopandas
+import pandas as pd
+import pyogrio
 import pytest
 import shapely
 
@@ -15,6 +22,11 @@ from spectralzoom.storage.readers.polygons import read_zones
 
 SQUARE, OTHER = shapely.box(0, 0, 10, 10), shapely.box(20, 0, 25, 10)
 BOWTIE = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
+
+
+def feature(**more: Any) -> str:
+    """Return a square as GeoJSON."""
+    return json.dumps({"type": "Feature", "properties": {}, "geometry": SQUARE.__geo_interface__} | more)
 
 
 def written(path: Path, shapes: list[Any], crs: Any = 32632, layer: str | None = None, **columns: list[Any]) -> str:
@@ -74,6 +86,99 @@ def test_only_geojson_may_lack_a_crs(tmp_path: Path) -> None:
         read_zones(path)
 
 
+@pytest.fixture
+def server() -> Iterator[HTTPServer]:
+    """Run a server on this machine that has only errors, and counts requests."""
+    asked: list[str] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            self.send_error(404)
+
+        def log_message(self, *words: object) -> None:
+            """Print nothing."""
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as running:
+        Thread(target=running.serve_forever, daemon=True).start()
+        yield running
+        running.shutdown()
+    assert asked == []
+
+
+LAYER = '<OGRVRTLayer name="a"><SrcDataSource>{url}/a.json</SrcDataSource></OGRVRTLayer>'
+
+
+@pytest.mark.parametrize("name", ["z.geojson", "z.gpkg", "z.shp"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "<OGRWFSDataSource><URL>{url}</URL></OGRWFSDataSource>",
+        f"<OGRVRTDataSource>{LAYER}</OGRVRTDataSource>",
+        feature(crs={"type": "link", "properties": {"href": "{url}/crs"}}),
+    ],
+)
+def test_a_file_by_another_driver_contacts_no_server(
+    name: str, content: str, server: HTTPServer, tmp_path: Path
+) -> None:
+    """GDAL's WFS and VRT, and linked CRS, are refused under every name."""
+    (tmp_path / name).write_text(content.replace("{url}", f"http://127.0.0.1:{server.server_port}"))
+    with pytest.raises(ZoneError, match="cannot read"):
+        read_zones(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    "sql",
+    ["CREATE VIRTUAL TABLE v USING VirtualShape('/data/z', 'UTF-8', 32632)", "create/**/\nvirtual table v using x"],
+)
+def test_a_geopackage_reads_no_other_file(sql: str, tmp_path: Path) -> None:
+    """Tables that a module of SQLite fills are refused; the index of shapes is none of them."""
+    path = written(tmp_path / "z.gpkg", [SQUARE])
+    assert read_zones(path).shapes["1"].area == 100
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA writable_schema = ON")
+        file.execute("INSERT INTO sqlite_master VALUES ('table', 'v', 'v', 0, ?)", [sql])
+        file.commit()
+    with pytest.raises(ZoneError, match="its table v may read other files"):
+        read_zones(path)
+
+
+def test_a_table_without_shapes_is_no_layer(tmp_path: Path) -> None:
+    """GIS programs store styles beside the only layer."""
+    path = written(tmp_path / "z.gpkg", [SQUARE])
+    pyogrio.write_dataframe(pd.DataFrame({"style": ["red"]}), path, layer="layer_styles")
+    assert list(read_zones(path).shapes) == ["1"]
+
+
+@pytest.mark.parametrize("grid", ["/data/a.gsb", "http://127.0.0.1:9/a.gsb", "../a.gsb"])
+def test_a_crs_names_no_file(grid: str, tmp_path: Path) -> None:
+    """The .prj file of a shapefile may name grids of PROJ alone."""
+    path = written(tmp_path / "z.shp", [SQUARE], crs=f"+proj=utm +zone=32 +ellps=bessel +nadgrids={grid}")
+    with pytest.raises(ZoneError, match=f"names the grid file {grid}; give one of EPSG"):
+        read_zones(path)
+    path = written(tmp_path / "y.shp", [SQUARE], crs="+proj=utm +zone=32 +ellps=bessel +nadgrids=none.gsb")
+    with pytest.raises(ZoneError, match="cannot read"):
+        read_zones(path)
+    path = written(tmp_path / "x.shp", [SQUARE], crs="+proj=utm +zone=32 +ellps=bessel +nadgrids=@null")
+    assert len(read_zones(path).shapes) == 1
+
+
+@pytest.mark.parametrize("part", [".dbf", ".shx", ".prj", ".cpg"])
+def test_parts_of_a_shapefile_lie_in_its_folder(part: str, tmp_path: Path) -> None:
+    """A link out of the folder is refused, and one within is followed."""
+    (tmp_path / "out").mkdir()
+    path = written(tmp_path / "z.shp", [SQUARE])
+    own = (tmp_path / "z").with_suffix(part)
+    own.with_suffix(part).rename(tmp_path / f"kept{part}")
+    own.symlink_to(tmp_path / f"kept{part}")
+    assert len(read_zones(path).shapes) == 1
+    own.unlink()
+    (tmp_path / f"kept{part}").rename(tmp_path / "out" / f"kept{part}")
+    own.symlink_to(tmp_path / "out" / f"kept{part}")
+    with pytest.raises(ZoneError, match=f"z{part} is no file, or a link out of its folder"):
+        read_zones(path)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -84,6 +189,17 @@ def test_only_geojson_may_lack_a_crs(tmp_path: Path) -> None:
         ("z.geojson", '{"type": "FeatureCollection", "features": []}', "expected polygons, got none"),
         ("z.gpkg", "SQLite? no", "cannot read"),
         ("z.shp", "\x00\x00", "cannot read"),
+        (
+            "z.geojson",
+            feature(crs={"type": "name", "properties": {"name": "+init=epsg:4326"}}),
+            "its CRS .* is no name",
+        ),
+        ("z.geojson", feature(type="Topology"), "JSON of type 'Topology', expected GeoJSON"),
+        ("z.geojson", feature(properties=[1]), "it is no valid GeoJSON"),
+        ("z.geojson", '{"features":' + 99999 * "[", "cannot read"),
+        ("z.geojson", feature().replace("10.0", "1e5"), "a point at x 100000, y 0, in degrees: is its CRS right"),
+        ("z.geojson", feature().replace("10.0", "NaN"), "cannot read"),
+        ("z.geojson", feature(crs={"type": "name", "properties": {"name": "EPSG:4978"}}), "neither geographic nor"),
     ],
 )
 def test_files_without_polygons_are_refused(name: str, content: str | None, words: str, tmp_path: Path) -> None:

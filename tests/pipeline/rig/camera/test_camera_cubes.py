@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import RigError, ShapeError
+from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.rig.camera.camera_cubes import (
     as_references,
     cube_lines,
@@ -145,10 +147,21 @@ def test_stuck_and_dead_pixels_are_found() -> None:
     dark, white = frames(64), frames(3000)
     dark[:, 3, 4] = 70
     white[:, 20, 5] = 66
-    references = as_references(mean_frame(dark), mean_frame(white), white_reference=0.5)
+    references, _ = as_references(mean_frame(dark), mean_frame(white), white_reference=0.5)
     assert references.bad is not None
     assert np.argwhere(references.bad).tolist() == [[3, 4], [20, 5]]
     assert references.white_reference.tolist() == [0.5] * 10
+
+
+def test_references_of_another_exposure_are_scaled() -> None:
+    """The camera copies frames that its own program took; a dark frame that cannot be scaled is refused."""
+    dark, white = (mean_frame(np.full((1, 8, 10), level, np.uint16)) for level in (60, 1560))
+    stated = replace(white, taken=Taken("the white frame", {"": 5.0}))
+    for one, exposure_ms, found in ((white, 10.0, None), (stated, 5.0, None), (stated, 10.0, 5.0)):
+        references, notes = as_references(dark, one, exposure_ms=exposure_ms)
+        assert (references.exposure_ms, len(notes)) == (found, int(found is not None))
+    with pytest.raises(RigError, match=r"dark frame was taken with 1 ms, .* take both again"):
+        as_references(replace(dark, taken=Taken("the dark frame", {"": 1.0})), stated, exposure_ms=5.0)
 
 
 def test_references_that_do_not_fit_are_refused() -> None:

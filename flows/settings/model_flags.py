@@ -1,0 +1,168 @@
+"""Define the flags of the verbs on weights: train and evaluate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from spectralzoom.flows.settings.flags import OutFolder, parse_numbers, parse_wholes, split_list
+from spectralzoom.models.network.machine import PROCESSOR, Device
+from spectralzoom.models.training.train import TrainingSettings
+from spectralzoom.pipeline.errors import SettingsError
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class SceneFlags:
+    """Flags of a labelled scene.
+
+    Parameters
+    ----------
+    seed
+        Random seed of initial weights, crops, noise and random policy.
+    scenes
+        Number of built-in scenes. Default: 4 to evaluate; 48 to train, on days from April to October (`scouting`: May
+        to July).
+    device
+        Device of the network: `cpu`, `cuda`, `mps`, or `auto` (cuda or mps if available, else cpu).
+    labels
+        For one scene: label file.
+    bands
+        For one scene: band numbers to use, counted from 0, with commas.
+    wavelengths
+        For one scene: centre wavelengths of its bands [nm], with commas.
+    """
+
+    seed: int = 0
+    scenes: int | None = None
+    device: Device = PROCESSOR
+    labels: str | None = None
+    bands: str | None = None
+    wavelengths: str | None = None
+
+    def choices(self) -> dict[str, Any]:
+        """Return the choices of files and bands of one scene. Raises SettingsError: numbers are invalid."""
+        return {
+            "labels": self.labels,
+            "bands": parse_wholes(self.bands, "--bands"),
+            "wavelengths": parse_numbers(self.wavelengths, "--wavelengths"),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainFlags(SceneFlags):
+    """Flags of a training.
+
+    Parameters
+    ----------
+    hold_out
+        Names of scenes to exclude from training, with commas: 059,060. The weights record the split.
+    validation
+        Number of validation scenes. Default: 3 built-in scenes, or one in eight of a folder, at most 4.
+    steps
+        Maximum number of steps; training stops at --steps or --minutes, whichever comes first.
+    minutes
+        Time limit of the steps [min]; reading scenes and validation are not included.
+    patch
+        Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
+    start
+        Weights from which the training starts. Bands, classes and sizes must be theirs, and DATASET must contain the
+        scenes that they know. The result is the mean of both networks, or the trained one where it reads the
+        validation scenes better.
+    learning_rate
+        Highest learning rate. Default: 0.0015, or a third of it with --start.
+    train_temporal
+        Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
+        reader that they have. It takes --scenes, --steps, --minutes and --seed; it does not resume. It
+        needs 4 GB of memory, and half an hour for reading the scenes besides --minutes.
+    dim
+        Token width of the transformer.
+    layers
+        Number of transformer layers. Default: 3, or 1 for frames of 512 px and more.
+    heads
+        Number of attention heads; a divisor of --dim.
+    crop
+        Size of the crops [px].
+    batch
+        Crops per step; half as many, of twice the area, in the last 30 % of the steps.
+    min_exposure_ms
+        Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
+        1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
+    train_mask
+        For one scene: mask image of the training pixels; 0 excludes a pixel.
+    mask_classes
+        For one scene: classes of the label file that the mask's numbers 1, 2, ... stand for, with commas.
+    """
+
+    hold_out: str | None = None
+    validation: int | None = None
+    steps: int = TrainingSettings.steps
+    minutes: float = TrainingSettings.minutes
+    patch: int | None = None
+    start: Path | None = None
+    learning_rate: float | None = None
+    train_temporal: Path | None = None
+    dim: int = 64
+    layers: int | None = None
+    heads: int = 4
+    crop: int = TrainingSettings.crop
+    batch: int = TrainingSettings.batch
+    min_exposure_ms: float = TrainingSettings.darkest_ms
+    train_mask: str | None = None
+    mask_classes: str | None = None
+
+    def choices(self) -> dict[str, Any]:
+        """Return the choices of files, bands and masks of one scene. Raises SettingsError: numbers are invalid."""
+        masks = {"train_mask": self.train_mask, "mask_classes": parse_wholes(self.mask_classes, "--mask-classes")}
+        return super().choices() | masks | {"hold_out": split_list(self.hold_out)}
+
+    @property
+    def settings(self) -> TrainingSettings:
+        """Return the settings of the network's training."""
+        same = {name: getattr(self, name) for name in ("steps", "minutes", "seed", "crop", "batch")}
+        usual = TrainingSettings.learning_rate / (3 if self.start else 1)
+        rate = usual if self.learning_rate is None else self.learning_rate
+        return TrainingSettings(**same, darkest_ms=self.min_exposure_ms, learning_rate=rate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateFlags(SceneFlags):
+    """Flags of an evaluation.
+
+    Parameters
+    ----------
+    weights
+        Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
+        trained on it.
+    out
+        Folder of evaluation.json.
+    fractions
+        Fractions of the patches to read at full resolution, with commas; none and all are always included.
+    frames
+        Names of the frames, with commas. Default: all.
+    """
+
+    weights: Annotated[tuple[Path, ...], Parameter(negative="")] = ()
+    out: OutFolder = None
+    fractions: str = "0.05,0.1,0.15,0.2,0.35"
+    frames: str | None = None
+
+    @property
+    def parts(self) -> tuple[float, ...]:
+        """Return the fractions, ascending, without those that are always judged.
+
+        Raises SettingsError: one is no number, or none from 0 to 1.
+        """
+        fractions = parse_numbers(self.fractions, "--fractions") or ()
+        for fraction in fractions:
+            if not 0 <= fraction <= 1:
+                raise SettingsError(
+                    f"--fractions are fractions of the patches from 0 to 1 (0.1 is 10 %), got {fraction:g}"
+                )
+        return tuple(sorted({fraction for fraction in fractions if 0 < fraction < 1}))
+
+
+NO_TRAIN_FLAGS, NO_EVALUATE_FLAGS = TrainFlags(), EvaluateFlags()

@@ -1,0 +1,454 @@
+"""Read wavelengths, widths, colours and bad bands from the numbers, tags and band names of any file.
+
+No file is opened here. A fact that cannot be read without a guess is left out, and a note gives the reason.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+RANGE_NM = (200.0, 3000.0)
+THERMAL_NM = 20_000.0  # end of the longest wavelengths in cameras' files
+LEAST_WIDTH_NM = 0.02
+RGB_NM = (640.0, 550.0, 460.0)
+NEAR_INFRARED_NM = 800.0
+GREY_NM = 550.0
+# spelling of a unit: its length [nm]
+_LENGTHS: Mapping[str, float] = {
+    r"nm|nano ?-?met(?:er|re)s?": 1.0,
+    r"[uμ]m|microns?|micro ?-?met(?:er|re)s?": 1000.0,
+    r"å|[aå]ngstr(?:o|ö|oe)ms?": 0.1,
+}
+_OTHER_LENGTHS: Mapping[str, float] = {
+    r"a": 0.1,
+    r"m|met(?:er|re)s?": 1e9,
+    r"cm|centimet(?:er|re)s?": 1e7,
+    r"mm|millimet(?:er|re)s?": 1e6,
+}
+_BY_SIZE = {"nm": 1.0, "micrometres": 1000.0, "metres": 1e9}
+_UNSAID = ("", "unknown", "none", "unspecified", "-")
+_MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
+_NUMBER = r"(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[+-]?\d+)?"
+_UNIT = rf"(?:{'|'.join(_LENGTHS)})(?![a-z])"
+_ITEM = re.compile(rf"([+-]?{_NUMBER})\s*(?![\d.,])(.*)")
+_BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE)  # also of np.float64(450.0)
+_UNIT_KEY = re.compile("units?$")
+_KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
+_CENTRE_KEY = re.compile(
+    rf"(?:(?:band|cent(?:er|re)|central|peak|nominal|mean|radiation)*wavelengths?(?:cent(?:er|re)|value|list|d)?s?"
+    rf"|(?:band|spectral)cent(?:er|re)s?|wls?|lambdas?|(?=nm)){_KEY_UNIT}"
+)
+_WIDTH_KEY = re.compile(
+    rf"(?:(?:band|wavelength)?fwhms?|fullwidth(?:at)?halfmax(?:imum)?|bandwidths?|spectralwidths?){_KEY_UNIT}"
+)
+GOOD_BANDS = ("bbl", "good", "goodband", "goodbands", "goodwavelength", "goodwavelengths", "goodbandlist")  # 0 is bad
+_BAD_BAND = ("bad", "badband", "isbad")  # of one band: 1 is bad
+_TRUTH = {"true": 1.0, "yes": 1.0, "good": 1.0, "false": 0.0, "no": 0.0, "bad": 0.0}
+
+MOST_NAME = 200  # characters of a band name that are read
+_COUNTED = r"(?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*"  # words before a band's number
+_BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)(?!\s*{_UNIT})[\s_:.)-]*")
+_DASH = r"\s*(?:[-~\u2010-\u2015\u2212]|\.{2,3}|to|bis|and|through)\s*"
+_SPAN = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})?{_DASH}({_NUMBER})\s*({_UNIT})")
+_LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})")
+# a number beside the length that may be another length, a width or the number of a band
+_DOUBTFUL = re.compile(
+    rf"(?<![a-z\d.])[\d.]+\s*(?:[,/;&+*|@±]|at)\s*{_NUMBER}\s*{_UNIT}|fwhm|width"
+    rf"|{_COUNTED}\d+{_DASH}{_NUMBER}\s*{_UNIT}|(?<!\d)(?:[2-9]\d\d|[12]\d{{3}})[\s_]+{_NUMBER}\s*{_UNIT}"
+)
+# words of a colour: its usual wavelength [nm]; the first that fits counts
+_COLOURS: Mapping[str, float] = {
+    "coastal(?: aerosol| blue)?|aerosol": 443.0,
+    "red ?edge ?(?:1|071)": 705.0,
+    "red ?edge ?(?:2|075)": 740.0,
+    "red ?edge ?(?:3|078)": 783.0,
+    "red ?edge": 717.0,
+    "near ?(?:infra ?red|ir)|nir": NEAR_INFRARED_NM,
+    "infra ?red": np.nan,  # short, middle or thermal
+    "swir ?(?:16|1)": 1610.0,
+    "swir ?(?:22|2)": 2200.0,
+    "blue": RGB_NM[2],
+    "green": RGB_NM[1],
+    "yellow": 590.0,
+    "orange": 620.0,
+    "red": RGB_NM[0],
+    "gr[ae]y|pan(?:chromatic)?": GREY_NM,
+}
+_LETTERS = dict(zip("rgbn", (*RGB_NM, NEAR_INFRARED_NM), strict=True))
+_COLOUR = re.compile("|".join(f"(?<![a-z])({words})(?![a-z])" for words in _COLOURS))
+_PLAIN = re.compile(
+    rf"(?:(?:{'|'.join(_COLOURS)}|r|x|wl|w|λ|lambda|wavelength|refl|reflectance|rho|rrs|radiance)[\s_-]*)*({_NUMBER})"
+)
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Facts of the bands; None if not known."""
+
+    wavelength_nm: NDArray[np.float64] | None = None  # (band,), NaN of a band without one
+    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
+    origin: str = ""  # one sentence
+    notes: tuple[str, ...] = ()  # assumptions, or reasons why nothing is known
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Return the bands (from 0) without a wavelength where others have one."""
+        return () if self.wavelength_nm is None else tuple(np.flatnonzero(np.isnan(self.wavelength_nm)).tolist())
+
+
+def why_unknown(bands: Bands) -> str:
+    """Return why there are no wavelengths, with every reason that was found."""
+    reasons = "; ".join(bands.notes)
+    return f"their wavelengths cannot be read ({reasons})" if reasons else "nothing says their wavelengths"
+
+
+def scale_nm(unit: str | None) -> float | None:
+    """Return the nm of a unit of length; None for other and unknown units."""
+    text = _plain_text(unit).strip(" .[](){}'\"")
+    return next((nm for words, nm in {**_LENGTHS, **_OTHER_LENGTHS}.items() if re.fullmatch(words, text)), None)
+
+
+def is_spectral(attrs: Mapping[str, Any]) -> bool:
+    """Return whether attributes are those of wavelengths, by their standard name or a unit of nm, um or Angstrom."""
+    unit = _plain_text(attrs.get("units", attrs.get("unit")))
+    short = scale_nm(unit)
+    return "wavelength" in str(attrs.get("standard_name", "")) or (short is not None and short <= 1000)
+
+
+def wavelength_unit(name: str) -> str | None:
+    """Return the unit in the name of a list of wavelengths, "" without one; None for names of other lists."""
+    found = _CENTRE_KEY.fullmatch(letters(name))
+    return None if found is None else found[1] or ""
+
+
+def width_unit(name: str) -> str | None:
+    """Return the unit in the name of a list of widths, "" without one; None for names of other lists."""
+    found = _WIDTH_KEY.fullmatch(letters(name))
+    return None if found is None else found[1] or ""
+
+
+def bands_of_numbers(
+    values: object, unit: str | None, origin: str, widths: object = None, width_unit: str | None = None
+) -> Bands:
+    """Return bands by numbers (band,) in a unit; numbers that are not above 0 are missing.
+
+    Without a unit they are nm, micrometres or metres by their size, with a note. Widths without a unit have that of
+    the wavelengths. Numbers in a unit that is no length, or with most of them missing, give a note alone.
+    """
+    centres = _above_zero(values)
+    known = np.isfinite(centres)
+    if 2 * known.sum() < max(len(centres), 1):
+        return Bands(notes=(f"the wavelengths are left out: {known.sum()} of {len(centres)} bands have one",))
+    scale, doubt = _scale(unit, centres[known])
+    if scale is None:
+        return Bands(notes=(doubt,))
+    notes = [doubt] if doubt else []
+    if not known.all():
+        notes.append(f"the file gives no wavelength of bands {bands_text(np.flatnonzero(~known).tolist())} (from 0)")
+    if widths is None:
+        return Bands(centres * scale, None, origin, tuple(notes))
+    width_scale = scale if _plain_text(width_unit) in _UNSAID else scale_nm(width_unit) or np.nan
+    fwhm = _above_zero(widths) * width_scale
+    fits = fwhm.shape == centres.shape and bool(((fwhm >= LEAST_WIDTH_NM) & (fwhm < centres * scale))[known].all())
+    notes += [] if fits else ["the widths (fwhm) are left out: not every band has one that fits its wavelength"]
+    return Bands(centres * scale, fwhm if fits else None, origin, tuple(notes))
+
+
+def _above_zero(values: object) -> NDArray[np.float64]:
+    """Return a flat copy, NaN where a number is masked, infinite or not above 0."""
+    numbers = np.ma.filled(np.ma.array(values, np.float64), np.nan).ravel()
+    return np.where(np.isfinite(numbers) & (numbers > 0), numbers, np.nan)
+
+
+def _scale(unit: str | None, numbers: NDArray[np.float64]) -> tuple[float | None, str]:
+    """Return the nm of a unit, and a note; a unit that is not stated is that of usual wavelengths of this size."""
+    if (known := scale_nm(unit)) is not None:
+        return known, ""
+    if _plain_text(unit) not in _UNSAID:
+        return None, f"the wavelengths are left out: their unit {unit!r} is no length; expected nm, um, Angstrom or m"
+    low, high = numbers.min(), numbers.max()
+    if high <= 20 and (numbers % 1 == 0).all():
+        return None, f"the wavelengths are left out: they have no unit, and {low:g} to {high:g} may count the bands"
+    for name, scale in _BY_SIZE.items():
+        if RANGE_NM[0] <= low * scale <= RANGE_NM[1] and high * scale <= THERMAL_NM:
+            return scale, f"the wavelengths have no unit, read as {name} by their size"
+    fits = "may be Angstrom or nm" if low > RANGE_NM[1] and high <= 10 * RANGE_NM[1] else "fit no unit of wavelengths"
+    return None, f"the wavelengths are left out: they have no unit, and {low:g} to {high:g} {fits}"
+
+
+def split_list(text: str, count: int) -> list[str] | None:
+    """Return the ``count`` numbers of a list as texts, "" where one is missing; None if it is no such list.
+
+    They are separated by semicolons, commas or spaces, and may have decimal commas and units.
+    """
+    bare = _BRACKET.sub(" ", text).strip()
+    for between in (";", ",", r"[,\s]+", r",?\s+") if bare else ():
+        words = [word.strip() for word in re.split(between, bare)]
+        words = words[:-1] if len(words) == count + 1 and not words[-1] else words
+        if len(words) == count and all(not _or_missing(word) or _item(word) for word in words):
+            pairs = [_to_number(part) for word in words for part in word.split(",")]
+            doubled = ";" not in bare and len(pairs) == 2 * count and all(map(_plausible, pairs))  # 450,550 650,750
+            return None if doubled else list(map(_or_missing, words))
+    return None
+
+
+def _or_missing(word: str) -> str:
+    return "" if word.strip().lower() in _MISSING else word
+
+
+def numbers_of_list(text: str, count: int) -> NDArray[np.float64] | None:
+    """Return the (``count``,) numbers of a list, NaN where one is missing; None if it is no such list."""
+    words = split_list(text, count)
+    return None if words is None else np.array([_to_number(word) for word in words], np.float64)
+
+
+def _item(word: str) -> tuple[float, str] | None:
+    """Return the number and the unit, "" without one, of an item of a list; None for others."""
+    found = _ITEM.fullmatch(_plain_text(word))
+    return None if found is None or (found[2] and scale_nm(found[2]) is None) else (_to_number(found[1]), found[2])
+
+
+def _to_number(text: str) -> float:
+    """Return the number at the beginning of a text, with a point or a comma; NaN without one."""
+    found = re.match(rf"[+-]?{_NUMBER}", text.strip().lower())
+    return np.nan if found is None else float(found[0].replace(",", "."))
+
+
+def _plausible(number: float) -> bool:
+    return RANGE_NM[0] <= number <= RANGE_NM[1]
+
+
+def _plain_text(text: object) -> str:
+    """Return text of one line in lower case, with one sign for each of micro and Angstrom."""
+    return " ".join(unicodedata.normalize("NFKC", "" if text is None else str(text)).lower().split())
+
+
+def bands_of_texts(
+    fields: Mapping[str, str | Sequence[str]], names: Sequence[str | None], where: str, colours: Sequence[str] = ()
+) -> Bands:
+    """Return (band,) facts by a file's fields, else by the names of its bands, else by its colours; with all notes.
+
+    A field such as ``wavelength`` or ``band centres (um)`` is a list in one text, or one text a band. ``colours`` are
+    GDAL's colour interpretations.
+    """
+    count = len(names)
+    fields = _gathered(fields, count)
+    names = names if any(names) else _listed_names(fields, count)
+    centres, notes = _listed(fields, _CENTRE_KEY, count)
+    found = Bands()
+    if centres is not None:
+        widths, doubts = _listed(fields, _WIDTH_KEY, count)
+        beside = () if widths is None else _in_one_unit(widths, fields, _WIDTH_KEY)
+        of_centres = _in_one_unit(centres, fields, _CENTRE_KEY)
+        found = bands_of_numbers(*of_centres, f"wavelengths from the tags of {where}", *beside)
+        notes = (*notes, *doubts, *found.notes)
+    if found.wavelength_nm is None:
+        found = bands_of_names(names, where, () if notes else colours)
+        notes = (*notes, *found.notes)
+    return replace(found, notes=notes)
+
+
+def _gathered(fields: Mapping[str, str | Sequence[str]], count: int) -> dict[str, str | Sequence[str]]:
+    """Return fields with those such as ``wavelength_1``, ``wavelength_2``, one a band, as one list."""
+    groups: dict[str, dict[int, str]] = {}
+    for key, value in fields.items():
+        if isinstance(value, str) and (digits := re.search(r"\d{1,5}$", key)):
+            groups.setdefault(key[: digits.start()].rstrip(" _"), {})[int(digits[0])] = value
+    whole = {base: one for base, one in groups.items() if min(one) in (0, 1) and max(one) - min(one) + 1 == count}
+    lists = {base: [one[number] for number in sorted(one)] for base, one in whole.items() if len(one) == count}
+    return {**fields, **lists}
+
+
+def _listed_names(fields: Mapping[str, str | Sequence[str]], count: int) -> Sequence[str | None]:
+    """Return the names that a field lists, one a band; None each without such a list."""
+    for key, value in fields.items():
+        if letters(key) in ("band", "bandname", "bandnames", "longname"):
+            ways = (
+                [re.split(between, value) for between in (",", r",(?!\d)", ";")] if isinstance(value, str) else [value]
+            )
+            if found := [way for way in ways if len(way) == count]:
+                return found[0]
+    return [None] * count
+
+
+def _in_one_unit(
+    items: Sequence[tuple[float, str]], fields: Mapping[str, str | Sequence[str]], kind: re.Pattern[str]
+) -> tuple[NDArray[np.float64], str]:
+    """Return numbers and their unit: nm of those with a unit of their own, else the one that the fields state."""
+    stated = {letters(key): value for key, value in fields.items()}
+    unit = next((stated[key] for key in stated if key != (bare := _UNIT_KEY.sub("", key)) and kind.fullmatch(bare)), "")
+    units = [unit] * len(items) if isinstance(unit, str) else list(unit)
+    numbers = np.array([number for number, _ in items], np.float64)
+    if len(set(filter(None, units))) < 2 and not any(own for _, own in items):
+        return numbers, max(units, default="")
+    scales = [scale_nm(own or said) or np.nan for (_, own), said in zip(items, units, strict=True)]
+    return numbers * scales, "nm"
+
+
+def letters(key: str) -> str:
+    """Return the small letters of a key alone, as they are compared: ``Band centres (µm)`` is ``bandcentresμm``."""
+    return re.sub(r"[^a-zμ]+", "", _plain_text(key))
+
+
+def _listed(
+    fields: Mapping[str, str | Sequence[str]], kind: re.Pattern[str], count: int
+) -> tuple[list[tuple[float, str]] | None, tuple[str, ...]]:
+    """Return number and unit of each band by the first field of a kind that lists them, and notes on the others."""
+    notes: list[str] = []
+    found: list[list[tuple[float, str]]] = []
+    for name, value in sorted(fields.items(), key=lambda field: len(field[0])):
+        key = kind.fullmatch(letters(name))
+        if key is None:
+            continue
+        words: list[str] | None = [_or_missing(str(word)) for word in np.ravel(value)]
+        if isinstance(value, str):
+            words = split_list(value, count)
+        items = [_item(word) if word else (np.nan, "") for word in words or ()]
+        if words and len(words) == count and None not in items and any(words):
+            found.append([(number, unit or key[1] or "") for number, unit in filter(None, items)])
+            continue
+        parts = re.findall(r"[^,;\s]+", _BRACKET.sub(" ", str(value))) if words is None else words
+        wrong = next((word for word in parts if _or_missing(word) and _item(word) is None), None)
+        why = f"{len(parts)} for {count} bands" if wrong is None else f"{wrong!r} is no number"
+        notes.append(f"{name} is left out: {why}")
+    fullest = min(found, key=lambda items: sum(np.isnan(number) for number, _ in items), default=None)
+    return fullest, tuple(notes)
+
+
+def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[str] = ()) -> Bands:
+    """Return (band,) facts by the lengths, numbers or colours in band names, else by the file's own colours.
+
+    A range is its mean, with its width. A name with several lengths, and colours that contradict the file's, give a
+    note alone.
+    """
+    texts = [_without_number(name, place) for place, name in enumerate(names)]
+    found = [_lengths(text) for text in texts]
+    origin = f"wavelengths from the band names of {where}"
+    if any(found):
+        for name, lengths in zip(names, found, strict=True):
+            if len(lengths) > 1:
+                return Bands(notes=(f"the band name {name!r} may give several lengths",))
+            if lengths and not RANGE_NM[0] <= lengths[0][0] <= THERMAL_NM:
+                return Bands(notes=(f"the band name {name!r} gives {lengths[0][0]:g} nm, which is no wavelength",))
+        centres, widths = np.array([one[0] if one else (np.nan, np.nan) for one in found]).T
+        return bands_of_numbers(centres, "nm", origin, None if np.isnan(widths).all() else widths)
+    plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
+    numbers = np.array([_to_number(one[1]) if one else np.nan for one in plain])
+    if are_wavelengths(numbers):
+        return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
+    return _bands_of_colours(names, texts, where, colours)
+
+
+def _without_number(name: str | None, place: int) -> str:
+    """Return the text of a name without the number of its band: after such a word, or its ``place`` (from 0 or 1)."""
+
+    def shortened(found: re.Match[str]) -> str:
+        number = int(found[2])
+        of_band = number in (place, place + 1) or (found[1].strip() and number < RANGE_NM[0])
+        return " " if of_band else found[0]
+
+    text = re.sub(r"(?<!\d)(\d{1,2}),(?=\d)|(?<=\d),(?=\d{1,2}(?!\d))", r"\1.", _plain_text(name)[:MOST_NAME])
+    return _BAND_NUMBER.sub(shortened, text)
+
+
+def _lengths(text: str) -> list[tuple[float, float]]:
+    """Return centre and width [nm] (NaN: none) of each different length in a name; two if the only one is doubtful."""
+    found: list[tuple[float, float]] = []
+    for span in _SPAN.finditer(text):
+        low, high = (_to_number(number) * (scale_nm(unit) or 1.0) for number, unit in _ends(span))
+        plausible = RANGE_NM[0] <= low < high <= THERMAL_NM
+        found += [((low + high) / 2, high - low)] if plausible else [(low, np.nan), (high, np.nan)]
+    for one in _LENGTH.finditer(_SPAN.sub(" ", text)):
+        centre = _to_number(one[1]) * (scale_nm(one[2]) or 1.0)
+        if not any(abs(centre - known) <= 1e-3 * known for known, _ in found):
+            found.append((centre, np.nan))
+    return found * 2 if len(found) == 1 and _DOUBTFUL.search(text) else found
+
+
+def _ends(span: re.Match[str]) -> tuple[tuple[str, str], tuple[str, str]]:
+    return (span[1], span[2] or span[4]), (span[3], span[4])
+
+
+def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
+    """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
+    if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
+        return False
+    years = (numbers % 1 == 0) & (numbers >= 1900) & (numbers <= 2100)
+    return not years.all() and not (len(numbers) > 1 and (np.diff(numbers) == 1).all())
+
+
+def _colour(text: str) -> set[float]:
+    """Return the usual wavelengths of the colours in a text, NaN for infrared without a range."""
+    words = re.sub(r"[\W_]+", " ", text).strip()
+    if words in _LETTERS:
+        return {_LETTERS[words]}
+    values = list(_COLOURS.values())
+    return {values[(found.lastindex or 1) - 1] for found in _COLOUR.finditer(words)}
+
+
+def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
+    """Return bands by the colours in their names, else by the file's; a band without a name has that of the file."""
+    default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
+    flags = [_colour(colour) for colour in colours] or [set() for _ in names]
+    if default and tuple(colours[3:]) == ("undefined",) and not texts[3].strip():
+        flags[3] = {NEAR_INFRARED_NM}
+    named = [_colour(text) for text in texts]
+    given = named if any(named) else flags
+    nm = [one or (set() if text.strip() else flag) for one, text, flag in zip(given, texts, flags, strict=True)]
+    centres = [min(one) if len(one) == 1 else np.nan for one in nm]
+    if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
+        shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
+        doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
+        return Bands(notes=(doubt,) if any(text.strip() for text in texts) else ())
+    others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
+    if others and not default:
+        said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
+        return Bands(notes=(said,))
+    notes = ("the band names say other colours than the file's flags of red, green and blue: the names count",)
+    source = f"the colours in the band names of {where}" if any(named) else "the file's colours"
+    listed = ", ".join(f"{one:g}" for one in centres)
+    origin = f"wavelengths assumed from {source}: {listed} nm"
+    return Bands(np.array(centres), None, origin, notes if others else ())
+
+
+def bad_bands(flags: object, count: int, name: str = "bbl") -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the bands (from 0) that ``count`` flags mark by 0; other flags mark none, with a note."""
+    values = np.asarray([] if flags is None else flags, np.float64).ravel()
+    if len(values) not in (0, count):
+        return (), (f"{name} is left out: {len(values)} flags for {count} bands",)
+    return tuple(np.flatnonzero(values == 0).tolist()), ()
+
+
+def bad_bands_of_texts(
+    fields: Mapping[str, str | Sequence[str]], count: int
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the bands (from 0) that a file's fields mark as bad, such as ``bbl``, and notes.
+
+    A field is a list in one text, or one text a band, "" where a band has none.
+    """
+    bad: set[int] = set()
+    notes: list[str] = []
+    for name, value in fields.items():
+        key = letters(name)
+        if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
+            words = re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value)) if isinstance(value, str) else value
+            flags = np.array([_TRUTH.get(_plain_text(word), _to_number(str(word))) for word in words])
+            marked, doubts = bad_bands(flags if key in GOOD_BANDS else ~(flags > 0), count, name)
+            bad |= set(marked)
+            notes += doubts
+        elif re.fullmatch("badbands?(?:list|multiplier)?s?", key):
+            notes.append(f"{name} is not read: 1 may mean good or bad there; name the good bands in a scene.toml")
+    return tuple(sorted(bad)), tuple(notes)
+
+
+def bands_text(bands: Sequence[int]) -> str:
+    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
+    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
+    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)

@@ -1,0 +1,82 @@
+"""Find and read dark and white frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import Frames, Taken, taken_with
+from spectralzoom.storage.readers.array_files import load_npy
+from spectralzoom.storage.readers.cube_sources import reading
+from spectralzoom.storage.readers.envi_files import open_envi_cube
+from spectralzoom.storage.readers.own_files import within
+
+KINDS = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One reference frame, as the mean of its lines."""
+
+    values: NDArray[np.float32]  # (sample, band)
+    files: tuple[Path, ...]  # header and data, or one file
+    taken: Taken
+    fields: Mapping[str, str] = field(default_factory=dict)  # of an ENVI header
+
+
+def find_reference(folder: Path, kind: str) -> Path | None:
+    """Return the header of the ``dark`` or ``white`` frame in a folder by its name (SceneError: there are several)."""
+    headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
+    found = [entry for entry in headers if entry.name.lower().startswith(kind)]
+    if len(found) > 1:
+        names = ", ".join(entry.name for entry in found)
+        raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
+    return within(folder, found[0]) if found else None
+
+
+def find_frames(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Frame]:
+    """Return the frames of a cube by their kinds: ``stated``, else those beside the cube ``stem``, else of its folder.
+
+    Raises SceneError: a file is missing, damaged or no frame, or a folder has several of a kind.
+    """
+    frames: dict[str, Frame] = {}
+    for kind in KINDS:
+        beside = (stem.with_name(f"{stem.name}.{kind}{ending}") for ending in (".hdr", ".npy"))
+        if (file := stated.get(kind)) is not None and not file.exists():
+            raise SceneError(f"there is no file {file}; check the name (seen from {Path.cwd()})")
+        file = file or next((within(stem.parent, one) for one in beside if one.is_file()), None)
+        file = find_reference(stem.parent, kind) if file is None and kind != "bad" else file
+        if file is not None:
+            frames[kind] = load_frame(file, kind)
+    return frames
+
+
+def load_frame(path: Path, kind: str = "reference") -> Frame:
+    """Read one ENVI or .npy frame (SceneError: it cannot be read or holds no real numbers)."""
+    where = f"the {kind} frame {path.name}"
+    if path.is_dir():
+        raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
+    files: tuple[Path, ...] = (path,)
+    taken, fields = Taken(where), {}
+    if path.suffix.lower() == ".npy":
+        with reading(path, ".npy"):
+            values = load_npy(path)
+    else:
+        cube = open_envi_cube(path)
+        values, fields = cube.values, dict(cube.header.fields)
+        files, taken = (cube.header_path, cube.path), taken_with(where, fields, cube.header.settings)
+    values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
+    if values.dtype.kind not in "uif":
+        raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
+    frame = values[None] if values.ndim == 2 else values
+    return Frame(np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files, taken, fields)
+
+
+def taken_of(frames: Mapping[str, Frame]) -> Frames:
+    """Return values of frames and how they were taken."""
+    return {kind: (frame.values, frame.taken) for kind, frame in frames.items()}

@@ -1,0 +1,427 @@
+"""Read where the pixels of a file lie on the earth: rasters of GDAL, ENVI headers, NetCDF, HDF5 and Zarr datasets.
+
+Each function returns a GeoBox, or None with notes that say why a place is dropped. CRS are read by pyproj. Coordinates
+are pixel centres, in the unit that their attributes state.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import odc.geo.crs as odc_crs
+import odc.geo.geobox as odc_geobox
+import xarray as xr
+from affine import Affine
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from odc.geo.math import affine_from_axis
+from pyproj import CRS, Transformer
+from pyproj.database import get_units_map
+from pyproj.exceptions import CRSError, ProjError
+
+from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
+from spectralzoom.storage.readers.own_files import check_sidecars
+
+Place = tuple[GeoBox | None, tuple[str, ...]]
+
+_CRS_TEXTS = ("crs_wkt", "spatial_ref", "esri_pe_string", "proj4_params", "proj4text", "epsg_code")  # grid mapping
+_CRS_ATTRIBUTES = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg", "crs_wkt", "crs")  # image, then dataset
+_NAMES = {"y": ("y", "lat", "latitude"), "x": ("x", "lon", "longitude")}
+_STANDARD = {"y": ("latitude", "grid_latitude"), "x": ("longitude", "grid_longitude")}
+_DIRECTIONS = {"y": r"degrees?_?n(orth)?", "x": r"degrees?_?e(ast)?"}
+_PIXELS = {"pixel", "pixels", "px"}  # units of coordinates that are no places
+_SPELLINGS = (
+    (r"deg(?:ree)?s?(?: ?(?:[nsew]|north|south|east|west))?|°", "degree"),
+    (r"us[ -]?(?:survey )?(?:foot|feet|ft)|(?:ft|foot|feet)[ -]?us|survey (?:foot|feet)", "us survey foot"),
+    (r"(?:international )?(?:feet|foot)", "foot"),
+    (r"(.*)meters?|(.*)metres", r"\1\2metre"),
+    (r"(km|radian|yard|nautical mile)s", r"\1"),
+    (r"(?:statute )?miles?", "statute mile"),
+)
+_ALLOWED = "m, km, ft or us-ft on a projected CRS, degrees or rad on a geographic one, rad on a geostationary one"
+_ENVI_PLACES = ("map info", "geo points", "rpc info", "coordinate system string")
+_WGS84 = r"(?i)wgs[- _]*(19)?84|world geodetic system 1984"
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """The coordinates of the pixel centres along one axis."""
+
+    name: str
+    values: NDArray[np.float64]
+    precision: float  # by which stored numbers may be rounded
+    unit: str  # as stated; degree for a latitude or longitude without one
+    geographic: bool  # a latitude or longitude, by unit, standard name or name
+
+    @property
+    def counts(self) -> bool:
+        """Return whether the coordinates count pixels."""
+        from_start = self.values[0] in (0.0, 0.5, 1.0) and bool((np.diff(self.values) == 1).all())
+        return self.unit.lower() in _PIXELS or (self.unit in ("", "1") and from_start)
+
+
+def place_of_dataset(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> Place:
+    """Return the grid on the earth of one variable, whose axes (y, x) are ``dims``; or None, with notes.
+
+    Open the dataset with ``mask_and_scale=True`` and any ``decode_coords``. Read are CF's grid mapping with its
+    GeoTransform, coordinates of pixel centres along ``dims``, latitudes and longitudes without a grid mapping, and
+    GeoZarr's ``proj:`` and ``spatial:`` attributes. Coordinates win over a transform that contradicts them.
+
+    Raises SceneError: coordinates have a unit that is not known, or that does not fit their CRS.
+    """
+    cube = dataset.variables[name]
+    shape = cube.sizes[dims[0]], cube.sizes[dims[1]]
+    axes = [_axis(dataset, dim, kind) for dim, kind in zip(dims, "yx", strict=True)]
+    known = [axis for axis in axes if axis is not None]
+    notes: list[str] = []
+    mapping = _grid_mapping(dataset, cube, known, notes)
+    attributes = {**_plain(dataset.attrs), **_plain(cube.attrs)}
+    crs = _crs(mapping, attributes, known, notes)
+    stated = _stated_transform(mapping, attributes, shape, dims, notes)
+    if crs is None:
+        there = stated is not None or any(not axis.counts for axis in known)
+        if there and not notes:
+            notes.append("it has coordinates and no CRS (write one: rio.write_crs of rioxarray)")
+        return None, (*notes, *_other_places(dataset, cube, dims))
+    if not _is_map(crs):
+        return _placed(shape, Affine.identity(), crs, notes)
+    transform = _transform(axes, stated, crs, shape, notes)
+    if transform is None:
+        reason = () if notes else ("it has a CRS, and neither coordinates along its axes nor a GeoTransform",)
+        return None, (*notes, *reason, *_other_places(dataset, cube, dims))
+    return _placed(shape, transform, crs, notes)
+
+
+def _axis(dataset: xr.Dataset, dim: str, kind: str) -> _Axis | None:
+    """Return the coordinates along one axis: those of its name, else others that CF's attributes mark."""
+    marks = (*_STANDARD[kind], f"projection_{kind}_coordinate", f"projection_{kind}_angular_coordinate")
+    for name in (dim, *dataset.variables):
+        found = dataset.variables.get(name)
+        if found is None or found.dims != (dim,) or found.dtype.kind not in "iuf" or not found.size:
+            continue
+        standard, axis, unit = (str(found.attrs.get(key, "")).strip() for key in ("standard_name", "axis", "units"))
+        word = str(name).rpartition("/")[2]
+        if name != dim and standard not in marks and axis.lower() != kind and word.lower() not in _NAMES[kind]:
+            continue
+        values = np.asarray(found.values)
+        rounded = float(np.spacing(np.abs(values).max())) if values.dtype.kind == "f" else 0.0
+        packed = abs(float(np.ravel(found.encoding.get("scale_factor", 0.0))[0])) / 2
+        by_name = bool(re.fullmatch(_DIRECTIONS[kind], unit.lower())) or word.lower() in _NAMES[kind][1:]
+        geographic = standard == _STANDARD[kind][0] if standard else by_name
+        unit = unit or ("degree" if geographic or standard in _STANDARD[kind] else "")
+        return _Axis(word, values.astype(np.float64), max(rounded, packed), unit, geographic)
+    return None
+
+
+def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
+    """Return attributes as Python's own texts and numbers, arrays as lists."""
+    found = {}
+    for name, value in attributes.items():
+        number = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        number = number[0] if isinstance(number, list) and len(number) == 1 else number
+        found[str(name)] = number.decode("utf-8", "replace") if isinstance(number, bytes) else number
+    return found
+
+
+def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, axes: list[_Axis], notes: list[str]) -> dict[str, Any]:
+    """Return the attributes of the grid mapping that the cube names for its axes, else of the only one there is."""
+    named: dict[str, list[str]] = {}
+    text = str(cube.encoding.get("grid_mapping", cube.attrs.get("grid_mapping", "")))
+    for word in text.replace(":", ": ").split():
+        if word.endswith(":") or not named:  # "crs", or "crs: x y other: lat lon"
+            named[word.removesuffix(":")] = []
+        else:
+            named[list(named)[-1]].append(word)
+    named = {key.removeprefix("/"): of_axes for key, of_axes in named.items()}
+    fitting = [key for key, of_axes in named.items() if {axis.name for axis in axes} & set(of_axes)]
+    for key in (*fitting, *named):
+        if key in dataset.variables:
+            return _plain(dataset.variables[key].attrs)
+        notes.append(f"its grid mapping {key} is not in the file")
+    single = {str(key): _plain(one.attrs) for key, one in dataset.variables.items() if not one.ndim}
+    single = {key: about for key, about in single.items() if {"grid_mapping_name", *_CRS_TEXTS[:2]} & set(about)}
+    if len(single) > 1 and any(about != next(iter(single.values())) for about in single.values()):
+        notes.append(f"the file has several grid mappings ({', '.join(single)}), and the cube names none of them")
+        return {}
+    return next(iter(single.values()), {})
+
+
+def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_Axis], notes: list[str]) -> CRS | None:
+    """Return the first CRS that can be read: of the grid mapping, of attributes, WGS 84 of latitudes and longitudes."""
+    given = [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS[:2] if mapping.get(key)]
+    if mapping.get("grid_mapping_name"):
+        given.append(("its grid mapping", mapping))
+    given += [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS[2:] if mapping.get(key)]
+    given += [(key, attributes[key]) for key in _CRS_ATTRIBUTES if attributes.get(key)]
+    if isinstance(attributes.get("_CRS"), dict):  # GDAL's in Zarr
+        given += [("_CRS", attributes["_CRS"][key]) for key in ("wkt", "projjson") if key in attributes["_CRS"]]
+    for where, value in given:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of old texts such as +init=epsg
+                by_cf = value is mapping
+                if re.search(r"init=(?!\w+:)", str(value)):
+                    raise ValueError("it names a file, which is not opened")
+                return CRS(CRS.from_cf(_in_metres(mapping, axes, notes)).to_wkt() if by_cf else value)
+        except Exception as error:  # of PROJ; KeyError of a parameter that is missing
+            lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
+            notes.append(f"the CRS cannot be read from {where}: {lacks}")
+    if not given and len(axes) == 2 and all(axis.geographic for axis in axes) and not notes:
+        notes.append("its latitudes and longitudes have no grid mapping, and are read as WGS 84")
+        return CRS.from_epsg(4326)
+    return None
+
+
+def _in_metres(mapping: Mapping[str, Any], axes: list[_Axis], notes: list[str]) -> dict[str, Any]:
+    """Return CF's parameters with a name, false easting and northing in metres: CF has them in the axes' unit."""
+    parameters = {key: value for key, value in mapping.items() if key not in _CRS_TEXTS}
+    parameters.setdefault("projected_crs_name", str(mapping["grid_mapping_name"]).replace("_", " "))
+    for axis, key in zip(axes, ("false_northing", "false_easting"), strict=False):
+        category, factor = _unit(axis.unit) or ("", 1.0)
+        if category == "linear" and factor != 1 and parameters.get(key):
+            notes.append(
+                f"its {key} of {parameters[key]:g} is read in {axis.unit}, the unit of {axis.name}, as CF says"
+            )
+            parameters[key] *= factor
+    return parameters
+
+
+def _stated_transform(
+    mapping: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+    shape: tuple[int, int],
+    dims: tuple[str, str],
+    notes: list[str],
+) -> Affine | None:
+    """Return the transform of pixel corners by a GeoTransform or GeoZarr's attributes; None without one."""
+    of_gdal = mapping.get("GeoTransform")
+    numbers = of_gdal or attributes.get("spatial:transform") or (attributes.get("crs") and attributes.get("transform"))
+    if not numbers:
+        return None
+    pair = attributes.get("spatial:dimensions", [*dims]), attributes.get("spatial:shape", [*shape])
+    if not of_gdal and pair != ([*dims], [*shape]):
+        notes.append("its spatial:transform is that of an image of another shape")
+        return None
+    try:
+        words = [float(word) for word in re.split(r"[\s,\[\]()]+", str(numbers)) if word]
+        found = Affine.from_gdal(*words) if of_gdal else Affine(*words[:6])
+    except (TypeError, ValueError):
+        found = Affine.scale(0)
+    if not math.isfinite(found.determinant) or not found.determinant:
+        notes.append("its transform is no grid of pixels")
+        return None
+    of_centres = not of_gdal and attributes.get("spatial:registration") == "node"
+    return found * Affine.translation(-0.5, -0.5) if of_centres else found
+
+
+def _transform(
+    axes: list[_Axis | None], stated: Affine | None, crs: CRS, shape: tuple[int, int], notes: list[str]
+) -> Affine | None:
+    """Return the transform by coordinates in units of the CRS, else the stated one; None with a note."""
+    y, x = axes
+    if y is None or x is None:
+        return stated
+    if y.counts or x.counts:
+        if stated is None or y.values[0] % 1 != 0.5 or x.values[0] % 1 != 0.5:
+            return stated
+        return stated * affine_from_axis(x.values, y.values, 1)  # odc-geo counts pixels from 0.5
+    if stated is not None and (stated.b or stated.d):
+        notes.append(f"its grid is turned, so that {y.name} and {x.name} are not used")
+        return stated
+    doubts: list[str] = []  # which a stated transform settles
+    along_x = _line(x, _per_unit(x, crs, doubts), None if stated is None else stated.a, notes)
+    along_y = _line(y, _per_unit(y, crs, doubts), None if stated is None else stated.e, notes)
+    if along_x is None or along_y is None:
+        return None
+    (left, width, x_px), (top, height, y_px) = along_x, along_y
+    turn = 2 * math.pi / float(crs.axis_info[0].unit_conversion_factor)
+    if crs.is_geographic and left >= turn / 2:  # 0 to 360 degrees east
+        left -= turn
+    found = Affine(width, 0.0, left, 0.0, height, top)
+    flipped = Affine(1, 0, 0, 0, -1, shape[0])  # GDAL stores NetCDF from the bottom up
+    for other in () if stated is None else (stated, stated * flipped):
+        a, _, c, _, e, f = (~found * other)[:6]
+        away_x, away_y = max(abs(c), abs(c + (a - 1) * shape[1])), max(abs(f), abs(f + (e - 1) * shape[0]))
+        if away_x <= max(OFF_GRID_PX, x_px) and away_y <= max(OFF_GRID_PX, y_px):
+            return other
+    notes += doubts if stated is None else [*doubts, f"its transform contradicts {y.name} and {x.name}, which are used"]
+    return found
+
+
+def _line(axis: _Axis, per_unit: float, stated: float | None, notes: list[str]) -> tuple[float, float, float] | None:
+    """Return the first edge and the step, in units of the CRS, and the precision [px]; None with a note."""
+    values, count = axis.values, len(axis.values)
+    if count == 1:
+        if stated is None:
+            notes.append(f"{axis.name} has one value, so that the size of its pixel is not known")
+            return None
+        return float(values[0]) * per_unit - stated / 2, stated, axis.precision * per_unit / abs(stated)
+    with np.errstate(all="ignore"):  # values may be any number
+        steps = np.diff(values)
+        step = float(values[-1] - values[0]) / (count - 1)
+        off = np.abs(values - values[0] - step * np.arange(count)).max()
+    if not np.isfinite(off) or not step or off > max(OFF_GRID_PX * abs(step), axis.precision):
+        notes.append(f"{axis.name} is not evenly spaced (steps of {steps.min():g} to {steps.max():g}); resample it")
+        return None
+    if off > OFF_GRID_PX * abs(step) and axis.precision > abs(step) / 2:
+        notes.append(f"{axis.name} is stored to {axis.precision:.2g}, too coarse for its steps of {abs(step):.2g}")
+        return None
+    return (float(values[0]) - step / 2) * per_unit, step * per_unit, axis.precision / abs(step)
+
+
+def _per_unit(axis: _Axis, crs: CRS, notes: list[str]) -> float:
+    """Return how many units of the CRS one unit of an axis is (SceneError: as `_in_crs`)."""
+    if axis.unit:
+        return _in_crs(axis.name, axis.unit, crs)
+    of_angles = _satellite_m(crs) is not None and np.abs(axis.values).max() < 1
+    assumed = "rad" if of_angles else str(crs.axis_info[0].unit_name)
+    notes.append(f"{axis.name} states no unit; it is read in {assumed}")
+    return _in_crs(axis.name, assumed, crs) if of_angles else 1.0
+
+
+def _in_crs(what: str, unit: str, crs: CRS) -> float:
+    """Return how many units of the CRS one unit is (SceneError: it is not known, or does not fit the CRS)."""
+    own = crs.axis_info[0]
+    category, factor = _unit(unit) or ("", 0.0)
+    satellite_m = _satellite_m(crs)
+    if category == "angular" and satellite_m is not None:  # scanning angles
+        return factor * satellite_m / float(own.unit_conversion_factor)
+    if category != ("angular" if crs.is_geographic else "linear"):
+        raise SceneError(
+            f"{what} is in {unit!r}, and its CRS, {crs.name!r}, in {own.unit_name}; allowed are {_ALLOWED}. Correct the"
+            f" units of {what}, or take the CRS out to read the cube without a place"
+        )
+    ratio = factor / float(own.unit_conversion_factor)
+    return 1.0 if math.isclose(ratio, 1, rel_tol=1e-12) else ratio
+
+
+def _satellite_m(crs: CRS) -> float | None:
+    """Return the height of a geostationary satellite [m]; None for other CRS."""
+    operation = crs.coordinate_operation
+    if operation is None or "geostationary" not in operation.method_name.lower():
+        return None
+    return next((float(one.value) for one in operation.params if "height" in one.name.lower()), None)
+
+
+def _unit(text: str) -> tuple[str, float] | None:
+    """Return linear or angular, and the metres or radians of one unit by PROJ's table; None if it is not there."""
+    text = re.sub(r"[\s_]+", " ", text.strip().lower())
+    many = re.match(r"\d[\d.]*(?:e[+-]?\d+)? ", text)  # such as 1000 m
+    word = text[many.end() :] if many else text
+    name = next((found.expand(to) for like, to in _SPELLINGS if (found := re.fullmatch(like, word))), word)
+    for category in ("linear", "angular"):
+        for unit in get_units_map(category=category).values():
+            if name in (unit.name.lower(), unit.proj_short_name) and unit.conv_factor:
+                return category, float(unit.conv_factor) * float(many[0] if many else 1)
+    return None
+
+
+def _other_places(dataset: xr.Dataset, cube: xr.Variable, dims: tuple[str, str]) -> Iterator[str]:
+    """Yield notes on other places that the file states, which are not read."""
+    for name, one in dataset.variables.items():
+        word = str(name).rpartition("/")[2].lower()
+        swath = word in _NAMES["y"][1:] or one.attrs.get("standard_name") == "latitude"
+        if swath and one.shape == (cube.sizes[dims[0]], cube.sizes[dims[1]]):
+            yield f"its place is given by latitudes of each pixel ({name}), which are not read; resample it to a grid"
+        elif one.ndim == 2 and word == "glt_x":
+            yield f"its place is given by a geolocation table ({name}), which is not read; orthorectify it first"
+    for name in (*dataset.variables, *dataset.attrs):
+        if str(name).rpartition("/")[2].startswith("StructMetadata"):
+            yield f"its place is given by HDF-EOS ({name}), which is not read; write it as GeoTIFF (gdal_translate)"
+
+
+def place_of_file(file: Any) -> Place:
+    """Return the grid on the earth of an open rasterio file, or None with a note."""
+    if file.transform.is_identity:
+        others = {
+            "ground control points": file.gcps[0],
+            "RPCs": file.rpcs,
+            "arrays of geolocation": file.tags(ns="GEOLOCATION"),
+        }
+        if other := " and ".join(name for name, there in others.items() if there):
+            return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",)
+        lacks = "it has a CRS and no transform (gdal_edit -a_ullr), so that its place on the earth is not known"
+        return None, () if file.crs is None else (lacks,)
+    if file.crs is None or not file.transform.determinant:
+        lacks = "a transform and no CRS (gdal_edit -a_srs)" if file.crs is None else "a transform that is no grid"
+        return None, (f"it has {lacks}, so that its place on the earth is not known",)
+    try:
+        crs = CRS.from_wkt(file.crs.to_wkt())
+    except Exception as error:  # of PROJ and of GDAL
+        return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
+    return _placed(file.shape, file.transform, crs)
+
+
+def _is_map(crs: CRS) -> bool:
+    return bool(crs.is_projected or crs.is_geographic)
+
+
+def _placed(shape: tuple[int, int], transform: Affine, crs: CRS, notes: Sequence[str] = ()) -> Place:
+    """Return a grid in the horizontal part of its CRS, by its EPSG code if it has one; None if it is on no map."""
+    if not _is_map(crs):
+        return None, (*notes, f"its CRS, {crs.name!r}, is not geographic or projected; its place is not known")
+    flat = crs.to_2d() if len(crs.axis_info) > 2 else crs
+    geodetic = flat.geodetic_crs
+    assert geodetic is not None
+    x, y = transform * (shape[1] / 2, shape[0] / 2)
+    try:
+        lon, lat = Transformer.from_crs(flat, geodetic, always_xy=True).transform(x, y)
+    except ProjError as error:
+        return None, (*notes, f"its CRS, {crs.name!r}, cannot be used: {error}")
+    turns = np.abs([lon, 2 * lat]) * geodetic.axis_info[0].unit_conversion_factor / (2 * math.pi)
+    if not (turns <= (1, 0.5)).all():  # inf and NaN, too
+        return None, (*notes, f"its middle, {x:g}, {y:g}, is no place in its CRS, {crs.name!r}; correct one of them")
+    code = 4326 if flat.equals(CRS.from_epsg(4326), ignore_axis_order=True) else flat.to_epsg()
+    return odc_geobox.GeoBox(shape, transform, odc_crs.CRS(flat.to_wkt() if code is None else code)), tuple(notes)
+
+
+def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int]) -> Place:
+    """Return the grid of an ENVI file with (line, sample) ``shape``, by its header as GDAL reads it.
+
+    Raises SceneError: ``map info`` states a unit that is not known, or that does not fit its CRS.
+    """
+    if not set(_ENVI_PLACES) & set(header):
+        return None, ()
+    rasterio = importlib.import_module("rasterio")
+    check_sidecars(data)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(data, driver="ENVI") as file:
+                found, notes = place_of_file(file)
+    except Exception as error:  # of GDAL and PROJ
+        return None, (f"its map info cannot be read: {error}",)
+    if found is None or found.crs is None:
+        stated = " and ".join(key for key in _ENVI_PLACES if key in header)
+        return None, notes or (f"the header has {stated}, which give no grid; its place on the earth is not known",)
+    crs, wkt = CRS(found.crs.to_wkt()), header.get("coordinate system string", "").strip("{} ")
+    words = [word.strip() for word in header.get("map info", "").strip("{} ").split(",")]
+    unit = next((word.partition("=")[2].strip() for word in words if word.lower().startswith("units")), "")
+    scale = 1.0
+    if unit.lower() == "feet" and (in_feet := _in_survey_feet(wkt)) is not None:  # GDAL takes all as international
+        crs = in_feet
+    elif unit and not (crs.is_geographic and unit.lower() in ("minutes", "seconds")):  # which GDAL reads
+        scale = _in_crs("map info", unit, crs)
+    datum = next((word for word in words[9 if words[0].lower() == "utm" else 7 : 10] if "=" not in word), "WGS-84")
+    as_wgs84 = crs.geodetic_crs is not None and re.match(_WGS84, crs.geodetic_crs.name)
+    if as_wgs84 and not wkt and not re.fullmatch(_WGS84, datum):
+        notes = (*notes, f"its datum, {datum!r}, is read as WGS 84, so that its place may be some 100 m off")
+    return _placed(shape, Affine.scale(scale) * found.affine, crs, notes)
+
+
+def _in_survey_feet(wkt: str) -> CRS | None:
+    """Return a CRS if its coordinates are US survey feet, else None."""
+    with suppress(CRSError):
+        crs = CRS.from_wkt(wkt)
+        return crs if crs.is_projected and math.isclose(crs.axis_info[0].unit_conversion_factor, 1200 / 3937) else None
+    return None
