@@ -52,10 +52,7 @@ class AngularGrid:
     geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
     def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``.
-
-        The transform maps pixel corners.
-        """
+        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``."""
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
         bounds = (left, top, left + step * shape[1], top + step * shape[0])
@@ -132,12 +129,11 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
     found: dict[str, SmallArray] = {}
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
-        if geobox.axis_aligned:
-            about = _axis(_crs_of(geobox), name)
-            centres = np.arange(size) * step + (first + step / 2)
-        else:
+        about = _axis(_crs_of(geobox), name)
+        if not geobox.axis_aligned:
+            step, first = 1.0, 0.0
             about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
-            centres = np.arange(size) + 0.5
+        centres = np.arange(size) * step + (first + step / 2)
         found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
     mapping = odc_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
     return {**found, GRID_MAPPING: SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))}
@@ -145,17 +141,12 @@ def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
 
 def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
     """Return CF's attributes of one axis of a map."""
-    unit = str(crs.proj.axis_info[0].unit_name).replace(" ", "_") if crs.proj.axis_info else "metre"
-    if crs.geographic:
-        standard, degrees = _DEGREES[name]
-        standard, degrees = (f"grid_{standard}", "degrees") if crs.proj.is_derived else (standard, degrees)
-        about = {"standard_name": standard, "long_name": f"{standard} of the pixel's centre"}
-        return {**about, "units": degrees if unit == "degree" else unit}
-    return {
-        "standard_name": f"projection_{name}_coordinate",
-        "long_name": f"{name} of the pixel's centre on the map",
-        "units": "m" if unit == "metre" else unit,
-    }
+    unit = str(crs.proj.axis_info[0].unit_name).replace(" ", "_")
+    standard, degrees = _DEGREES[name] if crs.geographic else (f"projection_{name}_coordinate", "")
+    if crs.geographic and crs.proj.is_derived:
+        standard, degrees = f"grid_{standard}", "degrees"
+    units = {"metre": "m", "degree": degrees}.get(unit, unit)
+    return {"standard_name": standard, "long_name": f"{name} of the pixel's centre on the map", "units": units}
 
 
 def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
@@ -164,10 +155,7 @@ def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
 
 
 def load_geobox(path: Path) -> GeoBox | None:
-    """Read the grid of a stored map; None where the store lies on an angular grid.
-
-    Raises IncompleteStoreError: the store is missing, or its grid is damaged.
-    """
+    """Read the grid of a stored map; None where it lies on an angular grid (IncompleteStoreError: missing, damaged)."""
     return geobox_of_group(open_group(path))
 
 

@@ -28,6 +28,7 @@ from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, N
 from spectralzoom.pipeline.ground.georeference import WGS84
 from spectralzoom.pipeline.ground.zones import on_field
 from spectralzoom.storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels; a .json file may h
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".idm", ".ind")
 SHAPEFILE_MAGIC, SQLITE_MAGIC = b"\0\0\x27\x0a", b"SQLite format 3\0"
 GEOPACKAGE_ID = b"GP"  # at byte 68
-VIRTUAL = re.compile(r"(?:\s|/\*.*?\*/|--.*?\n)*create(?:\s|/\*.*?\*/|--.*?\n)+virtual\b", re.IGNORECASE | re.DOTALL)
+VIRTUAL = re.compile(r"\s*create\b.*\bvirtual\b", re.IGNORECASE | re.DOTALL)  # tables that a module of SQLite fills
 INDEX = re.compile(r'create virtual table (?:"[^"]+"|\w+) using (?:rtree|fts)\w*\s*\(', re.IGNORECASE)
 OF_LIBRARIES = (sqlite3.Error, pyproj.exceptions.ProjError, shapely.errors.GEOSException)
 GRID_FILE = re.compile(r'(?:PARAMETERFILE\["[^"]*","|grids=|file=)([^" ]*[/\\:][^" ]*)')  # beyond PROJ's own folder
@@ -140,7 +141,7 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
     with path.open("rb") as file:
         head = file.read(100)
     if head.startswith(SQLITE_MAGIC) and head[68:70] == GEOPACKAGE_ID:
-        _check_within(path, [path.with_name(path.name + end) for end in ("-wal", "-journal", "-shm")])
+        _check_parts(path, [f"{path.name}{end}" for end in ("-wal", "-journal", "-shm")])
         _check_tables(path)
         address = f"GPKG:{path.absolute()}"
         layers = [str(name) for name, kind in pyogrio.list_layers(address) if kind is not None]
@@ -150,7 +151,7 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
             raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{[*layers, 'LAYER'][0]}")
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(address, layer=found))
     if head.startswith(SHAPEFILE_MAGIC) and path.suffix.lower() == ".shp":
-        _check_within(path, [path.with_suffix(end) for part in SHAPEFILE_PARTS for end in (part, part.upper())])
+        _check_parts(path, [f"{path.stem}{end}" for part in SHAPEFILE_PARTS for end in (part, part.upper())])
         if "!" in str(path.absolute()):
             raise ValueError('a "!" in its path stands for an archive; rename that folder')
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(path.absolute()))
@@ -162,6 +163,13 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
         raise ValueError("it is no valid GeoJSON") from None
 
 
+def _check_parts(path: Path, names: Iterable[str]) -> None:
+    """Refuse parts of a file that are no files, or links out of its folder (SceneError, ValueError)."""
+    for part in map(path.with_name, names):
+        if part.exists() and not within(path, part).is_file():
+            raise ValueError(f"{part} is no file")
+
+
 def _check_tables(path: Path) -> None:
     """Raise ValueError for a table that a module of SQLite fills from another file; rtree and fts are indices."""
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as file:
@@ -169,14 +177,6 @@ def _check_tables(path: Path) -> None:
     for name, sql in made:
         if VIRTUAL.match(sql) and not INDEX.match(sql):
             raise ValueError(f"its table {name} may read other files")
-
-
-def _check_within(path: Path, parts: Iterable[Path]) -> None:
-    """Refuse parts of a file that are no files, or lie outside of its folder (ZoneError)."""
-    homes = {path.parent.resolve(), path.resolve().parent}
-    for part in parts:
-        if part.exists() and not (part.is_file() and part.resolve().parent in homes):
-            raise ZoneError(f"{part} is no file, or a link out of its folder; put a copy of the file in its place")
 
 
 def _read_geojson(text: str) -> geopandas.GeoDataFrame:

@@ -18,6 +18,7 @@ reference per band, and ``mirror at rest = 1``, if it was taken so.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -356,27 +357,18 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
     Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
-    if (named := _named_run(address)) is not None:
-        return _run_with_cubes(*named)[2]
     path = Path(address)
-    if not path.exists():
-        raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
-    if not path.is_dir():
-        return None
-    found = (
-        [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr") if _is_raw_cube(one))
-    )
-    return found or None
+    if (of_archive := _run_with_cubes(address)) is not None:
+        return of_archive[2]
+    beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
+    return [one for one in beside if _is_raw_cube(one)] or None
 
 
 def _is_raw_cube(path: Path) -> bool:
     """Return whether a folder is a store of a survey's lines."""
-    if not (path / "zarr.json").is_file():
-        return False
-    try:
-        return "sweep" in open_group(path).attrs
-    except IncompleteStoreError:
-        return False
+    with suppress(IncompleteStoreError):
+        return (path / "zarr.json").is_file() and "sweep" in open_group(path).attrs
+    return False
 
 
 def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None, GeoBox | None] | None:
@@ -384,12 +376,9 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None,
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
-    named = _named_run(address)
-    if named is None:
-        if not Path(address).exists():
-            raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
+    if (found := _run_with_cubes(address)) is None:
         return None
-    archive, run, _ = _run_with_cubes(*named)
+    archive, run, _ = found
     parts = run.products.get("mosaic", "").split("/")  # stages/STAGE/KEY/mosaic.zarr
     params = try_manifest(archive.ref(*parts[1:3]).path)[0]["params"] if len(parts) > 3 else {}
     frame = params.get("frame", {})
@@ -400,22 +389,21 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None,
     return run, shape, geobox_of_record(frame, shape)
 
 
-def _named_run(address: str | Path) -> tuple[str, str | None] | None:
-    """Return the archive and the run (None: the newest) of an address; None if it is no archive's."""
+def _run_with_cubes(address: str | Path) -> tuple[Archive, Run, list[Path]] | None:
+    """Return the run of an address with its raw cubes: the named one, or the newest with any; None if no archive's."""
     text = str(address).rstrip("/")
-    place, _, run = text.rpartition("/runs/")
-    if place and run and is_archive(place):
-        return place, run
-    return (text, None) if (Path(text) / "stages").is_dir() else None
-
-
-def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
-    """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
-    archive = Archive.open(address, create=False, write=False)
-    for folder in archive.past_runs() if name is None else [archive.run_folder(name)]:
+    place, _, name = text.rpartition("/runs/")
+    if not (place and name and is_archive(place)):
+        place, name = text, ""
+        if not Path(text).exists():
+            raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
+        if not (Path(text) / "stages").is_dir():
+            return None
+    archive = Archive.open(place, create=False, write=False)
+    for folder in [archive.run_folder(name)] if name else archive.past_runs():
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
-    which = "no run" if name is None else f"the run {name}"
+    which = f"the run {name}" if name else "no run"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")
