@@ -90,10 +90,7 @@ def image_folder(folder: Path) -> Path:
 
 
 def find_files(path: Path) -> MatchedFiles:
-    """Match the images of a folder, or the one image, to their labels.
-
-    Raises SceneError: there is no image, or as `match_folder`.
-    """
+    """Match the images of a folder, or the one image, to their labels (SceneError: no image, or as `match_folder`)."""
     if not path.exists():
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir() or is_store(path):
@@ -200,10 +197,7 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
 
 
 def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
-    """Return the label file of a scene by scene.toml, else by its name; and a note if scene.toml names a missing one.
-
-    Raises SceneError: several files fit by their names.
-    """
+    """Return the label file of a scene by scene.toml, else by its name; and a note if the named one is missing."""
     if settings.labels is None or settings.path is None:
         return find_label(scene), ""
     if not settings.labels:

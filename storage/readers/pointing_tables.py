@@ -57,9 +57,9 @@ class LinePointing:
     part: tuple[str, ...] | None = None  # (line,) names of the sweeps, if a table cuts one cube into several
 
 
-def find_pointing(folder: Path, stem: str) -> Path | None:
+def find_pointing(folder: Path, stem: str, marks: Sequence[str] = (".pointing",)) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
-    names = (f"{stem}.pointing{ending}" for ending in ENDINGS)
+    names = [f"{stem}{mark}{ending}" for mark in marks for ending in ENDINGS]
     return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
 
 

@@ -40,13 +40,7 @@ from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.own_files import within
-from spectralzoom.storage.readers.pointing_tables import (
-    ENDINGS,
-    WITHOUT_MIRROR,
-    LinePointing,
-    find_pointing,
-    load_pointing,
-)
+from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
@@ -124,9 +118,8 @@ def open_recording(
     For files, ``pointing`` is a table or a folder with one for each cube; it and the frames ``dark`` and ``white`` are
     looked for beside the cubes, or assumed with a note. ``wavelengths`` [nm] are of all bands, ``white_reference`` is
     the value of the white reference, one or (band,), and ``mounting`` is of the device whose positions the pointing
-    has. Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
-    wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
-    be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
+    has. Raises SceneError, WavelengthError: files cannot be used; SettingsError: a flag is given for an archive;
+    ArchiveError, IncompleteStoreError, PoseError: the archive or a raw cube cannot be used.
     """
     camera = camera or LineCamera()
     stores = find_raw_cubes(address)
@@ -196,18 +189,15 @@ def _recording_of(
     samples = max(cube.source.shape[1] for cube in cubes)  # the widest are not binned
     camera, more = with_bits(replace(camera, samples=samples), cubes)
     notes += more
-    without = [
-        number for number, one in enumerate(cubes) if one.pointing is None or one.pointing.kind in WITHOUT_MIRROR
-    ]
-    if without and len(cubes) > 1:
-        pointing = cubes[without[0]].pointing
-        raise SceneError(
-            f"{paths[without[0]]} has {'no pointing' if pointing is None else 'places along a scan without a mirror'}, "
-            f"and how {len(cubes)} cubes lie beside each other is not known; give mirror positions or viewing angles "
-            "for each cube, or name one cube"
-        )
-    if without:
-        camera, cubes[0], more = _without_mirror(cubes[0], camera)
+    for path, cube in files.items():
+        if cube.pointing is not None and cube.pointing.kind not in WITHOUT_MIRROR:
+            continue
+        if len(cubes) > 1:
+            raise SceneError(
+                f"{path} has no pointing of a mirror, and how {len(cubes)} cubes lie beside each other is not known; "
+                "give mirror positions or viewing angles for each cube, or name one cube"
+            )
+        camera, cubes[0], more = _without_mirror(cube, camera)
         notes += more
     camera, more = _timed(camera, cubes)
     notes += more
@@ -226,10 +216,9 @@ def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -
     """Return a cube with its pointing by the file given, else by one with the cube's name, if there is one."""
     if file is not None and file.is_dir():
         folder = file
-        names = [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
-        file = next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
+        file = find_pointing(folder, cube.name, ("", ".pointing"))
         if file is None:
-            raise SceneError(f"{folder} has no pointing for {cube.name}; add {names[0]}, or name one table for all")
+            raise SceneError(f"{folder} has no pointing for {cube.name}; add {cube.name}.csv, or name one for all")
     file = find_pointing(cube.folder, cube.name) if file is None else file
     if file is None:
         return cube
