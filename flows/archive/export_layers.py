@@ -67,13 +67,11 @@ def parse_doses(given: str | None) -> dict[str, float]:
     doses: dict[str, float] = {}
     for part in split_names("dose", given):
         name, _, number = part.rpartition("=")
-        if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
+        if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or name.strip() in ("", *doses):
             raise SettingsError(
-                f"--dose expects classes with numbers, weed=2.5, got {part!r}; numbers are 0 or more, without "
+                f"--dose expects each class once with a number, weed=2.5, got {part!r}; numbers are 0 or more, without "
                 "an exponent"
             )
-        if name.strip() in doses:
-            raise SettingsError(f"--dose names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)
     return doses
 

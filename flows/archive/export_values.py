@@ -207,21 +207,16 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     legend = legend_of(stored.group)
     place = geobox_of(stored).affine
     found = list(rasterio_features.shapes(classes, mask=classes != UNLABELLED, transform=place))
-    numbers = [int(number) for _, number in found]
-    index = [legend.numbers.index(number) for number in numbers]
-    names = [legend.names[one] for one in index]
-    columns = {
-        "class": numbers,
-        "name": names,
-        "colour": [f"#{bytes(legend.colours[one].tolist()).hex()}" for one in index],
-    }
+    names = dict(zip(legend.numbers, legend.names, strict=True))
+    colours = {one: f"#{bytes(rgb).hex()}" for one, rgb in zip(legend.numbers, legend.colours.tolist(), strict=True)}
     crs = None if run.geobox is None else str(run.geobox.crs)
     outlines = [shapely.geometry.shape(outline) for outline, _ in found]
-    frame = geopandas.GeoDataFrame(columns, geometry=outlines, crs=crs)
+    frame = geopandas.GeoDataFrame({"class": [int(number) for _, number in found]}, geometry=outlines, crs=crs)
+    frame["name"], frame["colour"] = frame["class"].map(names), frame["class"].map(colours)
     if crs is not None:
         frame["hectares"] = frame.to_crs(EQUAL_AREA).area / M2_PER_HECTARE
     if doses:
-        frame["dose"] = [doses.get(name, 0.0) for name in names]
+        frame["dose"] = frame["name"].map(doses).fillna(0.0)
     package, shapefile = folder / "classes.gpkg", folder / "classes.shp"
     parts = [f"classes{ending}" for ending in (PARTS if crs is not None else PARTS[:-1])]
     day = {"DBF_DATE_LAST_UPDATE": run.receipt["finished"][:10]}  # the same polygons, the same bytes

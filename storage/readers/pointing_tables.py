@@ -1,16 +1,4 @@
-"""Read the pointing of lines: a table with a row for each line, as CSV (commas, semicolons or tabs).
-
-Optional columns are ``line`` (from 0), ``sweep``, ``time`` (of mid exposure since the start of the sweep) [s],
-``exposure_ms`` and ``valid`` (0 or 1). A table has exactly one of these kinds of pointing:
-
-::
-
-    mirror_x, mirror_y         mirror position, -1..1, in the device's axes
-    angle_x_deg, angle_y_deg   viewing angle along the line and along the scan
-    angle_deg                  viewing angle along the scan, of a scan through the undeflected direction
-    position_px                place along a straight scan without a mirror: stage, conveyor, drone
-    position_m                 the same in metres
-"""
+"""Read the pointing of lines: a table with a row for each line, as CSV (columns: docs/reference/recordings.md)."""
 
 from __future__ import annotations
 

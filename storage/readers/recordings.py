@@ -1,19 +1,4 @@
-"""Open recordings: sweeps of an archive, or of files with a pointing table.
-
-::
-
-    ARCHIVE                               raw cubes of the newest run, or of the run named: ARCHIVE/runs/NAME
-    stages/capture/KEY, NAME.zarr         raw cubes of one capture, or a single one
-    NAME.hdr, NAME.bil, .bip, .bsq        an ENVI cube, or a folder of them
-    a folder with raw_<frame> files       a Headwall camera's capture
-    NAME.zarr                             any Zarr cube
-
-Files beside a cube ``NAME`` are used if no flag names others: ``NAME.pointing.csv``,
-``NAME.dark.hdr``, ``NAME.white.hdr`` and ``NAME.bad.hdr``. Frames for all cubes of the folder are
-``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may have ``line axis = y``: lines lie along y of the field,
-and the scan goes along x. The header of a white frame may have ``white_reference = {...}``, the value of the white
-reference per band, and ``mirror at rest = 1``, if it was taken so.
-"""
+"""Open recordings: sweeps of an archive, or of files with a pointing table (layouts: docs/reference/recordings.md)."""
 
 from __future__ import annotations
 
