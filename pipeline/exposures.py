@@ -76,7 +76,8 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     for key, value in (*every, *re.findall(r"^\s*([^=:\n]+)[=:](.*)$", about, re.MULTILINE)):
         name = re.sub(r"[\s_.,/]+", " ", key.lower()).strip()
         if (match := _SETTING.fullmatch(name)) is not None:
-            plain = re.sub(r"\d+\.\d+", lambda found: f"{float(found[0]):g}", value.lower().strip("{} "))
+            plain = ", ".join(word.strip() for word in value.lower().strip("{} ").split(","))
+            plain = re.sub(r"\d+\.\d+", lambda found: f"{float(found[0]):g}", plain)
             conflicts += _put(settings, match["name"], f"{plain} {match['unit'] or ''}".strip())
         elif (match := _TIME.fullmatch(name)) is not None:
             number, units = _time(value, match)

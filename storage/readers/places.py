@@ -89,7 +89,7 @@ def place_of_dataset(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> P
     elif not notes and (stated is not None or any(not axis.counts for axis in known)):
         notes.append("it has coordinates and no CRS (write one: rio.write_crs of rioxarray)")
     for other, one in dataset.variables.items():
-        of_name = str(other).rpartition("/")[2].lower().startswith("lat")
+        of_name = re.match(r"lat(itude)?(?![a-z])", str(other).rpartition("/")[2].lower())
         if one.shape == shape and (of_name or one.attrs.get("standard_name") == "latitude"):
             notes.append(f"its place is given by latitudes of each pixel ({other}), not read; resample it to a grid")
     return None, tuple(notes)

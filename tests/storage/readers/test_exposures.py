@@ -85,7 +85,7 @@ def test_values_are_scaled_by_the_stated_exposures(tmp_path: Path, cube: Header,
     [
         ({"analog gain": 13.9, "digital gain": 0}, {"analog gain": "13.9000", "digital gain": 0}),
         ({"gain (dB)": 3}, {"gain": "3 dB"}),
-        ({"gain": "high"}, {"gain": "high"}),
+        ({"gain": "high", "binning": "{1, 2}"}, {"gain": "high", "binning": "{ 1,2 }"}),
     ],
 )
 def test_equal_gains_are_accepted(tmp_path: Path, cube: Header, white: Header) -> None:
