@@ -364,8 +364,10 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     crs = CRS(found.crs.to_wkt())
     words = [word.strip() for word in header.get("map info", "").strip("{} ").split(",")]
     unit = next((word.partition("=")[2].strip() for word in words if word.lower().startswith("units")), "")
-    of_gdal = ("minutes", "seconds") if crs.is_geographic else ("feet",)  # which it reads
+    of_gdal = ("minutes", "seconds") if crs.is_geographic else ("feet",)  # which it reads, all as international feet
     scale = _in_crs("map info", unit, crs) if unit and unit.lower() not in of_gdal else 1.0
+    if unit.lower() == "feet" and re.search(r"(?i)foot_us|us[ _]survey", header.get("coordinate system string", "")):
+        scale = 1200 / 3937 / 0.3048
     datum = next((word for word in words[9 if words[0].lower() == "utm" else 7 : 10] if "=" not in word), "WGS-84")
     as_wgs84 = crs.geodetic_crs is not None and re.match(_WGS84, crs.geodetic_crs.name)
     if as_wgs84 and "coordinate system string" not in header and not re.fullmatch(_WGS84, datum):

@@ -437,3 +437,12 @@ def test_an_unknown_datum_of_map_info_is_a_note(tmp_path: Path) -> None:
         "datum, 'Tokyo Mean', is read as WGS 84" in one
         for one in envi(tmp_path, map_info=f"{{{UTM}, Tokyo Mean}}").notes
     )
+
+
+def test_survey_feet_of_an_envi_file_of_gdal_stay_survey_feet(tmp_path: Path) -> None:
+    """GDAL writes a CRS in US survey feet with units=Feet, and reads it as international feet: 0.6 m off."""
+    place = Affine(2, 0, 1_000_000, 0, -2, 200_000)
+    about: dict[str, Any] = {"photometric": None, "crs": "EPSG:2263", "transform": place}
+    write_bands(tmp_path / "a.img", VALUES[None], driver="ENVI", **about).close()
+    found = open_cube_source(tmp_path / "a.hdr").geobox
+    np.testing.assert_allclose(corners(found.affine, found.crs.to_wkt()), corners(place, 2263), atol=1e-9)
