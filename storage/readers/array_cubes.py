@@ -20,17 +20,15 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_files import Arrays, FileArray
 from spectralzoom.storage.readers.band_facts import (
+    CENTRES,
     GOOD_BANDS,
+    WIDTHS,
     Bands,
     are_wavelengths,
     bad_bands,
-    bad_bands_of_texts,
-    bands_of_numbers,
-    bands_of_texts,
+    bands_of_fields,
     is_spectral,
     letters,
-    wavelength_unit,
-    width_unit,
 )
 from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, Guard, read_by_chunks
 from spectralzoom.storage.readers.places import Place, place_of_dataset
@@ -94,7 +92,7 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
             native = native[..., None] if native.ndim == 2 else native
             return values.of_numbers(native)
 
-    bands = _bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1)
+    bands, bad, doubts = _bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1)
     with guard():
         geobox, notes = _place_of(cube, arrays, attributes)
     return CubeSource(
@@ -106,8 +104,9 @@ def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping
         bands=bands,
         nodata=values.nodata,
         geobox=geobox,
+        bad_bands=bad,
         scaling="" if values.plain else json.dumps({key: np.ravel(one).tolist() for key, one in sorted(about.items())}),
-        notes=(*array.notes, *cube.notes, *notes, *bands.notes),
+        notes=(*array.notes, *cube.notes, *notes, *bands.notes, *doubts),
     )
 
 
@@ -238,33 +237,33 @@ def _place_of(cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any]) ->
     return place_of_dataset(dataset.assign(named), cube.name, (dims[cube.order[0]], dims[cube.order[1]]))
 
 
-def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
-    """Return wavelengths and widths by arrays of such names, the axis of the bands or attributes, or all reasons."""
+def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
+    """Return facts of the bands by the arrays beside a cube and its attributes; bad bands (from 0), and notes on them.
+
+    Arrays have the names of fields of other files; wavelengths may be the coordinate of the bands' axis.
+    """
     axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
-    named = sorted(
-        (name for name in arrays if wavelength_unit(_word(name)) is not None), key=lambda one: len(_word(one))
-    )
-    named += [axis] if axis in arrays and is_spectral(arrays[axis].attrs) else []
-    beside = next(
-        (name for name in arrays if width_unit(_word(name)) is not None and _is_line(arrays, name, count)), ""
-    )
-    widths = (arrays[beside][...], _unit(arrays[beside].attrs) or width_unit(_word(beside))) if beside else ()
+    fields: dict[str, Any] = {}
     notes: list[str] = []
-    for name in dict.fromkeys(named):
-        if not _is_line(arrays, name, count):
-            notes.append(f"the array {name} is left out: it has shape {arrays[name].shape} for {count} bands")
-            continue
-        unit = _unit(arrays[name].attrs) or wavelength_unit(_word(name))
-        found = bands_of_numbers(arrays[name][...], unit, f"wavelengths from the array {name}", *widths)
-        if found.wavelength_nm is not None:
-            return found
-        notes += found.notes
-    if not named and _is_line(arrays, axis, count) and are_wavelengths(centres := np.asarray(arrays[axis][...], float)):
-        return bands_of_numbers(centres, "", f"wavelengths from the array {axis}")
+    for name, one in arrays.items():
+        word = _word(name)
+        is_centre, is_width = (kind.fullmatch(letters(word)) is not None for kind in (CENTRES, WIDTHS))
+        if name == axis and not is_centre and is_spectral(one.attrs):
+            word, is_centre = "wavelength", True
+        if is_centre and not _is_line(arrays, name, count):
+            notes.append(f"the array {name} is left out: it has shape {one.shape} for {count} bands")
+        elif (is_centre or is_width or letters(word) in GOOD_BANDS) and _is_line(arrays, name, count):
+            fields |= {word: one[...], f"{word} units": _unit(one.attrs)} if word not in fields else {}
+    if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
+        values = np.asarray(arrays[axis][...], np.float64).ravel()
+        fields |= (
+            {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)} if are_wavelengths(values) else {}
+        )
     about = cube.array.attrs.items()
     usable = {key: one for key, one in about if isinstance(one, str) or np.asarray(one).dtype.kind in "iuf"}
-    found = bands_of_texts(usable, _names_of(arrays, (axis, "band_names", "band_name"), count), cube.name)
-    return replace(found, notes=(*notes, *found.notes))
+    names = _names_of(arrays, (axis, "band_names", "band_name"), count)
+    found = bands_of_fields(usable | fields, names, cube.name or "the file")
+    return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
 
 
 def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | None]:
@@ -311,7 +310,7 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple
         )
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS) or dim in arrays for dim in named):
         counts = {
-            math.prod(one.shape) for key, one in arrays.items() if one.ndim and wavelength_unit(_word(key)) is not None
+            math.prod(one.shape) for key, one in arrays.items() if one.ndim and CENTRES.fullmatch(letters(_word(key)))
         }
         if array.ndim == 3 and counts & set(array.shape[:2]) and array.shape[2] not in counts:
             raise SceneError(
@@ -363,11 +362,3 @@ def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
         for path, array in arrays.items()
         if path.startswith(head) and "/" not in path.removeprefix(head)
     } | {path: array for path, array in arrays.items() if "/" in path}
-
-
-def marked_bands(cube: ArrayCube, arrays: Arrays, count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the bands (from 0) that an array or an attribute of good bands marks by 0, and notes."""
-    for name, array in arrays.items():
-        if letters(_word(name)) in GOOD_BANDS and _is_line(arrays, name, count):
-            return bad_bands(array[...], count, name)
-    return bad_bands_of_texts(cube.array.attrs, count)

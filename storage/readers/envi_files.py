@@ -34,7 +34,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import rescaled
 from spectralzoom.storage.readers.own_files import within
@@ -219,7 +219,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
 def bands_of_header(header: EnviHeader, where: str) -> Bands:
     """Return (band,) wavelengths and widths of a header, of a library (sample,), or the notes on why there are none."""
     count = header.samples if "spectral library" in header.kind.lower() else header.bands
-    return bands_of_texts(header.fields, [None] * count, where)
+    return bands_of_fields(header.fields, [None] * count, where)
 
 
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
@@ -238,7 +238,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     taken, exposure_ms = _taken(parts, height, notes)
     of_parts = [bands_of_header(one.header, one.header_path.name) for one in cubes]
     bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
-    bad, doubts = bad_bands_of_texts(cubes[0].header.fields, count)
+    bad, doubts = bad_bands(cubes[0].header.fields, count)
     notes += [*bands.notes, *doubts]
 
     acquired = acquired_of({**cubes[0].header.settings, **cubes[0].header.fields})

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts, split_list
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -83,7 +83,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
         known = _bands_of(file, keep, kinds, path)
-        bad, doubts = bad_bands_of_texts(_tags_of(file, keep), len(keep))
+        bad, doubts = bad_bands(_tags_of(file, keep), len(keep))
         acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
         notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
@@ -191,4 +191,4 @@ def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
 def _bands_of(file: Any, bands: Sequence[int], kinds: Sequence[str], path: Path) -> Bands:
     """Return wavelengths and widths of some bands (from 0) of an open file by its tags, band names or colours."""
     names, colours = ([of_file[band] for band in bands] for of_file in (file.descriptions, kinds))
-    return bands_of_texts(_tags_of(file, bands), names, str(path), colours)
+    return bands_of_fields(_tags_of(file, bands), names, str(path), colours)

@@ -17,14 +17,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text, taken_with
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.array_cubes import (
-    UNNAMED,
-    check_picture,
-    cube_source,
-    find_cube,
-    in_scope,
-    marked_bands,
-)
+from spectralzoom.storage.readers.array_cubes import UNNAMED, check_picture, cube_source, find_cube, in_scope
 from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, FileArray, find_zarr_store, list_arrays
 from spectralzoom.storage.readers.band_facts import Bands
 from spectralzoom.storage.readers.cube_sources import CubeSource, check_cube_source, reading
@@ -157,8 +150,7 @@ def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSourc
         acquired = acquired_of({**about, **cube.array.attrs, **_time_of(near)})
         notes += acquired.notes
         plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
-        bad, doubts = marked_bands(cube, near, source.shape[2])
-        source = replace(source, bad_bands=bad, acquired=acquired.text, notes=(*notes, *plain, *doubts))
+        source = replace(source, acquired=acquired.text, notes=(*notes, *plain))
         taken = taken_with(path.name, about, cube.array.attrs)
         if taken.exposure_ms is not None:
             exposure_ms = np.full(source.shape[0], taken.exposure_ms)

@@ -24,10 +24,9 @@ from spectralzoom.pipeline.setting_fields import numbers_of
 from spectralzoom.storage.readers.band_facts import (
     Bands,
     bad_bands,
-    bad_bands_of_texts,
+    bands_of_fields,
     bands_of_names,
     bands_of_numbers,
-    bands_of_texts,
     bands_text,
     numbers_of_list,
 )
@@ -204,7 +203,7 @@ def test_lists_are_split_in_one_way(text: str, count: int, found: list[float] | 
 )
 def test_fields_have_several_names(fields: dict[str, Any]) -> None:
     """Singular and plural, both spellings, a unit in the name, beside it or behind each number."""
-    bands = bands_of_texts(fields, ["", ""], "a.hdr")
+    bands = bands_of_fields(fields, ["", ""], "a.hdr")
     assert centres(bands) == pytest.approx([450, 550])
     assert (bands.fwhm_nm is not None) == ("fwhm" in fields)
 
@@ -282,8 +281,10 @@ def test_bands_marked_as_bad_are_left_out(tmp_path: Path, of_file: dict[str, str
 @given(st.lists(st.booleans(), min_size=1, max_size=40))
 def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
     """The zeros of a list are the bad bands, and their text is read as the same bands, also in scene.toml."""
-    bad, _ = bad_bands_of_texts({"bbl": ", ".join(str(int(one)) for one in good)}, len(good))
-    assert list(bad) == [band for band, one in enumerate(good) if not one] == list(bad_bands(good, len(good))[0])
+    bad, _ = bad_bands({"bbl": ", ".join(str(int(one)) for one in good)}, len(good))
+    assert (
+        list(bad) == [band for band, one in enumerate(good) if not one] == list(bad_bands({"bbl": good}, len(good))[0])
+    )
     if bad:
         assert [int(str(one)) for part in bands_text(bad).split(",") for one in numbers_of(part)] == list(bad)
         assert SceneSettings.model_validate({"bands": bands_text(bad)}).bands == bad
@@ -291,8 +292,8 @@ def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
 
 def test_marks_that_do_not_fit_are_noted() -> None:
     """A list of another length marks no band, and flags whose meaning is not known are not read."""
-    assert bad_bands_of_texts({"bbl": "1, 0"}, 3) == ((), ("bbl is left out: 2 flags for 3 bands",))
-    assert "1 may mean good or bad" in bad_bands_of_texts({"bad bands": "1, 0"}, 2)[1][0]
+    assert bad_bands({"bbl": "1, 0"}, 3) == ((), ("bbl is left out: 2 flags for 3 bands",))
+    assert "1 may mean good or bad" in bad_bands({"bad bands": "1, 0"}, 2)[1][0]
 
 
 ENVI = {
