@@ -189,6 +189,13 @@ def numbers_of_list(text: str, count: int) -> NDArray[np.float64] | None:
     return None if words is None else np.array([_to_number(word) for word in words], np.float64)
 
 
+def _words(value: object) -> list[Any]:
+    """Return the items of a list in one text, with any separators, or of an array."""
+    if isinstance(value, str):
+        return re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value))
+    return list(np.asarray(value).ravel().tolist())
+
+
 def _item(word: object) -> tuple[float, str] | None:
     """Return number, NaN if it is missing, and unit, "" without one, of an item of a list; None for other texts."""
     if _plain_text(word) in _MISSING:
@@ -250,7 +257,7 @@ def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | No
     for key, value in fields.items():
         if letters(key) in ("band", "bandname", "bandnames", "longname"):
             separators = (",", r",(?!\d)", ";") if isinstance(value, str) else ()
-            ways = [re.split(between, str(value)) for between in separators] or [list(map(str, np.ravel(value)))]
+            ways = [re.split(between, str(value)) for between in separators] or [list(map(str, _words(value)))]
             if found := [way for way in ways if len(way) == count]:
                 return found[0]
     return [None] * count
@@ -266,10 +273,8 @@ def _lists(
         if (known := kind.fullmatch(letters(key))) is None:
             continue
         value, unit = fields[key], stated.get(letters(key), next(iter(stated.values()), ""))
-        said = [unit] * count if isinstance(unit, str) else list(np.ravel(np.asarray(unit)))
-        words: Sequence[object] = value if isinstance(value, list) else np.ravel(np.asarray(value)).tolist()
-        if isinstance(value, str):
-            words = split_list(value, count) or re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value))
+        said = [unit] * count if isinstance(unit, str) else _words(unit)
+        words = (split_list(value, count) if isinstance(value, str) else None) or _words(value)
         items = [item for word in words if (item := _item(word)) is not None]
         if len(items) < len(words) or len(words) != count:
             wrong = next((word for word in words if _item(word) is None), None)
@@ -391,8 +396,7 @@ def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...]
     for name, value in fields.items():
         key = letters(name)
         if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
-            listed = re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value)) if isinstance(value, str) else np.ravel(value)  # type: ignore[arg-type]
-            flags = [_TRUTH.get(_plain_text(word), _to_number(word)) for word in listed]
+            flags = [_TRUTH.get(_plain_text(word), _to_number(word)) for word in _words(value)]
             if len(flags) == count:
                 bad |= {band for band, flag in enumerate(flags) if (flag == 0 if key in GOOD_BANDS else flag > 0)}
             else:
