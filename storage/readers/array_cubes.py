@@ -236,13 +236,10 @@ def _bands_of(
         elif (is_centre or is_width or letters(word) in GOOD_BANDS) and _is_line(arrays, name, count):
             fields |= {word: one[...], f"{word} units": _unit(one.attrs)} if word not in fields else {}
     if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
-        values = np.asarray(arrays[axis][...], np.float64).ravel()
-        fields |= (
-            {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)} if are_wavelengths(values) else {}
-        )
-    usable = {
-        key: one for key, one in array.attrs.items() if isinstance(one, str) or np.asarray(one).dtype.kind in "iuf"
-    }
+        values = arrays[axis][...].astype(np.float64).ravel()
+        if are_wavelengths(values):
+            fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
+    usable = {key: value for key, value in array.attrs.items() if np.asarray(value).dtype.kind in "iufU"}
     names = _names_of(arrays, (axis, "band_names", "band_name"), count)
     found = bands_of_fields(usable | fields, names, cube or "the file")
     return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)

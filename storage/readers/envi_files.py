@@ -34,7 +34,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields, numbers_of_list
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import rescaled
 from spectralzoom.storage.readers.own_files import within
@@ -155,11 +155,10 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:
     """Return the numbers of a list in a header, one a band; the default where there is none. SceneError: others."""
-    words = [word for word in re.split(r"[{},\s]+", fields.get(name, "")) if word]
-    found = [finite_number(word) for word in words] or [default] * count
-    if len(found) != count or None in found:
+    found = numbers_of_list(fields[name], count) if fields.get(name) else np.full(count, default)
+    if found is None or not np.isfinite(found).all():
         raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} numbers; correct the header")
-    return np.array(found, np.float64)
+    return found
 
 
 def open_headwall_cube(folder: Path) -> CubeSource:
@@ -168,12 +167,12 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     Lines are missing between parts, and at the end of a file that is cut off. Empty parts are left out. Raises
     SceneError: a part cannot be used, parts differ in their frames, or too many lines are missing.
     """
-    files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
-    headers = dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
-    for entry in sorted(folder.iterdir()):
-        match = _PART.fullmatch(entry.name)
-        if headers and match is not None and entry.is_file() and int(match[1]) not in headers:
-            raise SceneError(f"{entry} has no header {entry.stem}.hdr; copy the header, or move {entry.name} elsewhere")
+    entries = [entry for entry in sorted(folder.iterdir()) if entry.is_file()]
+    numbered = [(int(match[1]), entry) for entry in entries if (match := _PART.fullmatch(entry.name)) is not None]
+    headers = dict(sorted(one for one in numbered if one[1].suffix.lower() == ".hdr"))
+    if headers and (lone := [entry for number, entry in numbered if number not in headers]):
+        name = lone[0].name
+        raise SceneError(f"{lone[0]} has no header {lone[0].stem}.hdr; copy the header, or move {name} elsewhere")
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
@@ -198,7 +197,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     if any("map info" in cube.header.fields for cube in opened.values()):
         notes.append("the map info of its parts is not read: lines of a folder are on no map; name one file")
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
-    listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
+    listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in entries)
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
     if not indices:
         return source
@@ -211,9 +210,10 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
-    return replace(
-        source, files=(*source.files, *indices.values()), lines=_timed(source.lines, times), notes=tuple(notes)
-    )
+    lines, known = source.lines, times.stamp_us >= 0
+    if known.any() and np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
+        lines = replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
+    return replace(source, files=(*source.files, *indices.values()), lines=lines, notes=tuple(notes))
 
 
 def bands_of_header(header: EnviHeader, where: str) -> Bands:
@@ -291,14 +291,6 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
     unknown = [one.where for one in every.values() if one.exposure_ms is None]
     notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]
     return first, np.nan_to_num(exposure_ms, nan=usual)
-
-
-def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
-    """Add the times of frame indices."""
-    known = times.stamp_us >= 0
-    if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
-        return lines
-    return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
 
 
 def load_frame_index(path: Path) -> FrameIndex:

@@ -243,8 +243,7 @@ def _table(path: Path) -> NDArray[np.float64]:
         raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
     rows: list[list[float]] = []
     for line in lines:
-        cells = re.split(r"[;\t]" if re.search(r"[;\t]", line) else r"\s+", line.strip())
-        commas = len(cells) > 1 and all(re.fullmatch(r"\s*\d+,\d+\s*", cell) for cell in cells[:2])  # 450,5 10,2
+        commas = re.match(r"\s*\d+,\d+(\s*[;\t]\s*\d+(,\d+)?|\s+\d+,\d+)\b", line)  # 450,5 10,2
         fields = re.sub("[,;]", " ", line.replace(",", ".") if commas else line).split()[:2]
         for count in range(len(fields), 0, -1):
             with suppress(ValueError):
