@@ -9,14 +9,16 @@ from __future__ import annotations
 import importlib
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
@@ -32,7 +34,6 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
-from spectralzoom.storage.readers.orientation import orientation_of, upright
 from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 from spectralzoom.storage.readers.places import place_of_file
 
@@ -120,7 +121,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             ),
         )
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return upright(source if plain else rescaled(source, scale, offset), orientation_of(path))
+    return _upright(source if plain else rescaled(source, scale, offset), _orientation_of(path))
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
@@ -192,3 +193,56 @@ def _bands_of(file: Any, bands: Sequence[int], kinds: Sequence[str], path: Path)
     """Return wavelengths and widths of some bands (from 0) of an open file by its tags, band names or colours."""
     names, colours = ([of_file[band] for band in bands] for of_file in (file.descriptions, kinds))
     return bands_of_fields(_tags_of(file, bands), names, str(path), colours)
+
+
+_ORIENTATION = 274  # tag of Exif 2.32
+_TURNS: Mapping[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: np.swapaxes(image, 0, 1),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: np.swapaxes(image[::-1, ::-1], 0, 1),
+    8: lambda image: np.rot90(image),
+}
+
+
+def _orientation_of(path: Path) -> int:
+    """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP; 1 (upright) without a valid one."""
+    try:
+        if path.suffix.lower() in (".tif", ".tiff"):  # of any number of bands, which Pillow does not open
+            with tifffile.TiffFile(path) as file:
+                tag = file.pages.first.tags.get(_ORIENTATION)
+                found = 1 if tag is None else tag.value
+        else:
+            with warnings.catch_warnings(), Image.open(path) as image:
+                warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
+                found = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # of a kind without such tags; a damaged file is refused where it is read
+        return 1
+    return int(found) if found in _TURNS else 1
+
+
+def _upright(source: CubeSource, tag: int) -> CubeSource:
+    """Return an image as its orientation tag says, with a note; one with a place on the earth stays as it is."""
+    if tag == 1:
+        return source
+    if source.geobox is not None:
+        left = f"its orientation tag {tag} is not applied, since the file says where its pixels lie on the earth"
+        return replace(source, notes=(*source.notes, left))
+    turn = _TURNS[tag]
+    height, width, bands = source.shape
+    shape = (width, height, bands) if tag >= 5 else source.shape
+    check_memory(source.name, 2 * height * width * bands * source.dtype.itemsize)
+
+    def read_all(_first: int, _last: int) -> NDArray[Any]:
+        return np.ascontiguousarray(turn(source.read(0, height)))
+
+    return replace(
+        source,
+        shape=shape,
+        read=read_by_chunks(read_all, shape[0], shape[0]),
+        void=None if source.void is None else turn(source.void),
+        scaling=f"{source.scaling} orientation {tag}".strip(),
+        notes=(*source.notes, f"the picture is turned upright, as its orientation tag {tag} says"),
+    )
