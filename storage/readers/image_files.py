@@ -80,7 +80,10 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
             alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
-        kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
+        void = _void(file, alpha)
+        masked = void if scaled and void is not None and not void.all() else None
+        kinds_of_kept = (np.dtype(file.dtypes[band]) for band in keep or [0])
+        kind = np.dtype(np.float32) if masked is not None else np.result_type(*kinds_of_kept)
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
         known = _bands_of(file, keep, kinds, path)
@@ -94,7 +97,10 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             """Return some rows, (y, x, band) (SceneError: they are damaged)."""
             with _opened(path) as opened:
                 planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
-            return np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+            lines = np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+            if masked is not None:
+                lines[masked[first:last]] = np.nan
+            return lines
 
         source = CubeSource(
             name=path.name,
@@ -106,19 +112,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
             bad_bands=bad,
-            void=_void(file, alpha),
+            void=void,
             acquired=acquired.text,
             notes=tuple(notes),
-        )
-    read = source.read
-    void = source.void
-    if scaled and void is not None and not void.all():
-        source = replace(
-            source,
-            dtype=np.dtype(np.float32),
-            read=lambda first, last: np.where(
-                void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
-            ),
         )
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
     return _upright(source if plain else rescaled(source, scale, offset), _orientation_of(path))
