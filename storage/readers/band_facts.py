@@ -10,6 +10,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -248,18 +249,19 @@ def _gathered(fields: Mapping[str, object], count: int) -> dict[str, object]:
     for key, value in fields.items():
         if isinstance(value, str) and (found := re.fullmatch(r"(.*?\D)[ _]*(\d{1,5})", key)):
             groups[found[1]][int(found[2])] = value
-    ways = list(range(count)), list(range(1, count + 1))
-    return {**fields, **{base: [one[at] for at in sorted(one)] for base, one in groups.items() if sorted(one) in ways}}
+    whole = {base: one for base, one in groups.items() if len(one) == count and min(one) in (0, 1)}
+    counted = {base: one for base, one in whole.items() if max(one) - min(one) + 1 == count}
+    return {**fields, **{base: [one[at] for at in sorted(one)] for base, one in counted.items()}}
 
 
 def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
     """Return the names that a field lists, one a band; None each without such a list."""
     for key, value in fields.items():
         if letters(key) in ("band", "bandname", "bandnames", "longname"):
-            separators = (",", r",(?!\d)", ";") if isinstance(value, str) else ()
-            ways = [re.split(between, str(value)) for between in separators] or [list(map(str, _words(value)))]
+            by = (",", r",(?!\d)", ";") if isinstance(value, str) else ()
+            ways = [re.split(one, str(value)) for one in by] or [_words(value)]
             if found := [way for way in ways if len(way) == count]:
-                return found[0]
+                return list(map(str, found[0]))
     return [None] * count
 
 
@@ -273,7 +275,7 @@ def _lists(
         if (known := kind.fullmatch(letters(key))) is None:
             continue
         value, unit = fields[key], stated.get(letters(key), next(iter(stated.values()), ""))
-        said = [unit] * count if isinstance(unit, str) else _words(unit)
+        said = repeat(unit) if isinstance(unit, str) else _words(unit)
         words = (split_list(value, count) if isinstance(value, str) else None) or _words(value)
         items = [item for word in words if (item := _item(word)) is not None]
         if len(items) < len(words) or len(words) != count:
