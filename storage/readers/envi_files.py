@@ -1,13 +1,8 @@
 """Open ENVI cubes: one file, or the parts of one cube in a folder of a Headwall camera.
 
-::
-
-    raw_0  raw_0.hdr  raw_2000  raw_2000.hdr     parts of one cube, each named by its first frame
-    frameIndex_0.txt  frameIndex_2000.txt        when each frame was taken
-    darkReference(.hdr)  whiteReference(.hdr)    found by how their names begin
-
-Folders have the layout of the Nano-Hyperspec. The reader was tested on small folders in this layout, and on the
-references of a real MV.X.
+A folder has the layout of the Nano-Hyperspec: ``raw_<frame>``, each named by its first frame, ``frameIndex_<frame>.txt``
+with the times of frames, ``darkReference`` and ``whiteReference``. The reader was tested on small folders in this
+layout, and on the references of a real MV.X.
 """
 
 from __future__ import annotations
@@ -281,12 +276,13 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
         for start, part in parts.items()
     }
     first = next(iter(every.values()))
+    for one in every.values():
+        check_parts(one, first)
+    if all(one.exposure_ms is None for one in every.values()):
+        return first, None
     exposure_ms = np.full(height, np.nan)
     for start, one in every.items():
-        check_parts(one, first)
         exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
-    if np.isnan(exposure_ms).all():
-        return first, None
     usual = float(np.nanmedian(exposure_ms))
     unknown = [one.where for one in every.values() if one.exposure_ms is None]
     notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]

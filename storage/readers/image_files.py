@@ -22,7 +22,7 @@ from PIL import Image
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields, split_list
+from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -76,7 +76,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
-        of_all = _bands_of(file, range(file.count), kinds, path).wavelength_nm
+        of_all = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
         if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
             alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
@@ -86,8 +86,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         kind = np.dtype(np.float32) if masked is not None else np.result_type(*kinds_of_kept)
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
-        known = _bands_of(file, keep, kinds, path)
-        bad, doubts = bad_bands(_tags_of(file, keep), len(keep))
+        tags, (names, colours) = _tags_of(file, keep), ([one[at] for at in keep] for one in (file.descriptions, kinds))
+        known = bands_of_fields(tags, names, str(path), colours)
+        bad, doubts = bad_bands(tags, len(keep))
         acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
         notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
@@ -183,12 +184,6 @@ def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
     of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
     names = dict.fromkeys(name for own in of_bands for name in own)
     return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
-
-
-def _bands_of(file: Any, bands: Sequence[int], kinds: Sequence[str], path: Path) -> Bands:
-    """Return wavelengths and widths of some bands (from 0) of an open file by its tags, band names or colours."""
-    names, colours = ([of_file[band] for band in bands] for of_file in (file.descriptions, kinds))
-    return bands_of_fields(_tags_of(file, bands), names, str(path), colours)
 
 
 _ORIENTATION = 274  # tag of Exif 2.32

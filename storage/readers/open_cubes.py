@@ -25,18 +25,14 @@ from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_se
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 _WITH_VARIABLE = re.compile(
-    r"^(?P<path>.+\.(?:mat|zarr|npy)):(?P<variable>[^/\\:]+)$"
-    r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+)$",
-    re.IGNORECASE | re.DOTALL,
+    r"(.+\.(?:(?:mat|zarr|npy)(?=:[^/\\:]+$)|nc4?|h5|hdf5|he5)):([^:]+)", re.IGNORECASE | re.DOTALL
 )
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
     """Return path and variable of ``scene.mat:cube``."""
-    found = _WITH_VARIABLE.match(str(address))
-    if found is None:
-        return Path(address), None
-    return Path(found["path"] or found["path2"]), found["variable"] or found["variable2"]
+    found = _WITH_VARIABLE.fullmatch(str(address))
+    return (Path(address), None) if found is None else (Path(found[1]), found[2])
 
 
 def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image", "array", "none"]:

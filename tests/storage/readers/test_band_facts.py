@@ -226,12 +226,8 @@ def say_in_names(file: Any) -> None:
     file.descriptions = [f"Band {number} ({centre} Nanometers)" for number, centre in enumerate(NM)]
 
 
-def say_with_commas(file: Any) -> None:
-    file.update_tags(Wavelengths="; ".join(str(10 * nm).replace(".", ",") for nm in NM), wavelength_units="Angstroms")
-
-
 @pytest.mark.parametrize("photometric", ["MINISBLACK", None])
-@pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names, say_with_commas])
+@pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names])
 def test_a_geotiff_states_wavelengths_in_several_ways(tmp_path: Path, say: Any, photometric: str | None) -> None:
     """A fourth band of bytes, which GDAL calls alpha by itself, is a band if it has a wavelength."""
     with write(tmp_path / "a.tif", photometric=photometric) as file:
@@ -294,24 +290,6 @@ def test_marks_that_do_not_fit_are_noted() -> None:
     """A list of another length marks no band, and flags whose meaning is not known are not read."""
     assert bad_bands({"bbl": "1, 0"}, 3) == ((), ("bbl is left out: 2 flags for 3 bands",))
     assert "1 may mean good or bad" in bad_bands({"bad bands": "1, 0"}, 2)[1][0]
-
-
-ENVI = {
-    "wavelengths of another name": ({"wavelengths": "{0.45, 0.55}"}, [450, 550]),
-    "Angstrom": ({"wavelength": "{4500, 5500}", "wavelength_units": "Angstroms"}, [450, 550]),
-    "band names": ({"band_names": "{Blue: 430 - 470 nm, 550,0 nm}"}, [450, 550]),
-    "one is missing": ({"wavelength": "{450, }"}, [450]),
-}
-
-
-@pytest.mark.parametrize("case", ENVI)
-def test_envi_wavelengths_are_read_where_they_are_certain(tmp_path: Path, case: str) -> None:
-    """A band without a wavelength among others is left out, with a note."""
-    fields, nm = ENVI[case]
-    path = write_envi(tmp_path / "a.img", VALUES[:2].transpose(1, 2, 0).copy(), **fields)
-    scene = load_scene_file(path)
-    assert scene.wavelength_nm.tolist() == pytest.approx(nm)
-    assert any("gives no wavelength of bands 1" in note for note in scene.provenance) == (case == "one is missing")
 
 
 def test_wavelengths_and_bad_bands_are_those_of_spy(tmp_path: Path) -> None:
