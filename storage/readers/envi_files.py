@@ -1,7 +1,7 @@
 """Open ENVI cubes: one file, or the parts of one cube in a folder of a Headwall camera.
 
-A folder has the layout of the Nano-Hyperspec: ``raw_<frame>``, each named by its first frame, ``frameIndex_<frame>.txt``
-with the times of frames, ``darkReference`` and ``whiteReference``. The reader was tested on small folders in this
+A folder has the layout of the Nano-Hyperspec: ``raw_<frame>``, each named by its first frame, times of the frames in
+``frameIndex_<frame>.txt``, ``darkReference`` and ``whiteReference``. The reader was tested on small folders in this
 layout, and on the references of a real MV.X.
 """
 
