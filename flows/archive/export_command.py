@@ -7,7 +7,6 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,7 @@ from spectralzoom.pipeline.errors import ArchiveError, PipelineError
 from spectralzoom.pipeline.products.indices import find_index
 from spectralzoom.storage.export.image_files import write_cog
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import remove_leftovers, take_lock, to_json, write_whole
+from spectralzoom.storage.whole_files import locked, remove_leftovers, to_json, write_whole
 
 COLLECTION = "collection.json"
 Assets = dict[str, Any]  # pystac's, by key
@@ -87,9 +86,8 @@ def run_export(
     layers = [*map_layers(opened), *spectral_layers(opened, indices, reflectance=products.reflectance)]
     folder, polygons = out / opened.id, products.polygons or bool(doses)
     try:
-        with ExitStack() as stack:
-            release = take_lock(out / ".export.lock")
-            stack.callback(release if release is not None else lambda: None)
+        out.mkdir(parents=True, exist_ok=True)
+        with locked(out / ".export.lock"):
             _collection_id(out, opened.archive.root.name)
             for one in (out, folder):
                 remove_leftovers(one)
