@@ -149,7 +149,13 @@ def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | 
     fills = list(dict.fromkeys(one for one in listed if one is not None))
     pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
     pair = pair if np.size(pair) == 2 else (None, None)
-    ends = [None if end is None else _end_as_value(end, coded, stored) for end in pair]
+    # floating ends of whole numbers with a scale are values, others are packed (NetCDF Users Guide, conventions)
+    scaled = stored.kind in "biu" and bool(set(coded) - {"_Unsigned"})
+    are_values = [scaled and np.asarray(end).dtype.kind == "f" for end in pair]
+    ends = [
+        None if end is None else float(end) if is_value else _as_value(end, coded, stored)
+        for end, is_value in zip(pair, are_values, strict=True)
+    ]
     if not coded and len(fills) < 2 and ends == [None, None]:
         return None, fills[0] if fills else None
     low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
@@ -182,17 +188,6 @@ def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> f
     if not limits.min <= held <= limits.max:
         return None
     return float(_decoded(np.array([held], stored), coded)[0])
-
-
-def _end_as_value(end: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
-    """Return an end of the valid range as a value; None if it leaves nothing out.
-
-    Floating ends of whole numbers with a scale are values, others are packed as the numbers are (NetCDF Users Guide,
-    Attribute Conventions).
-    """
-    if stored.kind in "biu" and np.asarray(end).dtype.kind == "f" and set(coded) - {"_Unsigned"}:
-        return float(end)
-    return _as_value(end, coded, stored)
 
 
 def _place_of(

@@ -70,8 +70,11 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             )
         block = max(file.block_shapes)
         item = max(np.dtype(one).itemsize for one in file.dtypes)
-        claimed = (file.height, file.width, file.count)
-        _check_size(path, driver, claimed, item, math.prod(block) * file.count)
+        claimed = file.height * file.width * file.count * item
+        if driver != "JPEG":  # its blocks may have no byte each
+            check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
+        at_a_time = math.prod(block) * file.count * item + claimed // file.height * BLOCK_LINES
+        check_memory(path, at_a_time if driver in _CALLED else claimed * 3)
         kinds = [kind.name for kind in file.colorinterp]
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
@@ -150,14 +153,6 @@ def _opened(path: Path) -> Iterator[Any]:
             rasterio.open(path, driver=driver) as file,
         ):
             yield file
-
-
-def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
-    """Refuse more than the file's bytes or the memory can hold (SceneError)."""
-    claimed = math.prod(shape) * item
-    if driver != "JPEG":  # its blocks may have no byte each
-        check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
-    check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
 
 
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
