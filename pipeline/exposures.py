@@ -1,8 +1,7 @@
 """Read and compare the exposure, gain and binning of cubes and reference frames.
 
-A camera's number is ``bias + gain * exposure * (dark current + light)``. White above its own dark frame is proportional
-to gain times exposure, and is scaled by the stated ratio. A dark frame is not scaled: how much of it is bias, which
-does not depend on the exposure, is not known.
+White above its own dark frame is proportional to the exposure, and is scaled by the stated ratio. A dark frame is not
+scaled: how much of it is bias, which does not depend on the exposure, is not known. Gain and binning must be equal.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from spectralzoom.pipeline.errors import SceneError
 
 SAME = 1e-3  # largest relative difference of equal exposures, which cameras round
 MOST_DARK_ERROR = 0.05  # of white that the dark current of another exposure may stand for
-TO_MS = {"ns": 1e-6, "us": 1e-3, "ms": 1.0, "s": 1e3}
-_WORDS = {"ns": "nanosec", "us": "µs μs usec microsec", "ms": "msec millisec", "s": "sec"}
-_UNITS = {word: unit for unit, words in _WORDS.items() for word in (unit, *words.split())}
-_UNITS |= {f"{word}ond{end}": _UNITS[word] for word in list(_UNITS) if word.endswith("sec") for end in ("", "s")}
-_UNITS |= {"db": "dB", "decibel": "dB", "x": "x", "factor": "x"}
+_TO_MS = {
+    **{"ns": 1e-6, "s": 1e3, "sec": 1e3, "second": 1e3},
+    **dict.fromkeys(("us", "µs", "μs", "usec", "microsec", "microsecond"), 1e-3),
+    **dict.fromkeys(("ms", "msec", "millisec", "millisecond"), 1.0),
+}
 _OWN_UNIT = {"tint": "ms", "shutter": "ms"}  # of Specim and of Resonon, whose headers do not state it
-
-_UNIT = rf"(?:\s*(?:in )?[(\[]\s*(?P<unit>\w+)\s*[)\]]| (?:in )?(?P<word>{'|'.join(_UNITS)})|(?P<end>ms|us|db))?"
+_UNIT = rf"(?:\s*(?:in )?[(\[]\s*(?P<unit>\w+)\s*[)\]]| (?:in )?(?P<word>{'|'.join(_TO_MS)})s?)?"
 _TIME = re.compile(
     r"(?:(?:camera|sensor|frame|line) )?(?P<name>exposure|integration|shutter|tint|t int|(?:exp|int)(?= ?time))"
     rf" ?(?:time|period|duration)? ?(?P<detector>\d?){_UNIT}"
 )
-_GAIN = re.compile(r"(?:(?:camera|sensor|detector|analog|analogue|digital|em) )?gain ?(?P<detector>\d?)" + _UNIT)
-_FRAME = re.compile(r"(?:.* )?binning(?: ?\w+)?|aoi (?:left|top)")
+_SETTING = re.compile(
+    r"(?P<name>(?:\w+ )?gain(?: ?\d)?|(?:.* )?binning(?: ?\w+)?|aoi (?:left|top))(?: ?[(\[](?P<unit>\w+)[)\]])?"
+)
 _VALUE = re.compile(r"(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)")
 
 
@@ -44,8 +43,7 @@ class Taken:
     where: str = ""
     exposures: Mapping[str, float] = field(default_factory=dict)  # [ms], by the number of the detector
     times: Mapping[str, float] = field(default_factory=dict)  # exposures without a unit, by their key
-    gains: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # number and unit (dB, x or none), by key
-    frame: Mapping[str, str] = field(default_factory=dict)  # binning, first elements and gain in words, by key
+    settings: Mapping[str, str] = field(default_factory=dict)  # gain, binning and first elements, by their key
     notes: tuple[str, ...] = ()
     conflicts: tuple[str, ...] = ()  # keys that contradict each other
 
@@ -56,15 +54,10 @@ class Taken:
 
     @property
     def text(self) -> str:
-        """Return the exposure and the gain for messages."""
+        """Return the exposure for messages."""
         times = [f"{ms:g} ms" for ms in dict.fromkeys(self.exposures.values())]
         times = times or [f"{key} = {time:g} (no unit)" for key, time in self.times.items()]
-        return " and ".join(times or ["an exposure that is not stated"]) + self.gains_text
-
-    @property
-    def gains_text(self) -> str:
-        """Return the gains as the end of `text`."""
-        return "".join(f", {key} = {gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items())
+        return " and ".join(times or ["an exposure that is not stated"])
 
 
 def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
@@ -73,40 +66,32 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     Keys are those of several makes, with the unit in key or value; lines of ``description`` may be keys. Numbers that
     are no exposure are left out with a note.
     """
-    exposures: dict[str, tuple[str, float]] = {}
+    exposures: dict[str, float] = {}
     times: dict[str, float] = {}
-    gains: dict[str, tuple[float, str]] = {}
-    frame: dict[str, str] = {}
+    settings: dict[str, str] = {}
     notes: list[str] = []
     conflicts: list[str] = []
     every = [(key, str(value)) for header in headers for key, value in header.items()]
     about = "\n".join(value for key, value in every if key == "description")
     for key, value in (*every, *re.findall(r"^\s*([^=:\n]+)[=:](.*)$", about, re.MULTILINE)):
         name = re.sub(r"[\s_.,/]+", " ", key.lower()).strip()
-        if _FRAME.fullmatch(name):
-            conflicts += _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)) or value.strip().lower())
-        elif (match := _GAIN.fullmatch(name)) is not None:
-            number, unit = _number(value, match)
-            if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
-                conflicts += _put(frame, name, value.strip().lower())
-            else:
-                conflicts += _put(gains, name[: match.end("detector")].strip(), (number, unit))
+        if (match := _SETTING.fullmatch(name)) is not None:
+            plain = ", ".join(word.strip() for word in value.lower().strip("{} ").split(","))
+            plain = re.sub(r"\d+\.\d+", lambda found: f"{float(found[0]):g}", plain)
+            conflicts += _put(settings, match["name"], f"{plain} {match['unit'] or ''}".strip())
         elif (match := _TIME.fullmatch(name)) is not None:
-            number, unit = _number(value, match)
-            unit = unit or _OWN_UNIT.get(match["name"], "")
+            number, units = _time(value, match)
             if number is None and not re.search(r"\d|nan|inf", value.lower()):
                 continue  # the state of a shutter
-            if number is None or number <= 0 or (unit and unit not in TO_MS):
+            if number is None or number <= 0 or len(units) > 1 or units - set(_TO_MS):
                 notes.append(f"{where}: {name} = {value.strip()[:40]} is no exposure that can be read, and is left out")
-            elif not unit:
+            elif not units:
                 conflicts += _put(times, name, number)
             else:
-                ms = number * TO_MS[unit]
-                other, known = exposures.setdefault(match["detector"], (name, ms))
-                if not all_alike([ms, known]):
-                    conflicts.append(f"{other} of {known:g} ms and {name} of {ms:g} ms")
-    found = {detector: ms for detector, (_, ms) in exposures.items()}
-    return Taken(where, found, {} if found else times, gains, frame, tuple(notes), tuple(conflicts))
+                ms = number * _TO_MS[units.pop()]
+                if not all_alike([ms, exposures.setdefault(match["detector"], ms)]):
+                    conflicts.append(f"exposures of {exposures[match['detector']]:g} ms and of {ms:g} ms ({name})")
+    return Taken(where, exposures, {} if exposures else times, settings, tuple(notes), tuple(conflicts))
 
 
 def _put(table: dict[str, Any], name: str, value: Any) -> list[str]:
@@ -114,14 +99,15 @@ def _put(table: dict[str, Any], name: str, value: Any) -> list[str]:
     return [] if table.setdefault(name, value) == value else [f"{name} of {table[name]} and of {value}"]
 
 
-def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
-    """Return the number of a value, None if there is none, and its unit as in the value, else in the key."""
+def _time(value: str, key: re.Match[str]) -> tuple[float | None, set[str]]:
+    """Return the number of a value, None if there is none, and its different units in value and key."""
     match = _VALUE.fullmatch(value.strip().lower())
     if match is None:
-        return None, ""
-    of_key = key["unit"] or key["word"] or key["end"]
-    units = {_UNITS.get(word, word) for word in (match["unit"], of_key) if word}
-    return finite_number(match["number"].replace(",", ".")), " and ".join(sorted(units))
+        return None, set()
+    words = (match["unit"], key["unit"] or key["word"] or "")
+    units = [word if word in _TO_MS else word.removesuffix("s") for word in words]
+    own = {_OWN_UNIT[key["name"]]} if key["name"] in _OWN_UNIT and not any(units) else set()
+    return finite_number(match["number"].replace(",", ".")), ({*units} - {""}) | own
 
 
 def all_alike(values: Iterable[float]) -> bool:
@@ -136,44 +122,33 @@ def span_text(exposure_ms: NDArray[np.float64]) -> str:
     return f"{low:g} ms" if all_alike([low, high]) else f"{low:g} to {high:g} ms"
 
 
-def _exposure_at_gain(frame: Taken, cube: Taken, usual_ms: float, *, stated: bool) -> float | None:
-    """Return the exposure [ms] of a frame at the gain of the cube; None if it is not known.
+def _exposure_of(frame: Taken, cube: Taken, usual_ms: float, *, stated: bool) -> float | None:
+    """Return the exposure [ms] of a frame; None if it is not known.
 
     Times without a unit count if both headers have the same key: the cube's is ``usual_ms``. Raises SceneError: they
-    were taken with another binning or area, gains differ without a unit, or detectors have different ratios.
+    were taken with another gain, binning or area, or detectors have different ratios.
     """
-    for key in sorted(frame.frame.keys() & cube.frame.keys()):
-        _check_same(frame, cube, key, frame.frame[key], cube.frame[key])
-    gain = 1.0
-    for key in sorted(frame.gains.keys() & cube.gains.keys()):
-        (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
-        if not unit or unit != unit_of_cube:
-            texts = (f"{number:g} {word or '(no unit)'}" for number, word in (frame.gains[key], cube.gains[key]))
-            _check_same(frame, cube, key, *texts)
-        else:
-            gain *= 10 ** ((one - other) / 20) if unit == "dB" else one / other
+    for key in sorted(frame.settings.keys() & cube.settings.keys()):
+        _check_same(frame, cube, key, frame.settings[key], cube.settings[key])
     both = sorted(frame.exposures.keys() & cube.exposures.keys())
     if both and not all_alike(frame.exposures[one] / cube.exposures[one] for one in both):
-        times = (" and ".join(f"{taken.exposures[one]:g}" for one in both) + " ms" for taken in (frame, cube))
-        _check_same(frame, cube, "exposures", *times)
+        _check_same(frame, cube, "exposures", frame.text, cube.text)
     if frame.exposure_ms is not None and stated:
-        return frame.exposure_ms * gain
-    for key in sorted(frame.times.keys() & cube.times.keys()):
-        return frame.times[key] / cube.times[key] * usual_ms * gain
-    return None if gain == 1 else usual_ms * gain
+        return frame.exposure_ms
+    shared = sorted(frame.times.keys() & cube.times.keys())
+    return frame.times[shared[0]] / cube.times[shared[0]] * usual_ms if shared else None
 
 
 def _check_same(frame: Taken, cube: Taken, key: str, one: str, other: str) -> None:
     """Refuse a frame with another setting than the cube's (SceneError)."""
     if one != other:
-        unit = ", or state the unit of both (dB or x)" if "(no unit)" in one + other else ""
         both = f"{frame.where} was taken with {key} = {one}, {cube.where} with {other}"
-        raise SceneError(f"{both}; give a frame taken with the cube's own settings{unit}")
+        raise SceneError(f"{both}; give a frame taken with the cube's own settings")
 
 
 def check_parts(one: Taken, first: Taken) -> None:
     """Refuse a part of a cube with another gain or binning than the first (SceneError)."""
-    mine, other = ({**taken.gains, **taken.frame, **taken.times} for taken in (one, first))
+    mine, other = ({**taken.settings, **taken.times} for taken in (one, first))
     for key in mine | other:
         if mine.get(key) != other.get(key):
             both = f"{one.where} was taken with {key} = {mine.get(key)}, {first.where} with {other.get(key)}"
@@ -186,24 +161,24 @@ Frames = Mapping[str, tuple[NDArray[np.float32], Taken]]  # (sample, band) DN, b
 def match_exposures(
     frames: Frames, cube: Taken, lines_ms: NDArray[np.float64], *, stated: bool, usual_ms: float | None = None
 ) -> tuple[float | None, list[str]]:
-    """Return the exposure [ms] of the white frame at the gain of the cube, and notes; None if it is that of all lines.
+    """Return the exposure [ms] of the white frame and notes; None if it is that of all lines.
 
     ``lines_ms`` (line,) are exposures of the lines, and ``stated`` is whether a file has them. A white frame that
     states no exposure is assumed to have ``usual_ms``, by default the median of the lines. A dark frame of another
-    exposure is used as it is. Raises SceneError: a header contradicts itself, a frame has another binning, another gain
-    without a unit, or a dark frame may change values by more than 5 %.
+    exposure is used as it is. Raises SceneError: a header contradicts itself, a frame has another binning or gain, or a
+    dark frame may change values by more than 5 %.
     """
     for taken in (cube, *(taken for _, taken in frames.values())):
         if taken.conflicts:
             raise SceneError(f"{taken.where} states {taken.conflicts[0]}; correct the header, or remove the wrong one")
     usual = float(np.median(lines_ms)) if usual_ms is None else usual_ms
-    lines = span_text(lines_ms) + cube.gains_text if stated else cube.text
+    lines = span_text(lines_ms) if stated else cube.text
     notes = list(cube.notes)
     found: dict[str, float] = {}
     for kind in sorted(frames.keys() & {"dark", "white"}):
         frame = frames[kind][1]
         notes += frame.notes
-        ms = _exposure_at_gain(frame, cube, usual, stated=stated)
+        ms = _exposure_of(frame, cube, usual, stated=stated)
         both = f"{frame.where} was taken with {frame.text}, the lines with {lines}"
         if ms is not None:
             found[kind] = ms

@@ -18,7 +18,6 @@ from rich.markup import escape
 from spectralzoom.flows.archive.export_layers import (
     NO_PRODUCTS,
     ExportedRun,
-    Layer,
     ProductFlags,
     map_layers,
     open_exported,
@@ -31,7 +30,7 @@ from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import print_json, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError
 from spectralzoom.pipeline.products.indices import find_index
-from spectralzoom.storage.export.image_files import write_cog
+from spectralzoom.storage.export.image_files import Layer, write_cog
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked, remove_leftovers, to_json, write_whole
 
@@ -128,9 +127,9 @@ def _write_images(folder: Path, layers: Sequence[Layer], console: Console) -> As
     for layer in layers:
         path = folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
-            write_cog(path, layer.image, layer.rows())
+            write_cog(path, layer)
         unit = {} if layer.unit is None else {"unit": layer.unit}
-        bands = [{"name": name, "data_type": layer.image.dtype, **unit} for name in layer.image.bands]
+        bands = [{"name": name, "data_type": layer.dtype, **unit} for name in layer.bands]
         assets[layer.name] = _asset(folder, path, layer.title, COG, *layer.roles, bands=bands)
     return assets
 

@@ -75,8 +75,7 @@ def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
 def run_init(source: str, console: Console, *, force: bool = False) -> dict[str, Any]:
     """Write a scene.toml for a folder or file, with progress on ``console``; return the findings for --json.
 
-    Raises SettingsError: a scene.toml exists and ``force`` is not given; ArchiveError: the folder cannot be written to;
-    else as `draft_scene`.
+    Raises SettingsError: one exists, and ``force`` is not given; ArchiveError: no write access; else as `draft_scene`.
     """
     place, _ = split_variable(source)
     path = (place if place.is_dir() and not label_files.is_store(place) else place.parent) / SETTINGS_NAME
@@ -203,8 +202,7 @@ def _show(record: dict[str, Any], console: Console) -> None:
 def draft_scene(address: str | Path, before: SceneSettings = SceneSettings()) -> SceneDraft:  # noqa: B008 - frozen
     """Inspect the images and labels of a folder, or one file and its labels, by an earlier scene.toml of them.
 
-    The first image is read, of others only the size; all label files are read. Raises SceneError: there is no image, or
-    the first one cannot be read; labels may belong to several images, or have mixed values.
+    All label files are read. Raises SceneError: the first image cannot be read; labels cannot be matched, or are mixed.
     """
     path, _ = split_variable(address)
     found = label_files.find_files(path)

@@ -78,5 +78,5 @@ def load_frame(path: Path, kind: str = "reference") -> Frame:
 
 
 def taken_of(frames: Mapping[str, Frame]) -> Frames:
-    """Return values of frames and how they were taken."""
+    """Return the values of frames and how they were taken."""
     return {kind: (frame.values, frame.taken) for kind, frame in frames.items()}

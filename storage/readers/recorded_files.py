@@ -152,8 +152,8 @@ def references_of(
     """Return the references of a cube by its frames, and notes.
 
     ``exposure_ms`` (line,) are those of its lines, ``white_reference`` is the default value of the white reference, one
-    or (band,). Without a white frame, values are those of the exposure of the camera. Raises SceneError: a frame has
-    other samples, bands, binning or gain than the cube, or white is not brighter than dark.
+    or (band,). Without a white frame, values are those of the exposure of the camera. Raises SceneError: a frame does
+    not fit the cube, or white is not brighter than dark.
     """
     name, source, frames = cube.name, cube.source, cube.frames
     frame = source.shape[1:]
@@ -169,10 +169,8 @@ def references_of(
     notes += more
     for kind, one in frames.items():
         if one.values.shape != frame:
-            raise SceneError(
-                f"the {kind} frame {one.files[0]} is {one.values.shape} (sample, band), the cube {frame}; give one "
-                "taken with the cube's own samples and bands"
-            )
+            is_not = f"the {kind} frame {one.files[0]} is {one.values.shape} (sample, band), the cube {frame}"
+            raise SceneError(f"{is_not}; give one taken with the cube's own samples and bands")
     found = {kind: one.values for kind, one in frames.items()}
     measured = {"dark", "white"} <= set(found)
     if "dark" not in found:
