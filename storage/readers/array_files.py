@@ -134,14 +134,12 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
         listed = scipy_io.whosmat(_plain_mat(content, _MAT_HEAD))
-    size = path.stat().st_size
-    found: dict[str, FileArray] = {}
-    for number, (name, shape, kind) in enumerate(listed):
-        if kind in _MATLAB:
-            read = partial(load, name, number, shape, kind)
-            ratio = 8 * DEFLATE_RATIO  # a double may be one byte
-            found[name] = _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), read, size, ratio)
-    return found
+    size, most = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
+    return {
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, at, shape, kind), size, most)
+        for at, (name, shape, kind) in enumerate(listed)
+        if kind in _MATLAB
+    }
 
 
 def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> mmap.mmap:
@@ -209,55 +207,45 @@ def as_pictures(arrays: dict[str, FileArray]) -> dict[str, FileArray]:
     """
     words = {name.lower().replace("_", ""): one for name, one in arrays.items() if math.prod(one.shape) == 1}
     pair = next((names for names in _SIZES if set(names) <= set(words)), None)
-    if pair is None:
+    sides = () if pair is None else tuple(float(words[name][...].item()) for name in pair)
+    if not sides or not all(side.is_integer() and side > 0 for side in sides):
         return arrays
-    height, width = (float(words[name][...].item()) for name in pair)
-    if not (height.is_integer() and width.is_integer() and min(height, width) > 0):
-        return arrays
-    shape = int(height), int(width)
-    tables = {name: one for name, one in arrays.items() if one.ndim == 2 and math.prod(shape) in one.shape}
-    return {**arrays, **{name: _as_picture(one, shape) for name, one in tables.items() if one.shape != shape}}
+    height, width = map(int, sides)
 
+    def turned(table: FileArray) -> FileArray:
+        bands_first = table.shape[1] == height * width
+        bands = table.shape[0 if bands_first else 1]
 
-def _as_picture(table: FileArray, shape: tuple[int, int]) -> FileArray:
-    """Return a table of spectra as a cube (y, x, band)."""
-    pixels = shape[0] * shape[1]
-    bands_first = table.shape[1] == pixels
-    bands = table.shape[0] if bands_first else table.shape[1]
+        def load() -> NDArray[Any]:
+            values = table[...].T if bands_first else table[...]
+            return values.reshape(height, width, bands, order="F")
 
-    def load() -> NDArray[Any]:
-        values = table[...].T if bands_first else table[...]
-        return values.reshape(*shape, bands, order="F")
+        cube = _whole(table.where, (height, width, bands), table.dtype, load, table.stored, table.ratio)
+        order = "(band, pixel)" if bands_first else "(pixel, band)"
+        of_sizes = f"{height} x {width} px (y x x), as the sizes beside it say; pixels go down columns"
+        return replace(cube, notes=(f"a table {order} of {of_sizes}",))
 
-    order = "(band, pixel)" if bands_first else "(pixel, band)"
-    note = f"a table {order} of {shape[0]} x {shape[1]} px (y x x), as the sizes beside it say; pixels go down columns"
-    cube = _whole(table.where, (*shape, bands), table.dtype, load, table.stored, table.ratio)
-    return replace(cube, notes=(note,))
+    tables = {name: one for name, one in arrays.items() if one.ndim == 2 and height * width in one.shape}
+    return {**arrays, **{name: turned(one) for name, one in tables.items() if one.shape != (height, width)}}
 
 
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     """List the arrays of a NetCDF file of version 3."""
-    with xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False) as opened:
-        listed, attributes = {str(name): one for name, one in opened.variables.items()}, dict(opened.attrs)
+    opened = partial(xr.open_dataset, path, engine="scipy", decode_cf=False, cache=False)
 
     def read(name: str, part: Any) -> NDArray[Any]:
-        with xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False) as file:
+        with opened() as file:
             return np.asarray(file.variables[name][part].values)
 
-    size = path.stat().st_size
-    return {
-        name: FileArray(
-            f"{path}:{name}",
-            one.shape,
-            one.dtype,
-            dict(one.attrs),
-            partial(read, name),
-            (1,) * one.ndim,
-            size,
-            tuple(map(str, one.dims)),
+    def array(name: str, one: xr.Variable) -> FileArray:
+        shape, size = one.shape, path.stat().st_size
+        get = partial(read, name)
+        return FileArray(
+            f"{path}:{name}", shape, one.dtype, one.attrs, get, (1,) * one.ndim, size, tuple(map(str, one.dims))
         )
-        for name, one in listed.items()
-    }, attributes
+
+    with opened() as file:
+        return {str(name): array(str(name), one) for name, one in file.variables.items()}, dict(file.attrs)
 
 
 def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -20,32 +22,29 @@ LEAST_WIDTH_NM = 0.02
 RGB_NM = (640.0, 550.0, 460.0)
 NEAR_INFRARED_NM = 800.0
 GREY_NM = 550.0
-# spelling of a unit: its length [nm]
+# spelling of a unit: its length [nm]; the first ones may stand behind a number in the name of a band
 _LENGTHS: Mapping[str, float] = {
     r"nm|nano ?-?met(?:er|re)s?": 1.0,
     r"[uμ]m|microns?|micro ?-?met(?:er|re)s?": 1000.0,
     r"å|[aå]ngstr(?:o|ö|oe)ms?": 0.1,
-}
-_OTHER_LENGTHS: Mapping[str, float] = {
     r"a": 0.1,
     r"m|met(?:er|re)s?": 1e9,
     r"cm|centimet(?:er|re)s?": 1e7,
     r"mm|millimet(?:er|re)s?": 1e6,
 }
 _BY_SIZE = {"nm": 1.0, "micrometres": 1000.0, "metres": 1e9}
-_UNSAID = ("", "unknown", "none", "unspecified", "-")
+_UNSAID = ("", "unknown", "none", "unspecified", "-", "1")
 _MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
 _NUMBER = r"(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[+-]?\d+)?"
-_UNIT = rf"(?:{'|'.join(_LENGTHS)})(?![a-z])"
+_UNIT = rf"(?:{'|'.join(list(_LENGTHS)[:3])})(?![a-z])"
 _ITEM = re.compile(rf"([+-]?{_NUMBER})\s*(?![\d.,])(.*)")
 _BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE)  # also of np.float64(450.0)
-_UNIT_KEY = re.compile("units?$")
 _KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
-_CENTRE_KEY = re.compile(
+CENTRES = re.compile(
     rf"(?:(?:band|cent(?:er|re)|central|peak|nominal|mean|radiation)*wavelengths?(?:cent(?:er|re)|value|list|d)?s?"
     rf"|(?:band|spectral)cent(?:er|re)s?|wls?|lambdas?|(?=nm)){_KEY_UNIT}"
 )
-_WIDTH_KEY = re.compile(
+WIDTHS = re.compile(
     rf"(?:(?:band|wavelength)?fwhms?|fullwidth(?:at)?halfmax(?:imum)?|bandwidths?|spectralwidths?){_KEY_UNIT}"
 )
 GOOD_BANDS = ("bbl", "good", "goodband", "goodbands", "goodwavelength", "goodwavelengths", "goodbandlist")  # 0 is bad
@@ -109,33 +108,20 @@ def why_unknown(bands: Bands) -> str:
     return f"their wavelengths cannot be read ({reasons})" if reasons else "nothing says their wavelengths"
 
 
-def scale_nm(unit: str | None) -> float | None:
+def scale_nm(unit: object) -> float | None:
     """Return the nm of a unit of length; None for other and unknown units."""
     text = _plain_text(unit).strip(" .[](){}'\"")
-    return next((nm for words, nm in {**_LENGTHS, **_OTHER_LENGTHS}.items() if re.fullmatch(words, text)), None)
+    return next((nm for words, nm in _LENGTHS.items() if re.fullmatch(words, text)), None)
 
 
 def is_spectral(attrs: Mapping[str, Any]) -> bool:
     """Return whether attributes are those of wavelengths, by their standard name or a unit of nm, um or Angstrom."""
-    unit = _plain_text(attrs.get("units", attrs.get("unit")))
-    short = scale_nm(unit)
+    short = scale_nm(attrs.get("units", attrs.get("unit")))
     return "wavelength" in str(attrs.get("standard_name", "")) or (short is not None and short <= 1000)
 
 
-def wavelength_unit(name: str) -> str | None:
-    """Return the unit in the name of a list of wavelengths, "" without one; None for names of other lists."""
-    found = _CENTRE_KEY.fullmatch(letters(name))
-    return None if found is None else found[1] or ""
-
-
-def width_unit(name: str) -> str | None:
-    """Return the unit in the name of a list of widths, "" without one; None for names of other lists."""
-    found = _WIDTH_KEY.fullmatch(letters(name))
-    return None if found is None else found[1] or ""
-
-
 def bands_of_numbers(
-    values: object, unit: str | None, origin: str, widths: object = None, width_unit: str | None = None
+    values: object, unit: object, origin: str, widths: object = None, width_unit: object = None
 ) -> Bands:
     """Return bands by numbers (band,) in a unit; numbers that are not above 0 are missing.
 
@@ -148,14 +134,13 @@ def bands_of_numbers(
         return Bands(notes=(f"the wavelengths are left out: {known.sum()} of {len(centres)} bands have one",))
     scale, doubt = _scale(unit, centres[known])
     if scale is None:
-        return Bands(notes=(doubt,))
+        return Bands(notes=(f"the wavelengths are left out: {doubt}",))
     notes = [doubt] if doubt else []
     if not known.all():
         notes.append(f"the file gives no wavelength of bands {bands_text(np.flatnonzero(~known).tolist())} (from 0)")
     if widths is None:
         return Bands(centres * scale, None, origin, tuple(notes))
-    width_scale = scale if _plain_text(width_unit) in _UNSAID else scale_nm(width_unit) or np.nan
-    fwhm = _above_zero(widths) * width_scale
+    fwhm = _above_zero(widths) * (scale if _plain_text(width_unit) in _UNSAID else scale_nm(width_unit) or np.nan)
     fits = fwhm.shape == centres.shape and bool(((fwhm >= LEAST_WIDTH_NM) & (fwhm < centres * scale))[known].all())
     notes += [] if fits else ["the widths (fwhm) are left out: not every band has one that fits its wavelength"]
     return Bands(centres * scale, fwhm if fits else None, origin, tuple(notes))
@@ -167,40 +152,36 @@ def _above_zero(values: object) -> NDArray[np.float64]:
     return np.where(np.isfinite(numbers) & (numbers > 0), numbers, np.nan)
 
 
-def _scale(unit: str | None, numbers: NDArray[np.float64]) -> tuple[float | None, str]:
+def _scale(unit: object, numbers: NDArray[np.float64]) -> tuple[float | None, str]:
     """Return the nm of a unit, and a note; a unit that is not stated is that of usual wavelengths of this size."""
     if (known := scale_nm(unit)) is not None:
         return known, ""
     if _plain_text(unit) not in _UNSAID:
-        return None, f"the wavelengths are left out: their unit {unit!r} is no length; expected nm, um, Angstrom or m"
+        return None, f"their unit {unit!r} is no length; expected nm, um, Angstrom or m"
     low, high = numbers.min(), numbers.max()
     if high <= 20 and (numbers % 1 == 0).all():
-        return None, f"the wavelengths are left out: they have no unit, and {low:g} to {high:g} may count the bands"
+        return None, f"they have no unit, and {low:g} to {high:g} may count the bands"
     for name, scale in _BY_SIZE.items():
         if RANGE_NM[0] <= low * scale <= RANGE_NM[1] and high * scale <= THERMAL_NM:
             return scale, f"the wavelengths have no unit, read as {name} by their size"
     fits = "may be Angstrom or nm" if low > RANGE_NM[1] and high <= 10 * RANGE_NM[1] else "fit no unit of wavelengths"
-    return None, f"the wavelengths are left out: they have no unit, and {low:g} to {high:g} {fits}"
+    return None, f"they have no unit, and {low:g} to {high:g} {fits}"
 
 
 def split_list(text: str, count: int) -> list[str] | None:
-    """Return the ``count`` numbers of a list as texts, "" where one is missing; None if it is no such list.
+    """Return the ``count`` numbers of a list as texts; None if it is no such list.
 
-    They are separated by semicolons, commas or spaces, and may have decimal commas and units.
+    They are separated by semicolons, commas or spaces, and may be missing, or have decimal commas and units.
     """
     bare = _BRACKET.sub(" ", text).strip()
     for between in (";", ",", r"[,\s]+", r",?\s+") if bare else ():
         words = [word.strip() for word in re.split(between, bare)]
         words = words[:-1] if len(words) == count + 1 and not words[-1] else words
-        if len(words) == count and all(not _or_missing(word) or _item(word) for word in words):
+        if len(words) == count and all(map(_item, words)):
             pairs = [_to_number(part) for word in words for part in word.split(",")]
-            doubled = ";" not in bare and len(pairs) == 2 * count and all(map(_plausible, pairs))  # 450,550 650,750
-            return None if doubled else list(map(_or_missing, words))
+            doubled = len(pairs) == 2 * count and all(RANGE_NM[0] <= one <= RANGE_NM[1] for one in pairs)
+            return None if doubled and ";" not in bare else words  # 450,550 650,750
     return None
-
-
-def _or_missing(word: str) -> str:
-    return "" if word.strip().lower() in _MISSING else word
 
 
 def numbers_of_list(text: str, count: int) -> NDArray[np.float64] | None:
@@ -209,20 +190,25 @@ def numbers_of_list(text: str, count: int) -> NDArray[np.float64] | None:
     return None if words is None else np.array([_to_number(word) for word in words], np.float64)
 
 
-def _item(word: str) -> tuple[float, str] | None:
-    """Return the number and the unit, "" without one, of an item of a list; None for others."""
+def _words(value: object) -> list[Any]:
+    """Return the items of a list in one text, with any separators, or of an array."""
+    if isinstance(value, str):
+        return re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value))
+    return list(np.asarray(value).ravel().tolist())
+
+
+def _item(word: object) -> tuple[float, str] | None:
+    """Return number, NaN if it is missing, and unit, "" without one, of an item of a list; None for other texts."""
+    if _plain_text(word) in _MISSING:
+        return np.nan, ""
     found = _ITEM.fullmatch(_plain_text(word))
     return None if found is None or (found[2] and scale_nm(found[2]) is None) else (_to_number(found[1]), found[2])
 
 
-def _to_number(text: str) -> float:
+def _to_number(text: object) -> float:
     """Return the number at the beginning of a text, with a point or a comma; NaN without one."""
-    found = re.match(rf"[+-]?{_NUMBER}", text.strip().lower())
+    found = re.match(rf"[+-]?{_NUMBER}", _plain_text(text))
     return np.nan if found is None else float(found[0].replace(",", "."))
-
-
-def _plausible(number: float) -> bool:
-    return RANGE_NM[0] <= number <= RANGE_NM[1]
 
 
 def _plain_text(text: object) -> str:
@@ -230,96 +216,84 @@ def _plain_text(text: object) -> str:
     return " ".join(unicodedata.normalize("NFKC", "" if text is None else str(text)).lower().split())
 
 
-def bands_of_texts(
-    fields: Mapping[str, str | Sequence[str]], names: Sequence[str | None], where: str, colours: Sequence[str] = ()
-) -> Bands:
-    """Return (band,) facts by a file's fields, else by the names of its bands, else by its colours; with all notes.
-
-    A field such as ``wavelength`` or ``band centres (um)`` is a list in one text, or one text a band. ``colours`` are
-    GDAL's colour interpretations.
-    """
-    count = len(names)
-    fields = _gathered(fields, count)
-    names = names if any(names) else _listed_names(fields, count)
-    centres, notes = _listed(fields, _CENTRE_KEY, count)
-    found = Bands()
-    if centres is not None:
-        widths, doubts = _listed(fields, _WIDTH_KEY, count)
-        beside = () if widths is None else _in_one_unit(widths, fields, _WIDTH_KEY)
-        of_centres = _in_one_unit(centres, fields, _CENTRE_KEY)
-        found = bands_of_numbers(*of_centres, f"wavelengths from the tags of {where}", *beside)
-        notes = (*notes, *doubts, *found.notes)
-    if found.wavelength_nm is None:
-        found = bands_of_names(names, where, () if notes else colours)
-        notes = (*notes, *found.notes)
-    return replace(found, notes=notes)
-
-
-def _gathered(fields: Mapping[str, str | Sequence[str]], count: int) -> dict[str, str | Sequence[str]]:
-    """Return fields with those such as ``wavelength_1``, ``wavelength_2``, one a band, as one list."""
-    groups: dict[str, dict[int, str]] = {}
-    for key, value in fields.items():
-        if isinstance(value, str) and (digits := re.search(r"\d{1,5}$", key)):
-            groups.setdefault(key[: digits.start()].rstrip(" _"), {})[int(digits[0])] = value
-    whole = {base: one for base, one in groups.items() if min(one) in (0, 1) and max(one) - min(one) + 1 == count}
-    lists = {base: [one[number] for number in sorted(one)] for base, one in whole.items() if len(one) == count}
-    return {**fields, **lists}
-
-
-def _listed_names(fields: Mapping[str, str | Sequence[str]], count: int) -> Sequence[str | None]:
-    """Return the names that a field lists, one a band; None each without such a list."""
-    for key, value in fields.items():
-        if letters(key) in ("band", "bandname", "bandnames", "longname"):
-            ways = (
-                [re.split(between, value) for between in (",", r",(?!\d)", ";")] if isinstance(value, str) else [value]
-            )
-            if found := [way for way in ways if len(way) == count]:
-                return found[0]
-    return [None] * count
-
-
-def _in_one_unit(
-    items: Sequence[tuple[float, str]], fields: Mapping[str, str | Sequence[str]], kind: re.Pattern[str]
-) -> tuple[NDArray[np.float64], str]:
-    """Return numbers and their unit: nm of those with a unit of their own, else the one that the fields state."""
-    stated = {letters(key): value for key, value in fields.items()}
-    unit = next((stated[key] for key in stated if key != (bare := _UNIT_KEY.sub("", key)) and kind.fullmatch(bare)), "")
-    units = [unit] * len(items) if isinstance(unit, str) else list(unit)
-    numbers = np.array([number for number, _ in items], np.float64)
-    if len(set(filter(None, units))) < 2 and not any(own for _, own in items):
-        return numbers, max(units, default="")
-    scales = [scale_nm(own or said) or np.nan for (_, own), said in zip(items, units, strict=True)]
-    return numbers * scales, "nm"
-
-
 def letters(key: str) -> str:
     """Return the small letters of a key alone, as they are compared: ``Band centres (µm)`` is ``bandcentresμm``."""
     return re.sub(r"[^a-zμ]+", "", _plain_text(key))
 
 
-def _listed(
-    fields: Mapping[str, str | Sequence[str]], kind: re.Pattern[str], count: int
-) -> tuple[list[tuple[float, str]] | None, tuple[str, ...]]:
-    """Return number and unit of each band by the first field of a kind that lists them, and notes on the others."""
+def bands_of_fields(
+    fields: Mapping[str, object], names: Sequence[str | None], where: str, colours: Sequence[str] = ()
+) -> Bands:
+    """Return (band,) facts by a file's fields, else by the names of its bands, else by its colours; with all notes.
+
+    A field such as ``wavelength`` or ``band centres (um)`` is a list in one text, or has one text or number a band.
+    ``colours`` are GDAL's colour interpretations.
+    """
+    count = len(names)
+    fields = _gathered(fields, count)
     notes: list[str] = []
-    found: list[list[tuple[float, str]]] = []
-    for name, value in sorted(fields.items(), key=lambda field: len(field[0])):
-        key = kind.fullmatch(letters(name))
-        if key is None:
+    for key, numbers, unit in _lists(fields, CENTRES, count, notes):
+        _, *widths = next(_lists(fields, WIDTHS, count, notes), ("",))
+        found = bands_of_numbers(numbers, unit, f"wavelengths from the list {key} of {where}", *widths)
+        notes += found.notes
+        if found.wavelength_nm is not None:
+            return replace(found, notes=tuple(notes))
+    names = names if any(names) else _listed_names(fields, count)
+    found = bands_of_names(names, where, () if notes else colours)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _gathered(fields: Mapping[str, object], count: int) -> dict[str, object]:
+    """Return fields with those such as ``Band_1``, ``Band_2``, one a band, as one list."""
+    groups: dict[str, dict[int, str]] = defaultdict(dict)
+    for key, value in fields.items():
+        if isinstance(value, str) and (found := re.fullmatch(r"(.*?\D)[ _]*(\d{1,5})", key)):
+            groups[found[1]][int(found[2])] = value
+    whole = {base: one for base, one in groups.items() if len(one) == count and min(one) in (0, 1)}
+    counted = {base: one for base, one in whole.items() if max(one) - min(one) + 1 == count}
+    return {**fields, **{base: [one[at] for at in sorted(one)] for base, one in counted.items()}}
+
+
+def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
+    """Return the names that a field lists, one a band; None each without such a list."""
+    for key, value in fields.items():
+        if letters(key) in ("band", "bandname", "bandnames", "longname"):
+            by = (",", r",(?!\d)", ";") if isinstance(value, str) else ()
+            ways = [re.split(one, str(value)) for one in by] or [_words(value)]
+            if found := [way for way in ways if len(way) == count]:
+                return list(map(str, found[0]))
+    return [None] * count
+
+
+def _lists(
+    fields: Mapping[str, object], kind: re.Pattern[str], count: int, notes: list[str]
+) -> Iterator[tuple[str, NDArray[np.float64], object]]:
+    """Yield key, (band,) numbers and unit of each list of a kind; ``notes`` say why others are left out."""
+    of_lists = {_before_unit(letters(key)): value for key, value in fields.items()}
+    stated = {key: value for key, value in of_lists.items() if kind.fullmatch(key)}
+    for key in sorted(fields, key=len):
+        if (known := kind.fullmatch(letters(key))) is None:
             continue
-        words: list[str] | None = [_or_missing(str(word)) for word in np.ravel(value)]
-        if isinstance(value, str):
-            words = split_list(value, count)
-        items = [_item(word) if word else (np.nan, "") for word in words or ()]
-        if words and len(words) == count and None not in items and any(words):
-            found.append([(number, unit or key[1] or "") for number, unit in filter(None, items)])
+        value, unit = fields[key], stated.get(letters(key), next(iter(stated.values()), ""))
+        said = repeat(unit) if isinstance(unit, str) else _words(unit)
+        words = (split_list(value, count) if isinstance(value, str) else None) or _words(value)
+        items = [item for word in words if (item := _item(word)) is not None]
+        if len(items) < len(words) or len(words) != count:
+            wrong = next((word for word in words if _item(word) is None), None)
+            why = f"{len(words)} for {count} bands" if wrong is None else f"{str(wrong)!r} is no number"
+            notes.append(f"{key} is left out: {why}")
             continue
-        parts = re.findall(r"[^,;\s]+", _BRACKET.sub(" ", str(value))) if words is None else words
-        wrong = next((word for word in parts if _or_missing(word) and _item(word) is None), None)
-        why = f"{len(parts)} for {count} bands" if wrong is None else f"{wrong!r} is no number"
-        notes.append(f"{name} is left out: {why}")
-    fullest = min(found, key=lambda items: sum(np.isnan(number) for number, _ in items), default=None)
-    return fullest, tuple(notes)
+        units = [str(own or known[1] or of_band) for (_, own), of_band in zip(items, said, strict=False)]
+        numbers = np.array([number for number, _ in items], np.float64)
+        if len(different := set(filter(None, units))) > 1:
+            numbers, different = numbers * [scale_nm(unit) or np.nan for unit in units], {"nm"}
+        yield key, numbers, "".join(different)
+
+
+def _before_unit(key: str) -> str:
+    """Return the name of the list that a key such as ``wavelengthunits`` belongs to; "" for other keys."""
+    found = re.fullmatch("(.+?)units?", key)
+    return "" if found is None else found[1]
 
 
 def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[str] = ()) -> Bands:
@@ -340,7 +314,7 @@ def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[st
         centres, widths = np.array([one[0] if one else (np.nan, np.nan) for one in found]).T
         return bands_of_numbers(centres, "nm", origin, None if np.isnan(widths).all() else widths)
     plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
-    numbers = np.array([_to_number(one[1]) if one else np.nan for one in plain])
+    numbers = np.array([np.nan if one is None else _to_number(one[1]) for one in plain])
     if are_wavelengths(numbers):
         return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
     return _bands_of_colours(names, texts, where, colours)
@@ -361,19 +335,15 @@ def _without_number(name: str | None, place: int) -> str:
 def _lengths(text: str) -> list[tuple[float, float]]:
     """Return centre and width [nm] (NaN: none) of each different length in a name; two if the only one is doubtful."""
     found: list[tuple[float, float]] = []
-    for span in _SPAN.finditer(text):
-        low, high = (_to_number(number) * (scale_nm(unit) or 1.0) for number, unit in _ends(span))
+    for first, unit, second, last in _SPAN.findall(text):
+        low, high = _to_number(first) * (scale_nm(unit or last) or 1), _to_number(second) * (scale_nm(last) or 1)
         plausible = RANGE_NM[0] <= low < high <= THERMAL_NM
         found += [((low + high) / 2, high - low)] if plausible else [(low, np.nan), (high, np.nan)]
-    for one in _LENGTH.finditer(_SPAN.sub(" ", text)):
-        centre = _to_number(one[1]) * (scale_nm(one[2]) or 1.0)
+    for number, unit in _LENGTH.findall(_SPAN.sub(" ", text)):
+        centre = _to_number(number) * (scale_nm(unit) or 1)
         if not any(abs(centre - known) <= 1e-3 * known for known, _ in found):
             found.append((centre, np.nan))
     return found * 2 if len(found) == 1 and _DOUBTFUL.search(text) else found
-
-
-def _ends(span: re.Match[str]) -> tuple[tuple[str, str], tuple[str, str]]:
-    return (span[1], span[2] or span[4]), (span[3], span[4])
 
 
 def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
@@ -418,31 +388,21 @@ def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: 
     return Bands(np.array(centres), None, origin, notes if others else ())
 
 
-def bad_bands(flags: object, count: int, name: str = "bbl") -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the bands (from 0) that ``count`` flags mark by 0; other flags mark none, with a note."""
-    values = np.asarray([] if flags is None else flags, np.float64).ravel()
-    if len(values) not in (0, count):
-        return (), (f"{name} is left out: {len(values)} flags for {count} bands",)
-    return tuple(np.flatnonzero(values == 0).tolist()), ()
-
-
-def bad_bands_of_texts(
-    fields: Mapping[str, str | Sequence[str]], count: int
-) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the bands (from 0) that a file's fields mark as bad, such as ``bbl``, and notes.
 
-    A field is a list in one text, or one text a band, "" where a band has none.
+    A field is a list in one text, or has one text or number a band, "" where a band has none.
     """
     bad: set[int] = set()
     notes: list[str] = []
     for name, value in fields.items():
         key = letters(name)
         if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
-            words = re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value)) if isinstance(value, str) else value
-            flags = np.array([_TRUTH.get(_plain_text(word), _to_number(str(word))) for word in words])
-            marked, doubts = bad_bands(flags if key in GOOD_BANDS else ~(flags > 0), count, name)
-            bad |= set(marked)
-            notes += doubts
+            flags = [_TRUTH.get(_plain_text(word), _to_number(word)) for word in _words(value)]
+            if len(flags) == count:
+                bad |= {band for band, flag in enumerate(flags) if (flag == 0 if key in GOOD_BANDS else flag > 0)}
+            else:
+                notes.append(f"{name} is left out: {len(flags)} flags for {count} bands")
         elif re.fullmatch("badbands?(?:list|multiplier)?s?", key):
             notes.append(f"{name} is not read: 1 may mean good or bad there; name the good bands in a scene.toml")
     return tuple(sorted(bad)), tuple(notes)

@@ -29,7 +29,7 @@ from zarr.storage import WrapperStore
 
 from spectralzoom.pipeline.errors import SceneError
 
-_ZSTD, _ZSTD_SKIPPED = 0xFD2FB528, 0x184D2A50  # with which frames begin
+_ZSTD = 0xFD2FB528  # with which frames begin
 _NAME = "spectralzoom.checked"  # of the codec that stands for a packer in metadata
 SPARE_BYTES = 1024  # of checksums within a chunk
 HARMLESS_BYTES = 128 << 10  # of a deflated chunk, which makes 135 MB of them at most
@@ -57,40 +57,23 @@ def unpack(packer: str, data: Any, size: int) -> bytes:
         with gzip.open(io.BytesIO(packed)) if packer == "gzip" else bz2.open(io.BytesIO(packed)) as file:
             plain = file.read(most + 1)
     else:
-        stated = zstd_size(packed) if packer == "zstd" else _number(packed[4:8] if packer == "blosc" else packed[:4])
-        if stated is None or stated <= most:  # numcodecs fills all of an array, or gives as many bytes as are stated
-            whole = np.empty(size, np.uint8) if stated is None else None
+        stated = _zstd_size(packed) if packer == "zstd" else _number(packed[4:8] if packer == "blosc" else packed[:4])
+        if stated is None or stated <= most:  # numcodecs fills all of an array, and refuses frames beyond it
+            whole = np.empty(size if stated is None else stated, np.uint8)
             return bytes(numcodecs.get_codec({"id": packer}).decode(packed, whole))
     if plain is None or len(plain) > most:
         raise ValueError(f"a chunk packed by {packer} unpacks to more than the {size} bytes that its header declares")
     return bytes(plain)
 
 
-def zstd_size(data: memoryview) -> int | None:
-    """Return how many bytes all frames of a chunk hold by their headers; None if one does not say it."""
-    total = at = 0
-    while at < len(data):
-        magic = _number(data[at : at + 4])
-        if magic & ~15 == _ZSTD_SKIPPED:
-            at += 8 + _number(data[at + 4 : at + 8])
-            continue
-        if magic != _ZSTD or at + 4 == len(data):
-            raise ValueError("a chunk packed by zstd is damaged")
-        flags = data[at + 4]
-        single = flags >> 5 & 1
-        width = (single, 2, 4, 8)[flags >> 6]
-        if not width:
-            return None
-        at += 6 - single + (0, 1, 2, 4)[flags & 3]
-        total += _number(data[at : at + width]) + 256 * (width == 2)
-        at += width
-        last = 0
-        while not last and at < len(data):
-            block = _number(data[at : at + 3])
-            last = block & 1
-            at += 3 + (1 if block >> 1 & 3 == 1 else block >> 3)
-        at += 4 * (flags >> 2 & 1)
-    return total
+def _zstd_size(data: memoryview) -> int | None:
+    """Return how many bytes the first frame of a chunk holds by its header; None if that does not say it."""
+    if len(data) < 5 or _number(data[:4]) != _ZSTD:
+        raise ValueError("a chunk packed by zstd is damaged")
+    single = data[4] >> 5 & 1
+    width = (single, 2, 4, 8)[data[4] >> 6]
+    at = 6 - single + (0, 1, 2, 4)[data[4] & 3]
+    return _number(data[at : at + width]) + 256 * (width == 2) if width else None
 
 
 def _number(data: memoryview) -> int:
@@ -192,50 +175,27 @@ _DEFLATE, _SHUFFLE, _FLETCHER32, _LZF = 1, 2, 3, 32000  # filters of HDF5
 def read_hdf5(dataset: h5py.Dataset, part: Any) -> NDArray[Any]:
     """Return a part of an HDF5 array: ``...``, or one slice without a step for each axis.
 
-    Deflated chunks are decoded here; HDF5's own decoder knows no limit. Raises SceneError: a filter is not allowed;
+    Large deflated chunks are checked first; HDF5's decoder knows no limit. Raises SceneError: a filter is not allowed;
     ValueError: a chunk holds more than its array declares, or is damaged.
     """
     plist = dataset.id.get_create_plist()
-    filters = [(found[0], found[2]) for found in map(plist.get_filter, range(plist.get_nfilters()))]
-    codes = [code for code, _ in filters]
+    codes = [plist.get_filter(number)[0] for number in range(plist.get_nfilters())]
     allowed = [_SHUFFLE, _FLETCHER32, _DEFLATE if _DEFLATE in codes else _LZF]  # each once
     if any(code not in allowed or codes.count(code) > 1 for code in codes):
         raise SceneError(
             f"{dataset.file.filename}:{dataset.name} is packed by the HDF5 filters {codes}, of which one of deflate "
             "and lzf, shuffle and fletcher32 are read, each once; write it with deflate (h5repack -f GZIP=4)"
         )
-    stored: dict[tuple[int, ...], int] = {}
+    large: set[tuple[int, ...]] = set()
     if _DEFLATE in codes:
-        dataset.id.chunk_iter(lambda one: stored.update({one.chunk_offset: one.size}))
-    if max(stored.values(), default=0) <= HARMLESS_BYTES:
-        return np.asarray(dataset[part])
-    part = (slice(None),) * dataset.ndim if part is ... else part
-    ends = [one.indices(size) for one, size in zip(part, dataset.shape, strict=True)]
-    start = [first for first, _, _ in ends]
-    out = np.full([max(stop - first, 0) for first, stop, _ in ends], dataset.fillvalue, dataset.dtype)
-    for inside in dataset.iter_chunks(tuple(slice(*one) for one in ends)) if out.size else ():
-        origin = tuple(one.start // chunk * chunk for one, chunk in zip(inside, dataset.chunks, strict=True))
-        if not stored.get(origin):
-            continue  # never written
-        mask, data = dataset.id.read_direct_chunk(origin)
-        chunk = _unfiltered(data, [one for number, one in enumerate(filters) if not mask >> number & 1], dataset)
-        here = tuple(slice(one.start - a, one.stop - a) for one, a in zip(inside, start, strict=True))
-        there = tuple(slice(one.start - a, one.stop - a) for one, a in zip(inside, origin, strict=True))
-        out[here] = chunk[there]
-    return out
-
-
-def _unfiltered(data: bytes, filters: list[tuple[int, tuple[int, ...]]], dataset: h5py.Dataset) -> NDArray[Any]:
-    """Return the numbers of one chunk, of which ``filters`` (code, values) were applied in their order."""
-    size = math.prod(dataset.chunks) * dataset.dtype.itemsize
-    for code, values in reversed(filters):
-        if code == _DEFLATE:
-            data = unpack("zlib", data, size)
-        elif code == _FLETCHER32:
-            data = numcodecs.Fletcher32().decode(data)
-        else:
-            data = numcodecs.Shuffle(values[0]).decode(data)
-    return np.frombuffer(data, dataset.dtype).reshape(dataset.chunks)
+        dataset.id.chunk_iter(lambda one: large.add(one.chunk_offset) if one.size > HARMLESS_BYTES else None)
+    for origin in large:
+        parts = zip((slice(None),) * dataset.ndim if part is ... else part, origin, dataset.chunks, strict=True)
+        wanted = all((one.start or 0) < at + size and (one.stop is None or one.stop > at) for one, at, size in parts)
+        mask, data = dataset.id.read_direct_chunk(origin) if wanted else (-1, b"")
+        if not mask >> codes.index(_DEFLATE) & 1:
+            unpack("zlib", data, math.prod(dataset.chunks) * dataset.dtype.itemsize)
+    return np.asarray(dataset[part])
 
 
 def outside_links(file: h5py.File) -> list[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -82,7 +82,6 @@ DIMS = ("y", "x", "band")
 MOST_MISSING = 1 << 14  # lines that a cube may claim beyond those in its file
 
 ReadLines = Callable[[int, int], NDArray[Any]]
-Guard = Callable[[], AbstractContextManager[None]]  # turns errors of reading into SceneError
 
 
 @dataclass(frozen=True)
@@ -161,15 +160,13 @@ class _Lines(BackendArray):
 
     def _part(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
         """Return a part by whole numbers and slices."""
-        numbers = range(self.shape[0])[key[0]]
-        if isinstance(numbers, int):
-            return self.source.read(numbers, numbers + 1)[(0, *key[1:])]
-        if not numbers:
+        numbers = np.arange(self.shape[0])[key[0]]
+        if not numbers.size:
             return np.empty((0, *self.shape[1:]), self.dtype)[(slice(None), *key[1:])]
-        first = min(numbers)
-        block: NDArray[Any] = self.source.read(first, max(numbers) + 1)
-        part: NDArray[Any] = block[np.array(numbers) - first][(slice(None), *key[1:])]
-        return part
+        first = int(numbers.min())
+        block: NDArray[Any] = self.source.read(first, int(numbers.max()) + 1)
+        part: NDArray[Any] = block[numbers - first]
+        return part[(..., *key[1:])]
 
 
 def check_cube_source(source: CubeSource) -> None:

@@ -9,18 +9,20 @@ from __future__ import annotations
 import importlib
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import Bands, bad_bands_of_texts, bands_of_texts, split_list
+from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -32,7 +34,6 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
-from spectralzoom.storage.readers.orientation import orientation_of, upright
 from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 from spectralzoom.storage.readers.places import place_of_file
 
@@ -69,21 +70,28 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             )
         block = max(file.block_shapes)
         item = max(np.dtype(one).itemsize for one in file.dtypes)
-        claimed = (file.height, file.width, file.count)
-        _check_size(path, driver, claimed, item, math.prod(block) * file.count)
+        claimed = file.height * file.width * file.count * item
+        if driver != "JPEG":  # its blocks may have no byte each
+            check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
+        at_a_time = math.prod(block) * file.count * item + claimed // file.height * BLOCK_LINES
+        check_memory(path, at_a_time if driver in _CALLED else claimed * 3)
         kinds = [kind.name for kind in file.colorinterp]
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
-        of_all = _bands_of(file, range(file.count), kinds, path).wavelength_nm
+        of_all = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
         if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
             alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
-        kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
+        void = _void(file, alpha)
+        masked = void if scaled and void is not None and not void.all() else None
+        kinds_of_kept = (np.dtype(file.dtypes[band]) for band in keep or [0])
+        kind = np.dtype(np.float32) if masked is not None else np.result_type(*kinds_of_kept)
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
-        known = _bands_of(file, keep, kinds, path)
-        bad, doubts = bad_bands_of_texts(_tags_of(file, keep), len(keep))
+        tags, (names, colours) = _tags_of(file, keep), ([one[at] for at in keep] for one in (file.descriptions, kinds))
+        known = bands_of_fields(tags, names, str(path), colours)
+        bad, doubts = bad_bands(tags, len(keep))
         acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
         notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
@@ -93,7 +101,10 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             """Return some rows, (y, x, band) (SceneError: they are damaged)."""
             with _opened(path) as opened:
                 planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
-            return np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+            lines = np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+            if masked is not None:
+                lines[masked[first:last]] = np.nan
+            return lines
 
         source = CubeSource(
             name=path.name,
@@ -105,22 +116,12 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
             bad_bands=bad,
-            void=_void(file, alpha),
+            void=void,
             acquired=acquired.text,
             notes=tuple(notes),
         )
-    read = source.read
-    void = source.void
-    if scaled and void is not None and not void.all():
-        source = replace(
-            source,
-            dtype=np.dtype(np.float32),
-            read=lambda first, last: np.where(
-                void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
-            ),
-        )
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return upright(source if plain else rescaled(source, scale, offset), orientation_of(path))
+    return _upright(source if plain else rescaled(source, scale, offset), _orientation_of(path))
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
@@ -154,14 +155,6 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
 
 
-def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
-    """Refuse more than the file's bytes or the memory can hold (SceneError)."""
-    claimed = math.prod(shape) * item
-    if driver != "JPEG":  # its blocks may have no byte each
-        check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
-    check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
-
-
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
     """Return (y, x) pixels that are transparent or masked; None without a mask."""
     kinds = importlib.import_module("rasterio").enums.MaskFlags
@@ -188,7 +181,54 @@ def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
     return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
 
 
-def _bands_of(file: Any, bands: Sequence[int], kinds: Sequence[str], path: Path) -> Bands:
-    """Return wavelengths and widths of some bands (from 0) of an open file by its tags, band names or colours."""
-    names, colours = ([of_file[band] for band in bands] for of_file in (file.descriptions, kinds))
-    return bands_of_texts(_tags_of(file, bands), names, str(path), colours)
+_ORIENTATION = 274  # tag of Exif 2.32
+_TURNS: Mapping[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: np.swapaxes(image, 0, 1),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: np.swapaxes(image[::-1, ::-1], 0, 1),
+    8: lambda image: np.rot90(image),
+}
+
+
+def _orientation_of(path: Path) -> int:
+    """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP; 1 (upright) without a valid one."""
+    try:
+        if path.suffix.lower() in (".tif", ".tiff"):  # of any number of bands, which Pillow does not open
+            with tifffile.TiffFile(path) as file:
+                tag = file.pages.first.tags.get(_ORIENTATION)
+                found = 1 if tag is None else tag.value
+        else:
+            with warnings.catch_warnings(), Image.open(path) as image:
+                warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
+                found = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # of a kind without such tags; a damaged file is refused where it is read
+        return 1
+    return int(found) if found in _TURNS else 1
+
+
+def _upright(source: CubeSource, tag: int) -> CubeSource:
+    """Return an image as its orientation tag says, with a note; one with a place on the earth stays as it is."""
+    if tag == 1:
+        return source
+    if source.geobox is not None:
+        left = f"its orientation tag {tag} is not applied, since the file says where its pixels lie on the earth"
+        return replace(source, notes=(*source.notes, left))
+    turn = _TURNS[tag]
+    height, width, bands = source.shape
+    shape = (width, height, bands) if tag >= 5 else source.shape
+    check_memory(source.name, 2 * height * width * bands * source.dtype.itemsize)
+
+    def read_all(_first: int, _last: int) -> NDArray[Any]:
+        return np.ascontiguousarray(turn(source.read(0, height)))
+
+    return replace(
+        source,
+        shape=shape,
+        read=read_by_chunks(read_all, shape[0], shape[0]),
+        void=None if source.void is None else turn(source.void),
+        scaling=f"{source.scaling} orientation {tag}".strip(),
+        notes=(*source.notes, f"the picture is turned upright, as its orientation tag {tag} says"),
+    )

@@ -57,29 +57,19 @@ class SceneSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     path: Path | None = None
-    # of the file, counted from 0: numbers, or text with ranges such as "0-103,108-148"
-    bands: _Numbers | None = None
-    # of ``bands``, or of all bands of the file
-    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = None
-    # rows of nm and FWHM, of all bands of the file and the dropped ones
-    wavelengths_file: StrictStr | None = None
-    # rows of wavelengths_file that the file lacks, counted from 1: written as bands
-    dropped_bands: _Numbers = ()
+    bands: _Numbers | None = None  # of the file, from 0: numbers, or text with ranges such as "0-103,108-148"
+    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = None  # of ``bands``, or of all bands
+    wavelengths_file: StrictStr | None = None  # rows of nm and FWHM, of all bands of the file and the dropped ones
+    dropped_bands: _Numbers = ()  # rows of wavelengths_file that the file lacks, counted from 1: written as bands
     nodata: Annotated[float, Field(strict=True)] | None = None
-    # values = file's * scale + offset
-    scale: _Positive = 1.0
+    scale: _Positive = 1.0  # values = file's * scale + offset
     offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
-    # side of a pixel on the ground
-    pixel_m: _Positive | None = None
-    # relative to scene.toml, with {number} or {name}; "" if there are none
-    labels: StrictStr | None = None
+    pixel_m: _Positive | None = None  # side of a pixel on the ground
+    labels: StrictStr | None = None  # relative to scene.toml, with {number} or {name}; "" if there are none
     unlabelled: _Value | None = None
-    # attribute of polygons with their class
-    class_attribute: StrictStr | None = None
-    # number or colour of each
-    classes: dict[str, _Value] = {}
-    # of classes on maps
-    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}
+    class_attribute: StrictStr | None = None  # of polygons, with their class
+    classes: dict[str, _Value] = {}  # number or colour of each
+    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}  # of classes on maps
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -182,13 +172,8 @@ def settle_wavelengths(
         fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
-        return _from_file(
-            stated_file(settings.path.parent, settings.wavelengths_file, f"{settings.path}: wavelengths_file"),
-            settings.dropped_bands,
-            chosen,
-            file_bands,
-            path,
-        )
+        table = stated_file(settings.path.parent, settings.wavelengths_file, f"{settings.path}: wavelengths_file")
+        return _from_file(table, settings.dropped_bands, chosen, file_bands, path)
     advice = f"write wavelengths_nm or wavelengths_file into a {SETTINGS_NAME} beside it, or give survey --wavelengths"
     if known.wavelength_nm is None:
         why = why_unknown(known)
@@ -226,8 +211,7 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     if len(kept) != file_bands:
         raise WavelengthError(
             f"{path} has {len(table)} rows, {len(set(dropped))} of them dropped, which leaves {len(kept)} wavelengths "
-            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml, or "
-            "give the file of the scene if that is another one"
+            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml"
         )
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
@@ -243,8 +227,7 @@ def _table(path: Path) -> NDArray[np.float64]:
         raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
     rows: list[list[float]] = []
     for line in lines:
-        cells = re.split(r"[;\t]" if re.search(r"[;\t]", line) else r"\s+", line.strip())
-        commas = len(cells) > 1 and all(re.fullmatch(r"\s*\d+,\d+\s*", cell) for cell in cells[:2])  # 450,5 10,2
+        commas = re.match(r"\s*\d+,\d+(\s*[;\t]\s*\d+(,\d+)?|\s+\d+,\d+)\b", line)  # 450,5 10,2
         fields = re.sub("[,;]", " ", line.replace(",", ".") if commas else line).split()[:2]
         for count in range(len(fields), 0, -1):
             with suppress(ValueError):

@@ -147,7 +147,7 @@ WORKS = {  # address, wavelengths, shape (y, x, band), and the expected note
         "with_nm.mat",
         None,
         (12, 16, 5),
-        "no unit, read as micrometres by their size; wavelengths from the array wavelengths",
+        "no unit, read as micrometres by their size; wavelengths from the list wavelengths",
     ),
     "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
     "Zarr v2 of another tool": ("old.zarr", NM, (12, 16, 5), "dims have no names"),

@@ -24,10 +24,9 @@ from spectralzoom.pipeline.setting_fields import numbers_of
 from spectralzoom.storage.readers.band_facts import (
     Bands,
     bad_bands,
-    bad_bands_of_texts,
+    bands_of_fields,
     bands_of_names,
     bands_of_numbers,
-    bands_of_texts,
     bands_text,
     numbers_of_list,
 )
@@ -204,7 +203,7 @@ def test_lists_are_split_in_one_way(text: str, count: int, found: list[float] | 
 )
 def test_fields_have_several_names(fields: dict[str, Any]) -> None:
     """Singular and plural, both spellings, a unit in the name, beside it or behind each number."""
-    bands = bands_of_texts(fields, ["", ""], "a.hdr")
+    bands = bands_of_fields(fields, ["", ""], "a.hdr")
     assert centres(bands) == pytest.approx([450, 550])
     assert (bands.fwhm_nm is not None) == ("fwhm" in fields)
 
@@ -227,12 +226,8 @@ def say_in_names(file: Any) -> None:
     file.descriptions = [f"Band {number} ({centre} Nanometers)" for number, centre in enumerate(NM)]
 
 
-def say_with_commas(file: Any) -> None:
-    file.update_tags(Wavelengths="; ".join(str(10 * nm).replace(".", ",") for nm in NM), wavelength_units="Angstroms")
-
-
 @pytest.mark.parametrize("photometric", ["MINISBLACK", None])
-@pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names, say_with_commas])
+@pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names])
 def test_a_geotiff_states_wavelengths_in_several_ways(tmp_path: Path, say: Any, photometric: str | None) -> None:
     """A fourth band of bytes, which GDAL calls alpha by itself, is a band if it has a wavelength."""
     with write(tmp_path / "a.tif", photometric=photometric) as file:
@@ -282,8 +277,10 @@ def test_bands_marked_as_bad_are_left_out(tmp_path: Path, of_file: dict[str, str
 @given(st.lists(st.booleans(), min_size=1, max_size=40))
 def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
     """The zeros of a list are the bad bands, and their text is read as the same bands, also in scene.toml."""
-    bad, _ = bad_bands_of_texts({"bbl": ", ".join(str(int(one)) for one in good)}, len(good))
-    assert list(bad) == [band for band, one in enumerate(good) if not one] == list(bad_bands(good, len(good))[0])
+    bad, _ = bad_bands({"bbl": ", ".join(str(int(one)) for one in good)}, len(good))
+    assert (
+        list(bad) == [band for band, one in enumerate(good) if not one] == list(bad_bands({"bbl": good}, len(good))[0])
+    )
     if bad:
         assert [int(str(one)) for part in bands_text(bad).split(",") for one in numbers_of(part)] == list(bad)
         assert SceneSettings.model_validate({"bands": bands_text(bad)}).bands == bad
@@ -291,26 +288,8 @@ def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
 
 def test_marks_that_do_not_fit_are_noted() -> None:
     """A list of another length marks no band, and flags whose meaning is not known are not read."""
-    assert bad_bands_of_texts({"bbl": "1, 0"}, 3) == ((), ("bbl is left out: 2 flags for 3 bands",))
-    assert "1 may mean good or bad" in bad_bands_of_texts({"bad bands": "1, 0"}, 2)[1][0]
-
-
-ENVI = {
-    "wavelengths of another name": ({"wavelengths": "{0.45, 0.55}"}, [450, 550]),
-    "Angstrom": ({"wavelength": "{4500, 5500}", "wavelength_units": "Angstroms"}, [450, 550]),
-    "band names": ({"band_names": "{Blue: 430 - 470 nm, 550,0 nm}"}, [450, 550]),
-    "one is missing": ({"wavelength": "{450, }"}, [450]),
-}
-
-
-@pytest.mark.parametrize("case", ENVI)
-def test_envi_wavelengths_are_read_where_they_are_certain(tmp_path: Path, case: str) -> None:
-    """A band without a wavelength among others is left out, with a note."""
-    fields, nm = ENVI[case]
-    path = write_envi(tmp_path / "a.img", VALUES[:2].transpose(1, 2, 0).copy(), **fields)
-    scene = load_scene_file(path)
-    assert scene.wavelength_nm.tolist() == pytest.approx(nm)
-    assert any("gives no wavelength of bands 1" in note for note in scene.provenance) == (case == "one is missing")
+    assert bad_bands({"bbl": "1, 0"}, 3) == ((), ("bbl is left out: 2 flags for 3 bands",))
+    assert "1 may mean good or bad" in bad_bands({"bad bands": "1, 0"}, 2)[1][0]
 
 
 def test_wavelengths_and_bad_bands_are_those_of_spy(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def test_xarray_dataset_is_read(tmp_path: Path, cube: NDArray[np.uint16], dims: 
     scene = load_scene_file(path)
     np.testing.assert_array_equal(scene.values, cube)
     np.testing.assert_array_equal(scene.wavelength_nm, NM)
-    assert "wavelengths from the array wavelength" in scene.provenance
+    assert any("wavelengths from the list wavelength" in one for one in scene.provenance)
 
 
 def test_zarr_arrays_without_dims_are_read(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
