@@ -12,10 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
@@ -35,6 +34,9 @@ from spectralzoom.storage.readers.band_facts import (
 )
 from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, DIMS, CubeSource, LineFacts, read_by_chunks, reading
 from spectralzoom.storage.readers.places import Place, place_of_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _ALONG = ("downtrack", "along_track", "number_of_lines")
 _ACROSS = ("crosstrack", "across_track", "pixels_per_line")
@@ -117,6 +119,8 @@ def _time_of(near: Arrays) -> dict[str, Any]:
     if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
         return {}
     about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
+    import xarray as xr  # takes a second
+
     time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
     return {"time": xr.decode_cf(time)["time"].values}
 
@@ -172,6 +176,8 @@ def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | 
 
 def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
     """Return numbers of a file as values, decoded by xarray."""
+    import xarray as xr
+
     packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
     return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
 
@@ -195,6 +201,8 @@ def _place_of(
 ) -> Place:
     """Return the place of a cube by the arrays beside it, of which only coordinates along its axes are read."""
     sizes = dict(zip(dims, arrays[name].shape, strict=True))
+    import xarray as xr
+
     read: dict[str, xr.Variable] = {}
     named: dict[str, xr.Variable] = {}
     for key, one in arrays.items():

@@ -19,11 +19,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-import xarray as xr
 import zarr
 from numpy.typing import NDArray
 from zarr.storage import LocalStore
@@ -32,6 +31,9 @@ from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.checked_chunks import WIDEST, CheckedStore, outside_links, read_hdf5, unpack
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
 from spectralzoom.storage.readers.own_files import within
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 ARRAY_ENDINGS = (".npy", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
@@ -231,6 +233,8 @@ def as_pictures(arrays: dict[str, FileArray]) -> dict[str, FileArray]:
 
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     """List the arrays of a NetCDF file of version 3."""
+    import xarray as xr
+
     opened = partial(xr.open_dataset, path, engine="scipy", decode_cf=False, cache=False)
 
     def read(name: str, part: Any) -> NDArray[Any]:

@@ -15,12 +15,8 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-import odc.geo.xr as odc_xr
-import xarray as xr
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from xarray.backends import BackendArray
-from xarray.core import indexing
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken
@@ -120,53 +116,6 @@ class CubeSource:
     def valid(self) -> NDArray[np.bool_]:
         """Return (line,) whether each line is whole in its file."""
         return np.ones(self.shape[0], np.bool_) if self.lines.valid is None else self.lines.valid
-
-    def data_array(self) -> xr.DataArray:
-        """Return the cube for xarray; values are read when they are needed."""
-        marked = np.isin(np.arange(self.shape[2]), self.bad_bands)
-        facts: dict[str, tuple[str | tuple[str, ...], Any, dict[str, str]]] = {
-            "wavelength": ("band", self.bands.wavelength_nm, {"units": "nm"}),
-            "fwhm": ("band", self.bands.fwhm_nm, {"units": "nm"}),
-            "bad_band": ("band", marked if marked.any() else None, {}),
-            "valid": ("y", self.lines.valid, {}),
-            "time_s": ("y", self.lines.time_s, {"units": "s"}),
-            "exposure_ms": ("y", self.lines.exposure_ms, {"units": "ms"}),
-            "dark": (("x", "band"), self.dark, {}),
-            "white": (("x", "band"), self.white, {}),
-            "void": (("y", "x"), self.void, {}),
-        }
-        known = {name: fact for name, fact in facts.items() if fact[1] is not None}
-        places = {} if self.geobox is None else odc_xr.xr_coords(self.geobox, dims=("y", "x"))
-        about: dict[str, Any] = {
-            "notes": self.notes,
-            "files": tuple(map(str, self.files)),
-            "wavelengths_from": self.bands.origin,
-        }
-        about |= {} if self.nodata is None else {"_FillValue": self.nodata}
-        about |= {} if self.acquired is None else {"acquired": self.acquired}
-        lines = indexing.LazilyIndexedArray(_Lines(self))
-        return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=self.name, attrs=about)
-
-
-class _Lines(BackendArray):
-    """Lines of a cube as xarray asks for them."""
-
-    def __init__(self, source: CubeSource) -> None:
-        self.source, self.shape, self.dtype = source, source.shape, source.dtype
-
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
-        basic = indexing.IndexingSupport.BASIC
-        return indexing.explicit_indexing_adapter(key, self.shape, basic, self._part)  # type: ignore[no-any-return]
-
-    def _part(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
-        """Return a part by whole numbers and slices."""
-        numbers = np.arange(self.shape[0])[key[0]]
-        if not numbers.size:
-            return np.empty((0, *self.shape[1:]), self.dtype)[(slice(None), *key[1:])]
-        first = int(numbers.min())
-        block: NDArray[Any] = self.source.read(first, int(numbers.max()) + 1)
-        part: NDArray[Any] = block[numbers - first]
-        return part[(..., *key[1:])]
 
 
 def check_cube_source(source: CubeSource) -> None:

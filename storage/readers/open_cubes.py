@@ -6,10 +6,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
@@ -22,6 +21,9 @@ from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_sour
 from spectralzoom.storage.readers.frames import find_reference, load_frame, taken_of
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
 _WITH_VARIABLE = re.compile(
@@ -67,7 +69,9 @@ def open_cube(address: str | Path) -> xr.DataArray:
     is no such file, it is damaged, or its kind or shape cannot be used.
     """
     source = open_cube_source(address)
-    return with_wavelengths(source, address, None).data_array()
+    from spectralzoom.storage.readers.data_arrays import data_array
+
+    return data_array(with_wavelengths(source, address, None))
 
 
 def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource:

@@ -13,12 +13,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import odc.geo.crs as odc_crs
 import odc.geo.geobox as odc_geobox
-import xarray as xr
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
@@ -30,6 +29,9 @@ from pyproj.exceptions import ProjError
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
 from spectralzoom.storage.readers.own_files import check_sidecars
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Place = tuple[GeoBox | None, tuple[str, ...]]
 
