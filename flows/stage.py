@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Annotated, Any, Concatenate, Generic, Literal, ParamSpec, TypeVar, get_args, get_type_hints
 
 from spectralzoom.pipeline.errors import PipelineError
-from spectralzoom.storage.store import Archive, Ref
+from spectralzoom.storage.store import Archive, Ref, is_cleared, listed_bytes, read_manifest, stage_key
 from spectralzoom.storage.whole_files import bytes_in
 
 T = TypeVar("T")
@@ -190,7 +190,7 @@ class Stores:
         made = request.stage
         if not all(ref.key for ref in request.inputs):
             return self._make(request, Ref(made.product, "", Path()))
-        key = self.archive.key(made.product, made.version, request.params, request.inputs)
+        key = stage_key(made.product, made.version, request.params, request.inputs)
         ref = self.archive.ref(made.product, key)
         try:
             found = self.archive.find(ref.stage, ref.key) is not None
@@ -198,7 +198,7 @@ class Stores:
             if not self.dry:
                 raise
             return self._record(replace(self._row(request, replace(ref, key="")), state="blocked", why=str(error)))
-        if not found and self.archive.is_known(ref):
+        if not found and is_cleared(ref.path):
             self._cleared[ref] = partial(self._make, request, ref)
             found = True
         return self._record(self._row(request, ref)) if found else self._make(request, ref)
@@ -252,7 +252,7 @@ class Stores:
         row = Row(made.name, made.title, ref, "cached", version=made.version, params=request.params)
         if self.dry:
             return row
-        sizes = [self.archive.stored_bytes(one) for one in (*request.inputs, ref)]
+        sizes = [listed_bytes(read_manifest(one.path)) for one in (*request.inputs, ref)]
         return replace(row, bytes_in=sum(sizes[:-1]), bytes_out=sizes[-1])
 
     def _record(self, row: Row) -> Ref:

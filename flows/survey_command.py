@@ -31,7 +31,7 @@ from spectralzoom.flows.tasks.observer import Observer, observed_by
 from spectralzoom.flows.terminal.progress import StageProgress
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import refusals, remove, take_lock
+from spectralzoom.storage.whole_files import locked, remove
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -90,17 +90,12 @@ def _prefect_server(out: str) -> Iterator[None]:
         return
     root = Archive.open(out).root
     home = root / ".prefect"
-    with refusals(root, "lock", every=True):
-        release = take_lock(root / ".locks" / "prefect.lock", wait=False)
-    if release is None:
-        home = root / f".prefect-{os.getpid()}"
-        atexit.register(remove, home)
-    try:
+    with locked(root / ".locks" / "prefect.lock", wait=False) as is_held:
+        if not is_held:
+            home = root / f".prefect-{os.getpid()}"
+            atexit.register(remove, home)
         with quiet_environment(home), local_server(home):
             yield
-    finally:
-        if release is not None:
-            release()
 
 
 def show_published(published: Published, out: str, console: Console, *, verbose: bool = False) -> None:

@@ -11,13 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 
-NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}
-MICROMETRES = {"um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "micrometre", "micrometres"}
-UNSAID = {"", "unknown"}
 INTERLEAVES = ("bil", "bip", "bsq")
 # data type codes of the format's description
 DATA_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 6: "c8", 9: "c16", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
@@ -71,44 +67,6 @@ def finite_number(text: str) -> float | None:
     return number if np.isfinite(number) else None
 
 
-def wavelengths_nm(
-    fields: Mapping[str, str], channels: int, notes: list[str]
-) -> tuple[NDArray[np.float64] | None, float]:
-    """Return (band,) centres [nm] and the header's unit in nm, with notes on assumptions.
-
-    Without a unit they are read as nm or micrometres by their size. Centres that do not fit the bands are left out.
-    """
-    values = listed_numbers(fields, "wavelength", channels, notes)
-    if values is None:
-        return None, 1.0
-    unit = fields.get("wavelength units", "").strip().lower()
-    if unit in UNSAID and 200 <= values.min() <= values.max() <= 20000:
-        unit = "nm"
-        notes.append("the wavelengths have no unit, read as nm by their size")
-    elif unit in UNSAID and 0.2 <= values.min() <= values.max() <= 20:
-        unit = "micrometres"
-        notes.append("the wavelengths have no unit, read as micrometres by their size")
-    if unit not in NANOMETRES | MICROMETRES:
-        notes.append(f"wavelength units = {unit!r} are no lengths that can be read; the wavelengths are left out")
-        return None, 1.0
-    scale = 1.0 if unit in NANOMETRES else 1000.0
-    return values * scale, scale
-
-
-def listed_numbers(fields: Mapping[str, str], key: str, count: int, notes: list[str]) -> NDArray[np.float64] | None:
-    """Return the numbers of a list separated by commas or spaces; None with a note where it is none."""
-    if key not in fields:
-        return None
-    words = [word for word in re.split(r"[,\s]+", fields[key]) if word]
-    numbers = [finite_number(word) for word in words]
-    if len(words) != count or None in numbers:
-        wrong = next((word for word, number in zip(words, numbers, strict=True) if number is None), None)
-        why = f"{len(words)} for {count} bands" if wrong is None else f"{wrong!r} is no number"
-        notes.append(f"{key} is left out: {why}")
-        return None
-    return np.array(numbers, np.float64)
-
-
 @dataclass(frozen=True)
 class EnviHeader:
     """The content of one header; missing fields are None."""
@@ -120,8 +78,6 @@ class EnviHeader:
     interleave: str  # bil, bip or bsq
     offset: int  # bytes before the numbers
     kind: str  # file type, such as ENVI Standard or ENVI Spectral Library
-    wavelength_nm: NDArray[np.float64] | None  # (band,)
-    fwhm_nm: NDArray[np.float64] | None  # (band,)
     nodata: float | None
     fields: Mapping[str, str]  # all of them, keys in lower case, values without the outer braces
     settings: Mapping[str, str]  # of the lines that begin with ;
@@ -136,9 +92,8 @@ class EnviHeader:
 def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
     """Read a header's text; messages call it ``where``.
 
-    Wavelengths are returned in nm, as :func:`wavelengths_nm` reads them. Raises SceneError: it does not begin with
-    ENVI, a size, type or interleave is missing or impossible, or the file holds more than plain numbers (compressed,
-    bytes between frames).
+    Raises SceneError: it does not begin with ENVI, a size, type or interleave is missing or impossible, or the file
+    holds more than plain numbers (compressed, bytes between frames).
     """
     notes: list[str] = []
     fields, settings = split_header(text, where)
@@ -154,8 +109,6 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
             )
     if any(word in kind.lower() for word in OTHER_FILES):
         raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
-    channels = samples if "spectral library" in kind.lower() else bands
-    wavelength, scale = wavelengths_nm(fields, channels, notes)
     code = _whole(fields, "data type", where, least=1)
     if code not in DATA_TYPES:
         raise SceneError(f"{where}: data type = {code} is none of ENVI's {', '.join(map(str, DATA_TYPES))}; correct it")
@@ -171,7 +124,6 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
     if interleave not in INTERLEAVES:
         says = f"interleave = {interleave!r}" if interleave else "no interleave"
         raise SceneError(f"{where}: {says}, expected one of {', '.join(INTERLEAVES)}; correct it")
-    widths = None if wavelength is None else listed_numbers(fields, "fwhm", channels, notes)
     return EnviHeader(
         samples=samples,
         lines=_whole(fields, "lines", where, least=0) if "lines" in fields else None,
@@ -180,8 +132,6 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
         interleave=interleave,
         offset=_whole(fields, "header offset", where, least=0, otherwise=0),
         kind=kind,
-        wavelength_nm=wavelength,
-        fwhm_nm=None if widths is None or not (widths > 0).all() else widths * scale,
         nodata=finite_number(fields.get("data ignore value", "")),
         fields=fields,
         settings=settings,

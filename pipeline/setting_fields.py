@@ -62,4 +62,4 @@ def misfits(part: Any) -> Iterator[tuple[str, str]]:
 def numbers_of(item: object) -> Sequence[object]:
     """Return the numbers of one item of a list: ``4-7`` means four of them."""
     found = re.fullmatch(r"(\d{1,5})-(\d{1,5})", str(item).strip())
-    return [item] if found is None else range(int(found[1]), int(found[2]) + 1)
+    return [item] if found is None or int(found[1]) > int(found[2]) else range(int(found[1]), int(found[2]) + 1)

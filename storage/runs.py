@@ -22,16 +22,17 @@ from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError
 from spectralzoom.storage.store import (
     CAPTURED,
     LATEST,
-    MANIFEST,
     RESTS_ON,
     Archive,
     ancestors,
     descendants,
     file_problem,
     inputs_first,
+    is_known,
     is_name,
     lies_ahead,
     listed_bytes,
+    manifest_path,
     problems_of,
     try_manifest,
     uri_of,
@@ -229,13 +230,12 @@ def verify_everything(
         done += listed_bytes(manifest)
         with refusals(archive.root, "read the archive", every=True):
             problems = list(problems_of(archive.root / uri, every_byte=True))
-        if (archive.root / uri).exists() or uri in named:  # else gc has removed it since
+        if is_known(archive.root / uri) or uri in named:  # else gc has removed it since
             found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     what = "expected a folder with a manifest; take it out of the archive"
     found += [Finding(one.relative_to(archive.root).as_posix(), what, "stray") for one in archive.strays()]
-    there = known.keys() | archive.replaced()
     for uri, (by, why) in sorted((needed | named).items()):
-        if uri not in there and (archive.root / by).exists():  # else gc has removed both since
+        if uri not in known and is_known(archive.root / by):  # else gc has removed both since
             found.append(Finding(uri, f"is not there, but {by} {why}", "missing"))
     return found
 
@@ -290,8 +290,7 @@ def clear_up(
         gone: list[Removal] = []
         for number, removal in enumerate(plan.removals):
             progress(removal, number / len(plan.removals))
-            drop = archive.drop_leftover if removal.what == "leftover" else archive.discard
-            gone += [removal] if drop(removal.uri) else []  # else another process holds it
+            gone += [removal] if archive.discard(removal.uri) else []  # else another process holds it
         for lock in entries(archive.root / ".locks"):
             if "-" in lock.name:  # of stores and runs, which nothing makes meanwhile
                 lock.unlink(missing_ok=True)
@@ -322,7 +321,7 @@ def _unnamed(archive: Archive, keep_days: float, raw_too: bool) -> Clearance:
         if uri in named or uri.startswith("runs/"):
             continue
         with suppress(FileNotFoundError):  # published or copied here at this time
-            age_s = time.time() - (archive.root / uri / MANIFEST).stat().st_mtime
+            age_s = time.time() - manifest_path(archive.root / uri).stat().st_mtime
             if age_s < keep_days * DAY_S:
                 spared[uri] = f"no run names it, and it is younger than {keep_days:g} days"
             elif not raw_too and is_only_copy(known, uri):
@@ -351,37 +350,27 @@ def _obstacle(uri: str, problem: str | None, is_kept: bool) -> str | None:
     return None
 
 
-def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str) -> bool:
+def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str, seen: tuple[str, ...] = ()) -> bool:
     """Return whether the archive alone cannot make a store again: lines and pixels that were not simulated.
 
-    So is a store that was made of such lines, if they were cleared away or are missing.
+    So is a store that was made of such lines, if they were cleared away or are missing. Of a damaged or missing store
+    the runs that name it say whether its lines were simulated, and which they were.
     """
-    seen, waiting = set[str](), [uri]
-    while waiting:
-        seen.add(one := waiting.pop())
-        is_only, inputs = _origin(known, one)
-        if is_only:
-            return True
-        waiting += [name for name in inputs if name not in seen and (name not in known or known[name]["cleared"])]
-    return False
-
-
-def _origin(known: Mapping[str, Mapping[str, Any]], uri: str) -> tuple[bool, Sequence[str]]:
-    """Return whether a store holds lines or pixels that were not simulated, and its inputs.
-
-    Of a damaged or missing store the runs that name it say whether its lines were simulated, and which they were.
-    """
-    stage = uri.split("/")[1]
-    store = known.get(uri)
-    if store is not None and store["problem"] is None:
-        is_raster = stage == "rectify" and not store["inputs"]
-        return is_raster or (stage == CAPTURED and _source_in(store["params"]) != "sim"), store["inputs"]
+    stage, store = uri.split("/")[1], known.get(uri)
     runs = [one for one in known.values() if uri in one[RESTS_ON] and one["settings"]]
     sources = {one["settings"].get("source") for one in runs}
-    if stage == "rectify" or not LINES.fullmatch(uri):
-        return stage == "rectify" and "raster" in sources, ()
-    raw = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/") and name != uri]
-    return sources != {"sim"} and (stage == CAPTURED or not raw), raw
+    inputs: Sequence[str] = ()
+    if store is not None and store["problem"] is None:
+        inputs = store["inputs"]
+        is_only = _source_in(store["params"]) != "sim" if stage == CAPTURED else stage == "rectify" and not inputs
+    elif LINES.fullmatch(uri):
+        inputs = [name for one in runs for name in one[RESTS_ON] if name.startswith(f"stages/{CAPTURED}/")]
+        is_only = sources != {"sim"} and (stage == CAPTURED or not inputs)
+    else:
+        is_only = stage == "rectify" and "raster" in sources
+    seen = (*seen, uri)
+    gone = (one for one in inputs if one not in seen and (one not in known or known[one]["cleared"]))
+    return is_only or any(is_only_copy(known, one, seen) for one in gone)
 
 
 def _source_in(params: Mapping[str, Any]) -> str | None:

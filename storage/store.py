@@ -2,14 +2,15 @@
 
 ::
 
-    stages/<stage>/<key>/   what a stage made, and manifest.json: parameters, inputs, size and SHA-256 of every file
-    runs/<name>/            receipt, report and pictures of a survey, with the same kind of manifest
-    spool/<key>/            lines of a capture under way
-    .locks/                 held while something is made
+    stages/<stage>/<key>/         what a stage made, and manifest.json: parameters, inputs, hashes of all files
+    stages/<stage>/<key>.cleared  the manifest of a store whose folder was deleted
+    runs/<name>/                  receipt, report and pictures of a survey, with the same kind of manifest
+    spool/<key>/                  lines of a capture under way
+    .locks/                       held while something is made
 
-A folder is written under another name (``.part``), synced, and renamed. So a kill at any moment leaves either the whole
-store or a leftover that `Archive.reclaim` removes. Published files never change; a ``cleared`` store keeps its manifest
-alone. Every opening of a store compares the sizes of its files, and the SHA-256 of all but the chunks of arrays, which
+A folder is written under another name (``.part``), synced, and renamed; to delete it, it is renamed first. So a kill at
+any moment leaves either the whole store or a leftover that `Archive.reclaim` removes. Published files never change.
+Every opening of a store compares the sizes of its files, and the SHA-256 of all but the chunks of arrays, which
 have a checksum of their own.
 """
 
@@ -23,12 +24,11 @@ import math
 import os
 import re
 import shlex
-import shutil
 import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, date, datetime
 from itertools import count
@@ -46,19 +46,18 @@ from spectralzoom.storage.whole_files import (
     entries,
     files_in,
     is_folder,
+    locked,
     refusals,
     remove,
     sha256,
     sync,
-    take_lock,
 )
 
-MANIFEST, CLEARED, OLD = "manifest.json", "cleared", ".old.part"
+MANIFEST, CLEARED = "manifest.json", ".cleared"
 RESTS_ON = "rests_on"  # of a run's manifest: address of every store below it -> SHA-256 of its manifest.json
 LATEST = "latest"
 KEY_LENGTH = 20
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
-REPLACED_S = 0.02  # in which a store is given another store's place
 MOST_LOOKS = 5
 CLOCK_S = 2.0  # clocks of two machines differ by less
 CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
@@ -134,7 +133,7 @@ class Ref:
 
 def is_name(name: str) -> bool:
     """Return whether this can be the name of a stage, a store or a run."""
-    return _NAME.fullmatch(name) is not None and not name.endswith(PART)
+    return _NAME.fullmatch(name) is not None and not name.endswith((PART, CLEARED))
 
 
 def uri_of(address: str) -> str | None:
@@ -170,7 +169,7 @@ _EMPTY: Mapping[str, Any] = {"files": {}, "params": {}, "inputs": [], RESTS_ON: 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     """Write the manifest of a folder, with sizes and hashes of its files beside ``facts``."""
     files = {name: [one.st_size, sha256(folder / name)] for name, one in sorted(files_in(folder).items())}
-    created = datetime.now(UTC).isoformat(timespec="milliseconds")
+    created = datetime.now(UTC).isoformat()  # to the microsecond: no two stores have one manifest
     (folder / MANIFEST).write_text(manifest_text({"created": created, **facts, "files": files}))
 
 
@@ -206,22 +205,50 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
     return content
 
 
+def is_cleared(folder: Path) -> bool:
+    """Return whether a store's folder was deleted, and its manifest kept."""
+    return not os.path.lexists(folder) and os.path.lexists(_beside(folder))
+
+
+def is_known(folder: Path) -> bool:
+    """Return whether something was published here, even if its folder was cleared away."""
+    return os.path.lexists(folder) or is_cleared(folder)
+
+
+def _beside(folder: Path) -> Path:
+    return folder.with_name(folder.name + CLEARED)
+
+
+def manifest_path(folder: Path) -> Path:
+    """Return the path of the manifest of a store or run, which for a cleared store lies beside its folder."""
+    return _beside(folder) if is_cleared(folder) else folder / MANIFEST
+
+
+def manifest_bytes(folder: Path) -> bytes:
+    """Return the manifest of a store or run. Raises OSError: it cannot be read; ValueError: it is no file."""
+    path = manifest_path(folder)
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode):  # a pipe would be waited for
+            raise ValueError("it is no file of its own")
+        return path.read_bytes()
+    except FileNotFoundError:
+        if path == manifest_path(folder):
+            raise
+        return manifest_bytes(folder)  # it was cleared, or made again, at this moment
+
+
 def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     """Return the content of a folder's manifest and None, or an empty manifest and the problem."""
-    path = folder / MANIFEST
     try:
-        if folder.is_symlink():
-            problem = "it is a link, expected a folder"
-        elif not stat.S_ISREG(path.lstat().st_mode):  # a pipe would be waited for
-            problem = f"{MANIFEST} is damaged: it is no file of its own"
-        else:
-            return parse_manifest(path.read_bytes()), None
+        if not folder.is_symlink():
+            return parse_manifest(manifest_bytes(folder)), None
+        problem = "it is a link, expected a folder"
     except FileNotFoundError:
         problem = f"{MANIFEST} is missing" if folder.is_dir() else "it is not there"
     except OSError as error:
-        problem = f"{MANIFEST} cannot be read: {error.strerror}"
+        problem = f"{manifest_path(folder).name} cannot be read: {error.strerror}"
     except ValueError as error:
-        problem = f"{MANIFEST} is damaged: {error}"
+        problem = f"{manifest_path(folder).name} is damaged: {error}"
     return dict(_EMPTY), problem
 
 
@@ -231,11 +258,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if problem is not None:
         raise damage(folder, problem)
     return content
-
-
-def is_cleared(folder: Path) -> bool:
-    """Return whether a store's files were deleted, or are being deleted."""
-    return os.path.lexists(folder / CLEARED)
 
 
 def file_problem(path: Path, size: int, digest: str | None, about: os.stat_result | None = None) -> str | None:
@@ -260,24 +282,14 @@ def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
     """
     found: list[str] = []
     for _ in range(MOST_LOOKS):
-        before = _identity(folder)
-        found = _differences(folder, every_byte)
-        if not found or (before is not None and before == _identity(folder) and not is_cleared(folder)):
+        before = try_manifest(folder)
+        found = _differences(folder, *before, every_byte=every_byte)
+        if not found or (before == try_manifest(folder) and not is_cleared(folder)):
             break
-        time.sleep(REPLACED_S)
     return found
 
 
-def _identity(folder: Path) -> tuple[int, int] | None:
-    """Return the number of a folder, which that in its place does not share; None where there is none."""
-    with suppress(OSError):
-        about = folder.lstat()
-        return about.st_dev, about.st_ino
-    return None
-
-
-def _differences(folder: Path, every_byte: bool) -> list[str]:
-    manifest, problem = try_manifest(folder)
+def _differences(folder: Path, manifest: Mapping[str, Any], problem: str | None, *, every_byte: bool) -> list[str]:
     if problem is not None or is_cleared(folder):
         return [problem] if problem is not None else []
     there, found = files_in(folder), []
@@ -294,15 +306,11 @@ def check_store(folder: Path, *, every_byte: bool = False) -> None:
 
     Raises IncompleteStoreError: it is missing, or a file differs; ArchiveError: it is no folder of the archive.
     """
-    if folder.is_file() or (not folder.is_symlink() and not _real(folder).is_relative_to(_real(_root_of(folder)))):
+    path, root = (Path(os.path.realpath(one)) for one in (folder, _root_of(folder)))  # a link to itself stays
+    if folder.is_file() or (not folder.is_symlink() and not path.is_relative_to(root)):
         raise ArchiveError(f"{folder} is a file, or a link leads out of the archive to it; expected a folder there")
     for problem in problems_of(folder, every_byte=every_byte):
         raise damage(folder, problem)
-
-
-def _real(path: Path) -> Path:
-    """Return a path without links; a link that leads to itself stays."""
-    return Path(os.path.realpath(path))
 
 
 def damage(folder: Path, problem: str) -> IncompleteStoreError:
@@ -358,8 +366,13 @@ class Archive:
                 (path / "stages").mkdir(parents=True, exist_ok=True)
                 sync(path)
                 sync(path.parent)
-            if write:
-                _check_writable(path, create=create)
+            try:  # rights alone do not tell of a read-only or full disk
+                if write:
+                    with tempfile.TemporaryFile(dir=path, buffering=0) as probe:
+                        probe.write(b"written to see whether this can be written to")
+            except OSError as error:
+                if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):  # a full disk is for gc to free
+                    raise
         return cls(path)
 
     @property
@@ -368,10 +381,6 @@ class Archive:
         return str(self.root)
 
     # --- stores -------------------------------------------------------------------------------------------------------
-
-    def key(self, stage: str, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()) -> str:
-        """Return the key of a stage's store, as `stage_key`."""
-        return stage_key(stage, version, params, inputs)
 
     def ref(self, stage: str, key: str) -> Ref:
         """Return the address of a store, whether it exists or not. Raises ArchiveError: a name is not allowed."""
@@ -393,12 +402,12 @@ class Archive:
         ref = self.ref(stage, key)
         with refusals(self.root, "read the archive"):
             try:
-                if os.path.lexists(ref.path):
+                if is_known(ref.path):
                     check_store(ref.path)
             except IncompleteStoreError:
-                if os.path.lexists(ref.path):  # else gc has removed it meanwhile
+                if is_known(ref.path):  # else gc has removed it meanwhile
                     raise
-            return ref if ref.path.is_dir() and not is_cleared(ref.path) else None
+            return ref if ref.path.is_dir() else None
 
     def locate(self, address: str) -> Path:
         """Return the path on this machine of a store, a run, or a file in one, by its address.
@@ -418,11 +427,7 @@ class Archive:
 
     def is_there(self, uri: str) -> bool:
         """Return whether a store has its files, not its manifest alone."""
-        return uri_of(uri) is not None and (self.root / uri).is_dir() and not is_cleared(self.root / uri)
-
-    def is_known(self, ref: Ref) -> bool:
-        """Return whether a store was published here, even if its files were cleared away."""
-        return ref.path.is_dir()
+        return uri_of(uri) is not None and (self.root / uri).is_dir()
 
     def produce(
         self, stage: str, build: Build, *, version: int, params: Mapping[str, Any], inputs: Sequence[Ref] = ()
@@ -455,14 +460,19 @@ class Archive:
             remove(self.root / "spool" / ref.key)
         return ref, built
 
-    def adopt(self, uri: str, fetch: Callable[[Path], None]) -> bool:
-        """Publish a copy that ``fetch`` writes with its manifest; return False where it is here already."""
+    def adopt(self, uri: str, copy: Callable[[Path], None] | bytes) -> bool:
+        """Publish what ``copy`` writes with its manifest, or the manifest of a cleared store; False if it is here."""
         final = self.root / uri
         with refusals(self.root, "write to the archive"), self._locked(_lock_name(final)):
-            return not final.exists() and publish(final, fetch)
+            if is_known(final):
+                return False
+            if callable(copy):
+                return publish(final, copy)
+            _write_beside(final, copy)
+            return True
 
     def clear(self, ref: Ref, *, wait: bool = True) -> bool:
-        """Mark a store as cleared and delete its files but the manifest; a later request builds it again.
+        """Keep the manifest of a store beside its folder, and delete the folder; a later request builds it again.
 
         False where another process holds it and ``wait`` is false. Raises IncompleteStoreError: its manifest is
         damaged.
@@ -474,64 +484,43 @@ class Archive:
         ):
             if held:
                 read_manifest(final)
-                _delete_files(final, mark=True)
+                _write_beside(final, manifest_bytes(final))
+                remove(final)
         return held
 
     def discard(self, uri: str) -> bool:
-        """Remove a store or a run; False where another process holds it, or the disk refuses."""
+        """Remove a store, a run or a leftover; False where another process holds it, or the disk refuses."""
         path = self.root / uri
         with self._locked(_lock_name(path), wait=False) as held:
             if held:
+                remove(_beside(path))
                 remove(path)
-        return held and not os.path.lexists(path)
+        return held and not is_known(path)
 
-    def drop_leftover(self, uri: str) -> bool:
-        """Remove one of `leftovers`; False where a process holds it, or the disk refuses."""
-        path = self.root / uri
-        with self._locked(_lock_name(path), wait=False) as held:
-            if held and path.name.endswith(OLD) and not _published(path).exists():
-                path.rename(_published(path))  # a cleared store, which was to be replaced
-            elif held and (path.name.endswith(PART) or path.parent.name == "spool"):
-                remove(path)
-            elif held and is_cleared(path):
-                _delete_files(path)
-                return True
-        return held and not os.path.lexists(path)
-
-    @contextmanager
-    def in_use(self, *, alone: bool = False) -> Iterator[bool]:
+    def in_use(self, *, alone: bool = False) -> AbstractContextManager[bool]:
         """Keep other processes from removing stores while the block runs; many may use an archive at a time.
 
         ``alone`` asks for exclusive use, and yields False at once where another process uses the archive.
         """
-        with self._locked("use", wait=not alone, shared=not alone) as held:
-            yield held
+        return self._locked("use", wait=not alone, shared=not alone)
 
     def reclaim(self) -> list[str]:
         """Remove what killed processes left in this folder; return the addresses."""
         with refusals(self.root, "clear up the archive", every=True):
-            return [uri for uri in self.leftovers() if self.drop_leftover(uri)]
+            return [uri for uri in self.leftovers() if self.discard(uri)]
 
     def leftovers(self) -> list[str]:
-        """Return unfinished folders, spools of published captures, and cleared stores with files; not those in use."""
-        stores = self._folders("stages")
-        found = [one for one in stores if is_cleared(one) and files_in(one).keys() - {MANIFEST, CLEARED}]
-        found += [one for one in self._places() if one.name.endswith(PART)]
-        for spool in entries(self.root / "spool"):
-            made = [one for one in stores if one.name == spool.name]
-            found += [spool] if any(try_manifest(one)[1] is None and not is_cleared(one) for one in made) else []
+        """Return unfinished folders, and spools of published captures; not those in use."""
+        found = [one for one in self._places() if one.name.endswith(PART)]
+        whole = {one.name for one in self._folders("stages") if one.is_dir() and try_manifest(one)[1] is None}
+        found += [spool for spool in entries(self.root / "spool") if spool.name in whole]
         return [one.relative_to(self.root).as_posix() for one in sorted(found) if self._is_free(_lock_name(one))]
-
-    def replaced(self) -> set[str]:
-        """Return the addresses of cleared stores that a killed process was replacing; `reclaim` puts them back."""
-        old = (_published(one) for one in self._places() if one.name.endswith(OLD))
-        return {one.relative_to(self.root).as_posix() for one in old}
 
     def strays(self) -> list[Path]:
         """Return what lies among stores and runs and is neither."""
         loose = [one for one in entries(self.root / "stages") if not is_folder(one)]
         known = {*self._folders("stages"), *self._folders("runs")}
-        return loose + [one for one in self._places() if one not in known and not one.name.endswith(PART)]
+        return loose + [one for one in self._places() if one not in known and not one.name.endswith((PART, CLEARED))]
 
     def _places(self) -> list[Path]:
         """Return what lies where stores and runs do."""
@@ -539,27 +528,20 @@ class Archive:
         return [one for folder in above for one in entries(folder)]
 
     def _folders(self, kind: str) -> list[Path]:
-        """Return the folders of ``stages`` or ``runs`` that are no leftovers, and links, which count as damaged."""
+        """Return the folders of stores (also of cleared ones) or runs, and links, which count as damaged."""
         inside = [one for one in self._places() if kind in (one.parent.name, one.parents[1].name)]
-        return [one for one in inside if is_name(one.name) and (one.is_symlink() or one.is_dir())]
+        cleared = [one.with_suffix("") for one in inside if one.suffix == CLEARED and kind == "stages"]
+        there = {one for one in inside if one.is_symlink() or one.is_dir()}
+        return sorted(one for one in there.union(cleared) if is_name(one.name))
 
     def _is_free(self, lock: str) -> bool:
-        path = self.root / ".locks" / f"{lock}.lock"
-        release = take_lock(path, wait=False) if path.exists() else lambda: None
-        if release is not None:
-            release()
-        return release is not None
+        if not (self.root / ".locks" / f"{lock}.lock").exists():
+            return True
+        with self._locked(lock, wait=False) as held:
+            return held
 
-    @contextmanager
-    def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
-        """Hold a lock while the block runs; yield False where another process holds it and ``wait`` is false."""
-        with refusals(self.root, "lock", every=True):
-            release = take_lock(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
-        try:
-            yield release is not None
-        finally:
-            if release is not None:
-                release()
+    def _locked(self, name: str, *, wait: bool = True, shared: bool = False) -> AbstractContextManager[bool]:
+        return locked(self.root / ".locks" / f"{name}.lock", wait=wait, shared=shared)
 
     # --- runs ---------------------------------------------------------------------------------------------------------
 
@@ -617,17 +599,10 @@ class Archive:
 
     # --- manifests and lineage ----------------------------------------------------------------------------------------
 
-    def manifest(self, ref: Ref) -> dict[str, Any]:
-        """Return the manifest of a store: stage, version, params, inputs, created, files."""
-        return read_manifest(self.root / ref.uri)
-
-    def stored_bytes(self, ref: Ref) -> int:
-        """Return the size of a store's files as they were published; cleared files count too."""
-        return listed_bytes(self.manifest(ref))
-
     def size_of(self, uri: str) -> int:
         """Return the present bytes of all files of a store or run, manifest included."""
-        return bytes_in(self.root / uri)
+        path = self.root / uri
+        return _beside(path).lstat().st_size if is_cleared(path) else bytes_in(path)
 
     def manifests(self) -> dict[str, dict[str, Any]]:
         """Return the manifests of all stores, then runs, by address, each with its ``problem`` and ``cleared``."""
@@ -635,7 +610,7 @@ class Archive:
         with refusals(self.root, "read the archive", every=True):
             for path in (*self._folders("stages"), *self._folders("runs")):
                 content, problem = try_manifest(path)
-                if problem is None or path.exists():  # else another process has removed it
+                if problem is None or is_known(path):  # else another process has removed it
                     uri = path.relative_to(self.root).as_posix()
                     found[uri] = {**content, "problem": problem, "cleared": is_cleared(path)}
         return found
@@ -645,14 +620,10 @@ class Archive:
         found: dict[str, str] = {}
         waiting = [ref.uri for ref in refs]
         while waiting:
-            if (uri := waiting.pop()) not in found and (self.root / uri).is_dir():
-                found[uri] = sha256(self.root / uri / MANIFEST)
+            if (uri := waiting.pop()) not in found and is_known(self.root / uri):
+                found[uri] = hashlib.sha256(manifest_bytes(self.root / uri)).hexdigest()
                 waiting += try_manifest(self.root / uri)[0]["inputs"]
         return dict(sorted(found.items()))
-
-    def lineage(self, uri: str) -> list[str]:
-        """Return a store or run and all that it was made of, the nearest first."""
-        return [uri, *ancestors(self.manifests(), [uri])]
 
 
 Build = Callable[[Path], object]  # writes into a given folder
@@ -689,7 +660,7 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
     whose lock this one did not see, has published the same name meanwhile. Raises ArchiveError: another process has
     removed the folder.
     """
-    part, old = aside(final), aside(final, OLD)
+    part = aside(final)
     part.mkdir(parents=True)
     descriptor = os.open(part, os.O_RDONLY)  # while it is open, no other folder gets its number
     try:
@@ -702,8 +673,6 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
             sync(final.parents[1])  # the parent may be new: without its own name what it holds is lost
             if not os.path.samestat(os.fstat(descriptor), part.stat()):
                 raise ArchiveError(f"another process has removed {part}, which was being written; run again")
-            if is_cleared(final):
-                final.rename(old)
             try:
                 part.rename(final)
             except OSError as error:
@@ -714,54 +683,27 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
         return True
     finally:
         os.close(descriptor)
-        with suppress(OSError):
-            if old.exists() and not final.exists():
-                old.rename(final)
-        remove(old)
         remove(part)
 
 
-def _delete_files(folder: Path, *, mark: bool = False) -> None:
-    """Delete the files of a store that is marked as cleared, or ``mark`` it first; never those of its successor."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW)
-    try:
-        if mark:
-            os.close(os.open(CLEARED, os.O_CREAT | os.O_WRONLY, 0o644, dir_fd=descriptor))
-            os.fsync(descriptor)
-        names = [one.name for one in os.scandir(descriptor)]
-        for name in set(names) - {MANIFEST, CLEARED} if CLEARED in names else ():
-            with suppress(FileNotFoundError):
-                try:
-                    os.unlink(name, dir_fd=descriptor)
-                except IsADirectoryError:
-                    shutil.rmtree(name, dir_fd=descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _published(path: Path) -> Path:
-    """Return the path that a leftover was to get."""
-    return path.with_name(re.sub(r"(\.[0-9a-f]{8})?(\.old)?\.part$", "", path.name))
+def _write_beside(folder: Path, manifest: bytes) -> None:
+    """Write the manifest of a store that is to be cleared."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = aside(folder)
+    part.write_bytes(manifest)
+    sync(part)
+    part.replace(_beside(folder))
+    sync(folder.parent)
 
 
 def _lock_name(path: Path) -> str:
-    """Return the name of the lock of a store, run, spool or leftover."""
+    """Return the name of the lock of a store, run or spool, or of what a leftover was to become."""
     kind = CAPTURED if path.parent.name == "spool" else path.parent.name
-    return f"{kind}-{_published(path).name}"
-
-
-def _check_writable(path: Path, *, create: bool) -> None:
-    """Write a nameless file: rights alone do not tell of a read-only or full disk. A full disk is for gc to free."""
-    try:
-        with tempfile.TemporaryFile(dir=path, buffering=0) as probe:
-            probe.write(b"written to see whether this can be written to")
-    except OSError as error:
-        if create or error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
+    return f"{kind}-" + re.sub(r"(\.[0-9a-f]{8})?\.part$", "", path.name)
 
 
 def listed_bytes(manifest: Mapping[str, Any]) -> int:
-    """Return the size of all files that a manifest lists."""
+    """Return the size of all files that a manifest lists; cleared files count too."""
     return sum(size for size, _ in manifest["files"].values())
 
 

@@ -15,7 +15,7 @@ import secrets
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -118,28 +118,32 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def take_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Callable[[], None] | None:
-    """Hold ``path`` against other processes and threads until the function returned is called, or the process dies.
+@contextmanager
+def locked(path: Path, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
+    """Hold ``path`` against other processes and threads while the block runs; the lock ends with the process.
 
-    None where another holds it and ``wait`` is false; a ``shared`` lock excludes only others. A second release does
-    nothing. Raises OSError: the path cannot be locked.
+    Yields False where another holds it and ``wait`` is false; a ``shared`` lock excludes only others. Raises
+    ArchiveError: the path cannot be locked.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    with ExitStack() as held:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-        file = held.enter_context(os.fdopen(descriptor))  # its second close does nothing
-        try:
-            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if not wait:
-                return None
-            log.info("waiting for another run that holds %s", path.stem)
-            fcntl.flock(descriptor, kind)
-        if not (path.exists() and os.path.samestat(os.fstat(descriptor), path.stat())):  # gc has removed it meanwhile
-            return take_lock(path, wait=wait, shared=shared)
-        held.pop_all()
-        return file.close
+    kind, is_held = fcntl.LOCK_SH if shared else fcntl.LOCK_EX, False
+    with ExitStack() as opened:
+        with refusals(path, "lock", every=True), suppress(BlockingIOError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            while not is_held:
+                file = opened.enter_context(open(path, "a", opener=_not_by_link))
+                try:
+                    fcntl.flock(file, kind | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    if not wait:
+                        raise
+                    log.info("waiting for another run that holds %s", path.stem)
+                    fcntl.flock(file, kind)
+                is_held = path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())  # else gc removed it
+        yield is_held
+
+
+def _not_by_link(name: str, flags: int) -> int:
+    return os.open(name, flags | os.O_NOFOLLOW, 0o644)
 
 
 # --- single files -----------------------------------------------------------------------------------------------------
@@ -154,7 +158,10 @@ def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     refuses.
     """
     with refusals(folder, "write to"):
-        make_folder(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
         with tempfile.TemporaryDirectory(prefix=_PREFIX, suffix=PART, dir=folder) as aside:
             with _disk_errors(Path(aside)):
                 yield Path(aside)
@@ -179,14 +186,6 @@ def _disk_errors(folder: Path) -> Iterator[None]:
             with tempfile.TemporaryFile(dir=folder) as file:
                 file.write(bytes(PROBE_BYTES))
         raise
-
-
-def make_folder(folder: Path) -> None:
-    """Create a folder to export to (ArchiveError: it is or lies below a file)."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
 
 
 def write_whole(path: Path, content: str) -> None:

@@ -14,7 +14,7 @@ from spectralzoom.flows.terminal.figures import counted, format_bytes
 from spectralzoom.flows.terminal.processes import DONE, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, stderr
 from spectralzoom.storage.remote import bucket
-from spectralzoom.storage.remote.objects import Objects, parse_place
+from spectralzoom.storage.remote.objects import Objects
 from spectralzoom.storage.store import Archive
 
 BucketName = Annotated[str, Parameter(name="bucket", help="Address in a bucket: s3://bucket/prefix.")]
@@ -22,7 +22,7 @@ BucketName = Annotated[str, Parameter(name="bucket", help="Address in a bucket: 
 
 def push(archive: ArchiveName, to: BucketName, *, as_json: AsJson = False) -> int:
     """Copy the stores and runs of an archive that a bucket lacks into it."""
-    opened, objects = Archive.open(archive, create=False), Objects(parse_place(to))
+    opened, objects = Archive.open(archive, create=False), Objects(to)
     with StageProgress(stderr, {"push": "sending"}) as bars:
         copied = bucket.push(opened, objects, lambda uri, part: bars.show("push", part, uri))
     return _report(copied, as_json=as_json)
@@ -36,7 +36,7 @@ def pull(source: BucketName, archive: ArchiveName, *, run: str | None = None, as
     run
         Copy only this run (its name, or `latest`), with the stores that it names.
     """
-    objects, opened = Objects(parse_place(source)), Archive.open(archive)
+    objects, opened = Objects(source), Archive.open(archive)
     with StageProgress(stderr, {"pull": "fetching"}) as bars:
         copied = bucket.pull(objects, opened, lambda uri, part: bars.show("pull", part, uri), run)
     return _report(copied, as_json=as_json)
@@ -44,7 +44,7 @@ def pull(source: BucketName, archive: ArchiveName, *, run: str | None = None, as
 
 def _report(copied: bucket.Copied, *, as_json: bool) -> int:
     put_out(asdict(copied), show_copied, as_json=as_json)
-    return PARTLY if copied.conflicts else DONE
+    return PARTLY if copied.conflicts or copied.missing else DONE
 
 
 def show_copied(content: Mapping[str, Any], console: Console) -> None:
@@ -58,3 +58,5 @@ def show_copied(content: Mapping[str, Any], console: Console) -> None:
     )
     for uri in content["conflicts"]:
         console.print(f"{uri} was not copied: the other side has another run of this name.", soft_wrap=True)
+    for uri in content["missing"]:
+        console.print(f"{uri}, which a copied run names, is in neither place.", soft_wrap=True)

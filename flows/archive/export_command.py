@@ -7,7 +7,6 @@ import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from rich.markup import escape
 from spectralzoom.flows.archive.export_layers import (
     NO_PRODUCTS,
     ExportedRun,
-    Layer,
     ProductFlags,
     map_layers,
     open_exported,
@@ -32,9 +30,9 @@ from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import print_json, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError
 from spectralzoom.pipeline.products.indices import find_index
-from spectralzoom.storage.export.image_files import write_cog
+from spectralzoom.storage.export.image_files import Layer, write_cog
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import remove_leftovers, take_lock, to_json, write_whole
+from spectralzoom.storage.whole_files import locked, remove_leftovers, to_json, write_whole
 
 COLLECTION = "collection.json"
 Assets = dict[str, Any]  # pystac's, by key
@@ -87,9 +85,8 @@ def run_export(
     layers = [*map_layers(opened), *spectral_layers(opened, indices, reflectance=products.reflectance)]
     folder, polygons = out / opened.id, products.polygons or bool(doses)
     try:
-        with ExitStack() as stack:
-            release = take_lock(out / ".export.lock")
-            stack.callback(release if release is not None else lambda: None)
+        out.mkdir(parents=True, exist_ok=True)
+        with locked(out / ".export.lock"):
             _collection_id(out, opened.archive.root.name)
             for one in (out, folder):
                 remove_leftovers(one)
@@ -130,9 +127,9 @@ def _write_images(folder: Path, layers: Sequence[Layer], console: Console) -> As
     for layer in layers:
         path = folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
-            write_cog(path, layer.image, layer.rows())
+            write_cog(path, layer)
         unit = {} if layer.unit is None else {"unit": layer.unit}
-        bands = [{"name": name, "data_type": layer.image.dtype, **unit} for name in layer.image.bands]
+        bands = [{"name": name, "data_type": layer.dtype, **unit} for name in layer.bands]
         assets[layer.name] = _asset(folder, path, layer.title, COG, *layer.roles, bands=bands)
     return assets
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
 from affine import Affine
 from cyclopts import Parameter
-from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.publish.receipt import Receipt, load_receipt
@@ -23,11 +23,11 @@ from spectralzoom.flows.stages.ground import colours_of
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out
-from spectralzoom.storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of
+from spectralzoom.storage.arrays.class_maps import OLD_CLASS, legend_of
 from spectralzoom.storage.arrays.georeference import load_geobox
 from spectralzoom.storage.arrays.ground_maps import StoredImage, open_image
 from spectralzoom.storage.arrays.layout import open_group
-from spectralzoom.storage.export.image_files import CogImage
+from spectralzoom.storage.export.image_files import Layer, Rows
 from spectralzoom.storage.runs import has_time, read_run
 from spectralzoom.storage.store import LATEST, Archive, read_manifest
 
@@ -67,18 +67,15 @@ def parse_doses(given: str | None) -> dict[str, float]:
     doses: dict[str, float] = {}
     for part in split_names("dose", given):
         name, _, number = part.rpartition("=")
-        if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
+        if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or name.strip() in ("", *doses):
             raise SettingsError(
-                f"--dose expects classes with numbers, weed=2.5, got {part!r}; numbers are 0 or more, without "
+                f"--dose expects each class once with a number, weed=2.5, got {part!r}; numbers are 0 or more, without "
                 "an exponent"
             )
-        if name.strip() in doses:
-            raise SettingsError(f"--dose names {name.strip()} twice; give it one number")
         doses[name.strip()] = float(number)
     return doses
 
 
-Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")  # names of bands
 ANGULAR = (
     "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
@@ -150,51 +147,36 @@ def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     return ExportedRun(archive, folder, load_receipt(folder))
 
 
-@dataclass(frozen=True)
-class Layer:
-    """One image to export."""
-
-    name: str
-    title: str
-    roles: tuple[str, ...]
-    image: CogImage
-    rows: Callable[[], Rows]
-    unit: str | None = None
-
-
 def map_layers(run: ExportedRun) -> list[Layer]:
     """Return class map, confidence, expected gain and picture, and after a prior map the old classes of changes."""
     product = run.map_product
     legend = legend_of(open_group(run.path(product)))
     fraction: dict[str, Any] = {"unit": "1", "roles": ("data", "confidence")}
     layers = [
-        image_layer(run, product, "classes", "class_map", "Class map", legend=legend),
-        image_layer(run, product, "confidence", "confidence", "Probability of the class given", **fraction),
+        _stored(run, product, "classes", "class_map", "Class map", legend=legend),
+        _stored(run, product, "confidence", "confidence", "Probability of the class given", **fraction),
         _gain_layer(run),
         _picture(run),
     ]
     revisited = product if product == "ground_map" else "class_probabilities"
     if run.has(revisited) and OLD_CLASS in (group := open_group(run.path(revisited))):
         title = "Class of the prior map, where the map is sure of another one"
-        layers.append(image_layer(run, revisited, OLD_CLASS, OLD_CLASS, title, legend=legend_of(group)))
+        layers.append(_stored(run, revisited, OLD_CLASS, OLD_CLASS, title, legend=legend_of(group)))
     return layers
 
 
-def cog_image(
-    run: ExportedRun, product: str, geobox: GeoBox, dtype: str, bands: tuple[str, ...], **more: Any
-) -> CogImage:
-    """Return an image with the tags of the run, NaN without a value; ``more`` are fields of `CogImage`."""
-    tags = {
+def layer_of(run: ExportedRun, product: str, *, tags: Mapping[str, str] = MappingProxyType({}), **more: Any) -> Layer:
+    """Return an image with the tags of the run and more ``tags``; ``more`` are the other fields of `Layer`."""
+    own = {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
         "product": run.receipt["products"][product],
         "surveyed": run.observed[0],
         "processed": run.receipt["finished"],
-        "place": ANGULAR if geobox.crs is None else "map",
+        "place": ANGULAR if more["geobox"].crs is None else "map",
         **({} if run.undated else {"ACQUISITIONDATETIME": run.observed[0]}),
-        **more.pop("tags", {}),
     }
-    return CogImage(geobox, dtype, bands, **{"nodata": np.nan, "tags": tags, **more})
+    return Layer(tags={**own, **tags}, **more)
 
 
 def geobox_of(stored: StoredImage) -> GeoBox:
@@ -205,48 +187,45 @@ def geobox_of(stored: StoredImage) -> GeoBox:
     return GeoBox((y, x), Affine(*map(float, stored.about["spatial:transform"])), None)
 
 
-def image_layer(
-    run: ExportedRun,
-    product: str,
-    array: str,
-    name: str,
-    title: str,
-    *,
-    roles: tuple[str, ...] = ("data",),
-    unit: str | None = None,
-    legend: ClassNames | None = None,
-    **more: Any,
-) -> Layer:
-    """Return an image of a store on the store's own grid; ``more`` are fields of `CogImage`."""
+def _stored(run: ExportedRun, product: str, array: str, name: str, title: str, **more: Any) -> Layer:
+    """Return an image of a store on the store's own grid; ``more`` are fields of `Layer`."""
     stored = open_image(run.path(product), array)
-    more = (
-        {"bands": (array,), **more} if legend is None else {"bands": ("class",), "nodata": UNLABELLED, "legend": legend}
-    )
-    image = cog_image(run, product, geobox_of(stored), stored.dtype.name, **more)
-    return Layer(name, title, roles, image, stored.rows, unit)
+    usual: dict[str, Any] = {"geobox": geobox_of(stored), "dtype": stored.dtype.name, "rows": stored.rows}
+    usual |= {"bands": ("class",), "nodata": UNLABELLED} if "legend" in more else {"bands": (array,)}
+    return layer_of(run, product, name=name, title=title, **(usual | more))
 
 
 def _gain_layer(run: ExportedRun) -> Layer:
     """Return the expected gain with one pixel a patch, from the corner of the class map on."""
-    stored, drawn = open_image(run.path("attention"), "score"), run.path("class_map")
+    drawn = run.path("class_map")
     patch = int(read_manifest(drawn.parent)["params"]["gains"]["frame"]["grid"]["patch"])
+    stored = open_image(run.path("attention"), "score")
     y, x = stored.shape
     geobox = zoomed_out(geobox_of(open_image(drawn, "classes")), patch, (y, x))
     tags = {"policy": str(stored.about.get("policy", "")), "patch_px": str(patch)}
-    image = cog_image(run, "attention", geobox, stored.dtype.name, ("score",), tags=tags)
-    return Layer("attention", "Expected gain of a fine pass, by patch", ("data",), image, stored.rows, "1")
+    return layer_of(
+        run,
+        "attention",
+        name="attention",
+        title="Expected gain of a fine pass, by patch",
+        geobox=geobox,
+        dtype=stored.dtype.name,
+        bands=("score",),
+        rows=stored.rows,
+        unit="1",
+        tags=tags,
+    )
 
 
 def _picture(run: ExportedRun) -> Layer:
     """Return the picture on the ground, else the coarse mosaic in a photograph's tones: 1 to 255, 0 without a value."""
-    title, roles = "Picture of the coarse pass", ("visual", "overview")
+    about: dict[str, Any] = {"roles": ("visual", "overview"), "bands": RGB, "nodata": 0}
+    title = "Picture of the coarse pass"
     if run.map_product == "ground_map":
-        return image_layer(run, "ground_map", "picture", "rgb", title, roles=roles, bands=RGB, nodata=0)
-    place = run.path("mosaic")
-    image = cog_image(run, "mosaic", geobox_of(open_image(place, "coverage")), "uint8", RGB, nodata=0)
+        return _stored(run, "ground_map", "picture", "rgb", title, **about)
 
     def rows() -> Rows:
-        ref = run.archive.ref(*place.parent.relative_to(run.archive.root / "stages").parts)
+        ref = run.archive.ref(*run.path("mosaic").parent.relative_to(run.archive.root / "stages").parts)
         yield 0, np.nan_to_num(np.rint(colours_of(ref))).astype(np.uint8)
 
-    return Layer("rgb", title, roles, image, rows)
+    return _stored(run, "mosaic", "coverage", "rgb", title, **about, dtype="uint8", rows=rows)

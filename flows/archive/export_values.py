@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.archive.export_layers import ExportedRun, Layer, Rows, cog_image, geobox_of
+from spectralzoom.flows.archive.export_layers import ExportedRun, geobox_of, layer_of
 from spectralzoom.models.evaluation.metrics import stratified_fractions
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
@@ -27,6 +28,7 @@ from spectralzoom.storage.arrays.ground_maps import open_image
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import Mosaic, open_mosaic
 from spectralzoom.storage.export.csv_tables import csv_table
+from spectralzoom.storage.export.image_files import Layer, Rows
 from spectralzoom.storage.whole_files import write_whole, written_aside
 
 BYTES_AT_ONCE = 1 << 27
@@ -146,36 +148,41 @@ def spectral_layers(run: ExportedRun, indices: Sequence[SpectralIndex], *, refle
     return layers + [_index(view, index, bands, white) for index, bands in zip(indices, picked, strict=True)]
 
 
+def _layer(view: MosaicView, rows: Callable[[], Rows], **more: Any) -> Layer:
+    return layer_of(view.run, "mosaic", geobox=view.geobox, dtype="float32", rows=rows, unit="1", **more)
+
+
 def _reflectance(view: MosaicView, white: float) -> Layer:
     """Return all bands by rising wavelength, with the detector of each where some overlap."""
     order, centres, detector = sort_bands(view.mosaic.wavelength_nm)
     width = view.mosaic.fwhm_nm
     values = "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
     several = detector.any()
-    facts = {
-        "wavelength_nm": centres.tolist(),
-        "fwhm_nm": None if width is None else width[order].tolist(),
-        "detector": detector.tolist() if several else (),
-        "tags": {"values": values},
-    }
     called = [f", detector {one}" if several else "" for one in detector]
-    bands = tuple(f"{nm:.1f} nm{of}" for nm, of in zip(centres, called, strict=True))
-    image = cog_image(view.run, "mosaic", view.geobox, "float32", bands, **facts)
-    title, roles = f"{len(order)} bands: {values}", ("data", "reflectance")
-    return Layer("reflectance", title, roles, image, lambda: view.rows(order.tolist()), "1")
+    return _layer(
+        view,
+        lambda: view.rows(order.tolist()),
+        name="reflectance",
+        title=f"{len(order)} bands: {values}",
+        roles=("data", "reflectance"),
+        bands=tuple(f"{nm:.1f} nm{of}" for nm, of in zip(centres, called, strict=True)),
+        wavelength_nm=centres.tolist(),
+        fwhm_nm=None if width is None else width[order].tolist(),
+        detector=detector.tolist() if several else (),
+        tags={"values": values},
+    )
 
 
 def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
     wave = view.mosaic.wavelength_nm[list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
     tags = {"index": index.name, "bands": taken, "reference": index.reference}
-    image = cog_image(view.run, "mosaic", view.geobox, "float32", (index.name,), tags=tags)
 
     def rows() -> Rows:
         for first, values in view.rows(bands):
             yield first, index_values(index, values, wave, white=white)
 
-    return Layer(index.name, f"{index.title} of {taken}", ("data",), image, rows, "1")
+    return _layer(view, rows, name=index.name, title=f"{index.title} of {taken}", bands=(index.name,), tags=tags)
 
 
 def check_doses(run: ExportedRun, doses: Mapping[str, float]) -> None:
@@ -200,21 +207,16 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     legend = legend_of(stored.group)
     place = geobox_of(stored).affine
     found = list(rasterio_features.shapes(classes, mask=classes != UNLABELLED, transform=place))
-    numbers = [int(number) for _, number in found]
-    index = [legend.numbers.index(number) for number in numbers]
-    names = [legend.names[one] for one in index]
-    columns = {
-        "class": numbers,
-        "name": names,
-        "colour": [f"#{bytes(legend.colours[one].tolist()).hex()}" for one in index],
-    }
+    names = dict(zip(legend.numbers, legend.names, strict=True))
+    colours = {one: f"#{bytes(rgb).hex()}" for one, rgb in zip(legend.numbers, legend.colours.tolist(), strict=True)}
     crs = None if run.geobox is None else str(run.geobox.crs)
     outlines = [shapely.geometry.shape(outline) for outline, _ in found]
-    frame = geopandas.GeoDataFrame(columns, geometry=outlines, crs=crs)
+    frame = geopandas.GeoDataFrame({"class": [int(number) for _, number in found]}, geometry=outlines, crs=crs)
+    frame["name"], frame["colour"] = frame["class"].map(names), frame["class"].map(colours)
     if crs is not None:
         frame["hectares"] = frame.to_crs(EQUAL_AREA).area / M2_PER_HECTARE
     if doses:
-        frame["dose"] = [doses.get(name, 0.0) for name in names]
+        frame["dose"] = frame["name"].map(doses).fillna(0.0)
     package, shapefile = folder / "classes.gpkg", folder / "classes.shp"
     parts = [f"classes{ending}" for ending in (PARTS if crs is not None else PARTS[:-1])]
     day = {"DBF_DATE_LAST_UPDATE": run.receipt["finished"][:10]}  # the same polygons, the same bytes

@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.archive.plan_command import dry_run
-from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers
+from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers, WorkersBucket
 from spectralzoom.flows.settings.load import load_settings, of_this_version, parse_settings
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
 from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
@@ -45,6 +45,7 @@ def reprocess(
     weights: Path | None = None,
     scheduler: Scheduler = "threads",
     workers: Workers = None,
+    bucket: WorkersBucket = None,
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
@@ -59,7 +60,7 @@ def reprocess(
     dry_run
         Only print what would run.
     """
-    pool = WorkerPool(scheduler, workers)
+    pool = WorkerPool(scheduler, workers, bucket)
     return run_reprocess(archive, stderr, as_json=as_json, field=field, weights=weights, dry_run=dry_run, pool=pool)
 
 
@@ -128,7 +129,7 @@ def _settings_of(
 
     ``renewed`` has the newest generation of each run that may be another's prior map.
     """
-    here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers}
+    here: dict[str, Any] = {"scheduler": pool.scheduler, "workers": pool.workers, "bucket": pool.bucket}
     settings = asked_again(run, archive, weights)
     prior = settings.prior
     while (newer := renewed.get(prior, prior)) != prior:

@@ -38,7 +38,7 @@ from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import read_toml, refusals, take_lock
+from spectralzoom.storage.whole_files import locked, read_toml
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -77,13 +77,10 @@ def serve(
     home = next(iter(archives.values())) / ".prefect"
     with suppress(KeyboardInterrupt), terminable(), ExitStack() as held:
         for name, root in archives.items():
-            with refusals(root, "lock", every=True):
-                release = take_lock(root / ".locks" / "serve.lock", wait=False)
-            if release is None:
+            if not held.enter_context(locked(root / ".locks" / "serve.lock", wait=False)):
                 raise ArchiveError(
                     f"another serve uses the archive {name}; give all its fields to that one, or stop it"
                 )
-            held.callback(release)
         pages = _start_server(home, port, held)
         tempfile.tempdir = str(home)  # for Prefect's runner: another user may own its folder in /tmp
         when = cron or f"every {every}".removesuffix(", 0:00:00")

@@ -28,7 +28,7 @@ from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.storage.store import Archive, Ref
+from spectralzoom.storage.store import Archive, Ref, listed_bytes, read_manifest
 
 PATCH = 16  # of the shipped weights, so that scans are those of their surveys
 
@@ -137,7 +137,7 @@ def _record(
         "lines": (lines := sum(sweep.lines for sweep in sweeps)),
         "px_bands": lines * settings.camera.samples * len(scene.wavelength_nm),
         "cpu_s": row.cpu_s,
-        "bytes_stored": stores.archive.stored_bytes(raw),
+        "bytes_stored": listed_bytes(read_manifest(raw.path)),
         "effects_store": effects.uri,
         "effects": manifest["effects"],
         "effects_total": manifest["total"],

@@ -23,6 +23,10 @@ Scheduler = Annotated[
     str, Parameter(help="Worker pool: `threads`, `processes`, or the address of a dask scheduler, tcp://host:port.")
 ]
 Workers = Annotated[int | None, Parameter(help="Number of workers; default: one per core.")]
+WorkersBucket = Annotated[
+    str | None,
+    Parameter(name="--bucket", help="Bucket by which workers of a dask scheduler get stores that they lack."),
+]
 IN_TABLES = {flag: setting for setting, flag in FLAGS.items()}
 _IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
 _DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_TABLES.items()}

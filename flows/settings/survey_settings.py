@@ -44,7 +44,7 @@ from spectralzoom.storage.parallel.pool import WorkerPool
 BUILT_IN_SCENES = BUILT_IN_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # scene in front of a rig or in a recording: only its size and bands are known
-OF_THE_MACHINE = ("scheduler", "workers", "device")  # settings that depend on the machine of the survey
+OF_THE_MACHINE = ("scheduler", "workers", "bucket", "device")  # settings that depend on the machine of the survey
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white")
 USUAL_BUDGET = 0.5  # of a zoomed survey
 MOST_STEP = 8  # greatest line spacing [px]
@@ -258,6 +258,9 @@ class Settings:
         "threads", "Worker pool: threads, processes, or the address of a dask scheduler, tcp://host:port"
     )
     workers: int | None = stated(None, "Number of workers; default: one per core", "", 1, 1024, example=2)
+    bucket: str | None = stated(
+        None, "Bucket by which workers of a dask scheduler get stores that they lack", example="s3://bucket/prefix"
+    )
     device: Device = stated(
         PROCESSOR,
         "Device of the network; auto: cuda or mps if available, else cpu. Maps of different devices may differ by"
@@ -347,7 +350,7 @@ class Settings:
     @property
     def pool(self) -> WorkerPool:
         """Return the worker pool."""
-        return WorkerPool(self.scheduler, self.workers)
+        return WorkerPool(self.scheduler, self.workers, self.bucket)
 
     @property
     def shape(self) -> tuple[int, int] | None:

@@ -36,6 +36,7 @@ from spectralzoom.storage.readers.label_files import (
 )
 from spectralzoom.storage.readers.labels import load_codes
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
@@ -185,7 +186,7 @@ def _scenes(
     settings = find_scene_settings(folder / SETTINGS_NAME)
     masks = () if train_mask is None else (split_variable(train_mask)[0].resolve(),)
     found = match_folder(folder) if settings.labels is None else _match_by_settings(folder, settings)
-    images = [image for image in found.images if image.resolve() not in masks]
+    images = [within(folder, image) for image in found.images if image.resolve() not in masks]
     if not images:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"

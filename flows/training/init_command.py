@@ -24,8 +24,10 @@ from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.pipeline.errors import PipelineError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.readers import label_files
+from spectralzoom.storage.readers.band_facts import bands_text
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
+from spectralzoom.storage.readers.scene_files import empty_bands
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, load_scene_settings
 from spectralzoom.storage.whole_files import write_whole
 
@@ -73,8 +75,7 @@ def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
 def run_init(source: str, console: Console, *, force: bool = False) -> dict[str, Any]:
     """Write a scene.toml for a folder or file, with progress on ``console``; return the findings for --json.
 
-    Raises SettingsError: a scene.toml exists and ``force`` is not given; ArchiveError: the folder cannot be written to;
-    else as `draft_scene`.
+    Raises SettingsError: one exists, and ``force`` is not given; ArchiveError: no write access; else as `draft_scene`.
     """
     place, _ = split_variable(source)
     path = (place if place.is_dir() and not label_files.is_store(place) else place.parent) / SETTINGS_NAME
@@ -105,7 +106,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         "images": len(files.images),
         "labelled": len(files.labels),
         "shape": list(cube.shape),
-        "wavelengths_nm": None if nm is None else nm.tolist(),
+        "wavelengths_nm": None if nm is None else [None if np.isnan(one) else one for one in nm.tolist()],
         "classes": [asdict(one) for one in draft.classes],
         "notes": list(cube.notes),
         "unseen": [*_missing(draft), *draft.unseen],
@@ -142,7 +143,11 @@ def _value_lines(cube: CubeSource) -> Iterator[str]:
     elif "assumed" in cube.bands.origin:
         yield f"# wavelengths_nm = {nm.tolist()}   # assumed from the colours; remove the first # to change them"
     else:
-        yield f"# {bands} bands, {nm.min():g}-{nm.max():g} nm: {as_toml(cube.bands.origin)}"
+        yield f"# {bands} bands, {np.nanmin(nm):g}-{np.nanmax(nm):g} nm: {as_toml(cube.bands.origin)}"
+    empty = set(empty_bands(cube, SceneSettings()))
+    if empty - (left_out := {*cube.bad_bands, *cube.bands.unknown}) and len(empty) < bands:
+        used = bands_text(sorted({*range(bands)} - left_out - empty))
+        yield f'bands = "{used}"   # the others have no value, or the file marks them as bad'
     if cube.nodata is None:
         yield "# nodata = 0   # if that value means no data: remove the first #"
     if cube.dtype.itemsize == 2:
@@ -197,8 +202,7 @@ def _show(record: dict[str, Any], console: Console) -> None:
 def draft_scene(address: str | Path, before: SceneSettings = SceneSettings()) -> SceneDraft:  # noqa: B008 - frozen
     """Inspect the images and labels of a folder, or one file and its labels, by an earlier scene.toml of them.
 
-    The first image is read, of others only the size; all label files are read. Raises SceneError: there is no image, or
-    the first one cannot be read; labels may belong to several images, or have mixed values.
+    All label files are read. Raises SceneError: the first image cannot be read; labels cannot be matched, or are mixed.
     """
     path, _ = split_variable(address)
     found = label_files.find_files(path)

@@ -7,7 +7,7 @@ odc-geo; its grid mapping has the GeoTransform.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,25 +51,13 @@ class AngularGrid:
     factor: int = 1  # fine px a pixel
     geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
-    def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """Return the GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``.
-
-        The transform maps pixel corners.
-        """
+    def box(self, shape: tuple[int, int]) -> GeoBox:
+        """Return the grid of an image of (y, x) ``shape``: on the earth if known, else in tangents without a CRS."""
+        if self.geobox is not None:
+            return zoomed_out(self.geobox, self.factor, shape)
         step = self.ifov_rad * self.factor
         top, left = (-size / 2 * self.ifov_rad for size in self.scene_shape)
-        bounds = (left, top, left + step * shape[1], top + step * shape[0])
-        conventions = [_SPATIAL | {"description": _OF_ANGLES}]
-        return _spatial(shape, (step, 0.0, left, 0.0, step, top), bounds) | {"zarr_conventions": conventions}
-
-    def coordinates(self, shape: tuple[int, int]) -> dict[str, SmallArray]:
-        """Return the coordinates y and x [rad] of the pixel centres of an image of (y, x) ``shape``."""
-        found: dict[str, SmallArray] = {}
-        for name, size, whole in zip("yx", shape, self.scene_shape, strict=True):
-            about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
-            centres = -whole / 2 * self.ifov_rad + self.ifov_rad * self.factor * (np.arange(size) + 0.5)
-            found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
-        return found
+        return odc_geobox.GeoBox(shape, Affine(step, 0.0, left, 0.0, step, top), None)
 
     def record(self) -> dict[str, Any]:
         """Return the values from which `grid_of` makes this grid of angles again."""
@@ -94,80 +82,62 @@ def create_placed_group(
     """
     if grid is None:
         return create_group(path, title, attributes), {}
-    facts = {"angular_grid": grid.record(), **attributes}
-    if grid.geobox is None:
-        place = grid.attributes((shape[0], shape[1]))
-        return create_group(path, title, {**place, **facts}, grid.coordinates((shape[0], shape[1]))), place
-    geobox = zoomed_out(grid.geobox, grid.factor, (shape[0], shape[1]))
+    geobox = grid.box((shape[0], shape[1]))
     place = map_attributes(geobox)
-    return create_group(path, title, {**place, **facts}, map_coordinates(geobox)), {**place, **ON_THE_MAP}
+    facts = {**place, "angular_grid": grid.record(), **attributes}
+    group = create_group(path, title, facts, map_coordinates(geobox))
+    return group, place if geobox.crs is None else {**place, **ON_THE_MAP}
 
 
 def map_attributes(geobox: GeoBox) -> dict[str, Any]:
-    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners."""
-    crs = _crs_of(geobox)
+    """Return the GeoZarr ``proj:`` and ``spatial:`` attributes of a grid; the transform maps pixel corners."""
+    crs = geobox.crs
     return {
-        **({} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
-        "proj:wkt2": crs.to_wkt(),
-        **_spatial(geobox.shape, geobox.affine[:6], geobox.boundingbox.bbox),
-        "zarr_conventions": [_PROJ, _SPATIAL],
-    }
-
-
-def _spatial(shape: Sequence[int], transform: Iterable[float], bounds: Iterable[float]) -> dict[str, Any]:
-    return {
+        **({} if crs is None or crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}),
+        **({} if crs is None else {"proj:wkt2": crs.to_wkt()}),
         "spatial:dimensions": ["y", "x"],
-        "spatial:shape": list(shape),
+        "spatial:shape": list(geobox.shape),
         "spatial:transform_type": "affine",
-        "spatial:transform": [float(number) for number in transform],
-        "spatial:bbox": [float(number) for number in bounds],
+        "spatial:transform": [float(number) for number in geobox.affine[:6]],
+        "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
         "spatial:registration": "pixel",
+        "zarr_conventions": [_SPATIAL | {"description": _OF_ANGLES}] if crs is None else [_PROJ, _SPATIAL],
     }
 
 
 def map_coordinates(geobox: GeoBox) -> dict[str, SmallArray]:
-    """Return ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map by CF's rules."""
+    """Return ``x`` and ``y`` of a grid, and of one on the earth the grid mapping ``spatial_ref``, by CF's rules."""
     import odc.geo.xr as odc_xr
 
     found: dict[str, SmallArray] = {}
     a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
     for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
-        if geobox.axis_aligned:
-            about = _axis(_crs_of(geobox), name)
-            centres = np.arange(size) * step + (first + step / 2)
-        else:
+        about = _axis(geobox.crs, name)
+        if not geobox.axis_aligned:
+            step, first = 1.0, 0.0
             about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
-            centres = np.arange(size) + 0.5
+        centres = np.arange(size) * step + (first + step / 2)
         found[name] = SmallArray((name,), centres, {**about, "axis": name.upper()})
-    mapping = odc_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
+    if geobox.crs is None:
+        return found
+    mapping = odc_xr.xr_crs_coord(geobox.crs, transform=geobox.transform)
     return {**found, GRID_MAPPING: SmallArray((), np.asarray(mapping.values, np.int32), dict(mapping.attrs))}
 
 
-def _axis(crs: odc_crs.CRS, name: str) -> dict[str, str]:
-    """Return CF's attributes of one axis of a map."""
-    unit = str(crs.proj.axis_info[0].unit_name).replace(" ", "_") if crs.proj.axis_info else "metre"
-    if crs.geographic:
-        standard, degrees = _DEGREES[name]
-        standard, degrees = (f"grid_{standard}", "degrees") if crs.proj.is_derived else (standard, degrees)
-        about = {"standard_name": standard, "long_name": f"{standard} of the pixel's centre"}
-        return {**about, "units": degrees if unit == "degree" else unit}
-    return {
-        "standard_name": f"projection_{name}_coordinate",
-        "long_name": f"{name} of the pixel's centre on the map",
-        "units": "m" if unit == "metre" else unit,
-    }
-
-
-def _crs_of(geobox: GeoBox) -> odc_crs.CRS:
-    assert geobox.crs is not None
-    return geobox.crs
+def _axis(crs: odc_crs.CRS | None, name: str) -> dict[str, str]:
+    """Return CF's attributes of one axis of a map, or of a grid of angles."""
+    if crs is None:
+        return {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
+    unit = str(crs.proj.axis_info[0].unit_name).replace(" ", "_")
+    standard, degrees = _DEGREES[name] if crs.geographic else (f"projection_{name}_coordinate", "")
+    if crs.geographic and crs.proj.is_derived:
+        standard, degrees = f"grid_{standard}", "degrees"
+    units = {"metre": "m", "degree": degrees}.get(unit, unit)
+    return {"standard_name": standard, "long_name": f"{name} of the pixel's centre on the map", "units": units}
 
 
 def load_geobox(path: Path) -> GeoBox | None:
-    """Read the grid of a stored map; None where the store lies on an angular grid.
-
-    Raises IncompleteStoreError: the store is missing, or its grid is damaged.
-    """
+    """Read the grid of a stored map; None where it lies on an angular grid (IncompleteStoreError: missing, damaged)."""
     return geobox_of_group(open_group(path))
 
 

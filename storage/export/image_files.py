@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,17 +20,22 @@ from spectralzoom.storage.arrays.class_maps import ClassNames
 from spectralzoom.storage.whole_files import written_aside
 
 TILE = 512  # px: rasters within one tile need no overviews
-Blocks = Iterable[tuple[int, NDArray[Any]]]  # first row, (row, x) or (row, x, band) values, in order
+Rows = Iterator[tuple[int, NDArray[Any]]]  # first row, (row, x) or (row, x, band) values, in order
 
 
-@dataclass(frozen=True)
-class CogImage:
-    """Grid, bands and legend of one file."""
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """One image to export: grid, bands, legend and values."""
 
+    name: str  # of its file, without an ending
+    title: str
     geobox: GeoBox  # without a CRS in tangents of angles [rad]
     dtype: str
     bands: tuple[str, ...]  # their descriptions
-    nodata: float
+    rows: Callable[[], Rows]
+    nodata: float = np.nan
+    roles: tuple[str, ...] = ("data",)
+    unit: str | None = None
     legend: ClassNames | None = None  # of an image of classes: overviews take the commonest, not the mean
     tags: Mapping[str, str] = field(default_factory=dict)
     wavelength_nm: Sequence[float] | None = None  # of each band
@@ -38,8 +43,8 @@ class CogImage:
     detector: Sequence[int] = ()  # of each band
 
 
-def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
-    """Write one file atomically from blocks in order; one block at a time is in memory.
+def write_cog(path: Path, image: Layer) -> None:
+    """Write one file atomically; one block of rows at a time is in memory.
 
     Classes get a colour table, and their names as tags of the band and as GDAL's category names in ``NAME.aux.xml``.
     Raises ArchiveError: the disk refuses or changes the numbers.
@@ -56,7 +61,7 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     try:
         with written_aside(path.parent, names) as aside:
             plain, made = aside / "plain.tif", aside / path.name
-            _write_plain(plain, image, blocks)
+            _write_plain(plain, image)
             rasterio.shutil.copy(str(plain), str(made), driver="COG", **options)
             _check_same(plain, made, path)
             if image.legend is not None:
@@ -82,7 +87,7 @@ def _write_categories(path: Path, legend: ClassNames) -> None:
     ElementTree.ElementTree(root).write(path, encoding="utf-8")
 
 
-def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
+def _write_plain(path: Path, image: Layer) -> None:
     """Write an uncompressed TIFF in strips, block by block; GDAL makes the cloud-optimised file from it."""
     y, x = image.geobox.shape
     crs = None if image.geobox.crs is None else image.geobox.crs.to_wkt()
@@ -102,12 +107,12 @@ def _write_plain(path: Path, image: CogImage, blocks: Blocks) -> None:
             )
             colours = zip(image.legend.numbers, image.legend.colours.tolist(), strict=True)
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
-        for first, values in blocks:
+        for first, values in image.rows():
             planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
             file.write(planes.astype(image.dtype, copy=False), window=((first, first + len(values)), (0, x)))
 
 
-def _tag_wavelengths(file: Any, image: CogImage) -> None:
+def _tag_wavelengths(file: Any, image: Layer) -> None:
     """Write each band's wavelength and width in GDAL's domain IMAGERY [um], and as its ENVI driver has them [nm]."""
     facts = {"wavelength": ("CENTRAL_WAVELENGTH_UM", image.wavelength_nm), "fwhm": ("FWHM_UM", image.fwhm_nm)}
     for name, (own, lengths) in facts.items():

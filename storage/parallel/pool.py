@@ -20,6 +20,8 @@ from operator import call
 from typing import Any, TypeVar
 
 from spectralzoom.pipeline.errors import SettingsError, WorkerError
+from spectralzoom.storage.remote.objects import Objects
+from spectralzoom.storage.remote.worker_stores import fetching_work
 
 ANSWER_S = 5.0  # time limit of a scheduler's answer
 RESTART_S = 60.0  # time limit until a process of this machine replaces one that died
@@ -53,10 +55,14 @@ def memory_refusal(least: int, memory: int, why: str) -> SettingsError:
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Workers for blocks: ``threads``, ``processes``, or those of a dask scheduler at ``tcp://host:port``."""
+    """Workers for blocks: ``threads``, ``processes``, or those of a dask scheduler at ``tcp://host:port``.
+
+    With a ``bucket``, workers of a dask scheduler fetch the stores that their machines lack.
+    """
 
     scheduler: str = "threads"
     workers: int | None = None  # None: one for each core; ignored with a dask scheduler
+    bucket: str | None = None
 
     def __post_init__(self) -> None:
         if self.scheduler not in ("threads", "processes") and not _ADDRESS.fullmatch(self.scheduler):
@@ -66,6 +72,13 @@ class WorkerPool:
             )
         if self.workers is not None and self.workers < 1:
             raise SettingsError(f"workers must be at least 1, got {self.workers}")
+        if self.bucket is not None:
+            if not self.elsewhere:
+                raise SettingsError(
+                    f"bucket {self.bucket} is for workers on other machines; give --scheduler tcp://host:port, or no "
+                    "--bucket, and copy the archive by spectralzoom push"
+                )
+            Objects(self.bucket)
 
     @property
     def elsewhere(self) -> bool:
@@ -121,9 +134,9 @@ def run_blocks(
     any more. ``report`` is called with the fraction done.
 
     On threads ``make`` and ``take`` must be safe to call from several at once. Otherwise ``make``, items and results
-    are pickled, and ``take`` is called in this process. Workers of a dask scheduler read stores by the same paths.
-    Raises SettingsError: no scheduler answers, or its workers cannot import this code; WorkerError:
-    workers died repeatedly, or none is left.
+    are pickled, and ``take`` is called in this process. Workers of a dask scheduler read stores by the same paths:
+    mounted or, with a bucket, fetched. Raises SettingsError: no scheduler answers, or its workers cannot import this
+    code; WorkerError: workers died repeatedly, or none is left.
     """
 
     def whole(item: Item) -> Any:
@@ -186,6 +199,8 @@ def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]
     import dask
     import dask.distributed as dask_distributed
 
+    if pool.bucket is not None:
+        make = fetching_work(make, pool.bucket)
     cluster = _clusters[pool] = _clusters[pool] or Cluster(pool)
     lost = (WorkerError, CancelledError, dask_distributed.KilledWorker)
     try:

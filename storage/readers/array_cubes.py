@@ -8,100 +8,121 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.envi_headers import MICROMETRES, NANOMETRES, UNSAID
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.array_files import Arrays, FileArray
-from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, Guard, read_by_chunks
+from spectralzoom.pipeline.exposures import taken_with
+from spectralzoom.storage.readers.acquired import acquired_of
+from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, Arrays, FileArray, list_arrays
+from spectralzoom.storage.readers.band_facts import (
+    CENTRES,
+    GOOD_BANDS,
+    WIDTHS,
+    Bands,
+    are_wavelengths,
+    bad_bands,
+    bands_of_fields,
+    is_spectral,
+    letters,
+)
+from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, DIMS, CubeSource, LineFacts, read_by_chunks, reading
 from spectralzoom.storage.readers.places import Place, place_of_dataset
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _ALONG = ("downtrack", "along_track", "number_of_lines")
 _ACROSS = ("crosstrack", "across_track", "pixels_per_line")
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", *_ALONG)
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
 BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel", "channels", "spectral")
-WAVELENGTHS = (
-    *("wavelength", "wavelengths", "radiation_wavelength", "wavelength_nm", "wavelengths_nm"),
-    *("wl", "lambda", "nm", "wavelength_3d"),
-)
-METRES = {"m", "meter", "meters", "metre", "metres"}
 
-UNNAMED = "dims have no names, read as y, x, band"
-GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
+Turn = Callable[[NDArray[Any]], NDArray[Any]]
+NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 MOST_UNEVEN = 16  # times that a picture is longer than wide
 _SHOWN = 5  # arrays in a note
 
 
-@dataclass(frozen=True)
-class ArrayCube:
-    """An array that is a cube, with its axes of rows, columns and (if there are some) bands."""
+def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource:
+    """Open an array of a file or Zarr store as a cube: the one that is named, or the only one with three axes.
 
-    name: str
-    array: FileArray
-    order: tuple[int, ...]
-    notes: tuple[str, ...] = ()
-
-    @property
-    def dims(self) -> Sequence[str]:
-        """Return names of all axes, or those of their order if they have none."""
-        return self.array.dims or ("y", "x", "band")
-
-
-def find_cube(arrays: Arrays, variable: str | None, path: Path, *, labels: bool = False) -> ArrayCube:
-    """Return the array that is named, or the only one with three axes (of ``labels``: with two), else with two.
-
-    Only names, shapes and attributes are read. Raises SceneError: there is no such array, there are several, or the
-    axes are not y, x and band.
+    Only attributes and coordinates are read. ``variable`` is its name, alone or with its groups
+    (``SERC/Reflectance/Reflectance_Data``); of ``labels`` an array with two axes is preferred. Packed lines are
+    float32, NaN where there is no value. Raises SceneError: the file is damaged, or claims far more than it can hold;
+    it has no such array or several; or the axes are not y, x and band.
     """
-    name, notes = _chosen(arrays, variable, path, (2, 3) if labels else (3, 2))
-    order, more = _axes(arrays, name, path)
-    return ArrayCube(name, arrays[name], order, (*notes, *more))
-
-
-def cube_source(path: Path, cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any], guard: Guard) -> CubeSource:
-    """Return the cube with its lines, bands and place; ``guard`` turns errors of reading into SceneError.
-
-    Packed lines are float32, NaN where there is no value. Whole numbers with one fill value and no valid range stay
-    whole. Raises SceneError: the cube claims more than its file or the memory can hold.
-    """
-    array, order = cube.array, cube.order
-    array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
-    about = _packing_of(array.attrs)
-    values = _Values.of(about, array.dtype.newbyteorder("="))
-    sizes = [int(array.shape[axis]) for axis in order]
+    ending = path.suffix.lower()
+    guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
+    with guard():
+        arrays, about = list_arrays(path)
+        name, notes = _chosen(arrays, variable, path, (2, 3) if labels else (3, 2))
+        array = arrays[name]
+        order, named = _axes(arrays, name, path)
+        height, width, count = (*(int(array.shape[axis]) for axis in order), 1)[:3]
+        if ending in ARRAY_ENDINGS and count == 1 and not labels and min(height, width):
+            _check_picture((height, width), path)
+        array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
+        dims = [dim or f"axis {at}" for at, dim in enumerate((array.dims or DIMS)[: array.ndim])]
+        near = _in_scope(arrays, name)
+        bands, bad, doubts = _bands_of(name, array, dims[order[2]] if len(order) == 3 else "", near, count)
+        geobox, of_place = _place_of(name, dims, order, near, {**about, **array.attrs})
+        acquired = acquired_of({**about, **array.attrs, **_time_of(near)})
+        packing = _packing_of(array.attrs)
+        native = array.dtype.newbyteorder("=")
+        unpack, nodata = _unpacking(packing, native)
+        taken = taken_with(path.name, about, array.attrs)
+        files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
         selection = [slice(None)] * array.ndim
         selection[order[0]] = slice(start, stop)
         with guard():
-            block = np.transpose(np.asarray(array[tuple(selection)]), order)
-            native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
-            native = native[..., None] if native.ndim == 2 else native
-            return values.of_numbers(native)
+            block = np.ascontiguousarray(np.transpose(np.asarray(array[tuple(selection)]), order), native)
+            block = block.reshape(*block.shape[:2], count)
+            return block if unpack is None else unpack(block)
 
-    with guard():
-        geobox, notes = _place_of(cube, arrays, attributes)
+    unit = str(array.attrs.get("units", "")).strip()
+    said = [*acquired.notes, *array.notes, *notes]
+    said += [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
+    said += [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
+    exposure_ms = None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)
+    packed = {key: np.ravel(one).tolist() for key, one in sorted(packing.items())}
     return CubeSource(
         name=path.name,
-        shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
-        dtype=values.dtype,
-        read=read_by_chunks(read, sizes[0], array.chunks[order[0]]),
-        files=(path,),
-        bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
-        nodata=values.nodata,
+        shape=(height, width, count),
+        dtype=native if unpack is None else np.dtype(np.float32),
+        read=read_by_chunks(read, height, array.chunks[order[0]]),
+        files=files,
+        lines=LineFacts(exposure_ms=exposure_ms),
+        taken=taken,
+        bands=bands,
+        nodata=nodata,
         geobox=geobox,
-        scaling="" if values.plain else json.dumps({key: np.ravel(one).tolist() for key, one in sorted(about.items())}),
-        notes=(*array.notes, *cube.notes, *notes),
+        bad_bands=bad,
+        acquired=acquired.text,
+        scaling="" if unpack is None else json.dumps(packed),
+        notes=(*said, *of_place, *bands.notes, *doubts),
     )
+
+
+def _time_of(near: Arrays) -> dict[str, Any]:
+    """Return the value of a coordinate ``time`` with one element, by its units; empty where there is none."""
+    found = near.get("time")
+    if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
+        return {}
+    about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
+    import xarray as xr  # takes a second
+
+    time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
+    return {"time": xr.decode_cf(time)["time"].values}
 
 
 _CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
@@ -120,67 +141,43 @@ def _packing_of(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return known
 
 
-@dataclass(frozen=True)
-class _Values:
-    """How the numbers of a file become values."""
+def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
+    """Return the function from numbers of a file to values, NaN where there is none, and the no-data value.
 
-    stored: np.dtype[Any]
-    coded: Mapping[str, Any]
-    fills: tuple[float, ...]  # as values
-    low: float | None
-    high: float | None
+    The function is None where the numbers are the values, with one no-data value at most.
+    """
+    coded = {name: about[name] for name in _CODED if name in about}
+    if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
+        coded = {name: value for name, value in coded.items() if name == "_Unsigned"}
+    listed = [_as_value(number, coded, stored) for name in _FILLS for number in np.ravel(about.get(name, ()))]
+    fills = list(dict.fromkeys(one for one in listed if one is not None))
+    pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
+    pair = pair if np.size(pair) == 2 else (None, None)
+    # floating ends of whole numbers with a scale are values, others are packed (NetCDF Users Guide, conventions)
+    scaled = stored.kind in "biu" and bool(set(coded) - {"_Unsigned"})
+    are_values = [scaled and np.asarray(end).dtype.kind == "f" for end in pair]
+    ends = [
+        None if end is None else float(end) if is_value else _as_value(end, coded, stored)
+        for end, is_value in zip(pair, are_values, strict=True)
+    ]
+    if not coded and len(fills) < 2 and ends == [None, None]:
+        return None, fills[0] if fills else None
+    low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
 
-    @classmethod
-    def of(cls, about: Mapping[str, Any], stored: np.dtype[Any]) -> _Values:
-        """Return the rule by the attributes of an array."""
-        coded = {name: about[name] for name in _CODED if name in about}
-        if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
-            coded = {name: value for name, value in coded.items() if name == "_Unsigned"}
-        listed = [number for name in _FILLS for number in np.ravel(about.get(name, ()))]
-        fills = [_as_value(number, coded, stored) for number in listed]
-        pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
-        pair = pair if np.size(pair) == 2 else (None, None)
-        ends = [None if end is None else _end_as_value(end, coded, stored) for end in pair]
-        low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
-        return cls(stored, coded, tuple(dict.fromkeys(one for one in fills if one is not None)), low, high)
+    def unpack(numbers: NDArray[Any]) -> NDArray[Any]:
+        values = _decoded(numbers, coded)
+        out = np.isin(values, fills)
+        out |= False if low is None else values < low
+        out |= False if high is None else values > high
+        return np.where(out, np.float32(np.nan), values.astype(np.float32))
 
-    @property
-    def plain(self) -> bool:
-        """Whether the numbers are the values, with one no-data value at most."""
-        return not self.coded and len(self.fills) < 2 and self.low is None and self.high is None
-
-    @property
-    def whole(self) -> bool:
-        """Whether values are whole numbers; without a no-data value those out of the valid range would be lost."""
-        has_nodata = bool(self.fills) or (self.low is None and self.high is None)
-        return self.stored.kind in "biu" and not set(self.coded) - {"_Unsigned"} and has_nodata
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        as_stored = self.plain or self.whole
-        return _decoded(np.zeros(1, self.stored), self.coded).dtype if as_stored else np.dtype(np.float32)
-
-    @property
-    def nodata(self) -> float | None:
-        """Return the no-data value; None where NaN stands for it."""
-        return self.fills[0] if self.fills and (self.plain or self.whole) else None
-
-    def of_numbers(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Return values of `dtype`; the no-data value, or NaN without one, where a number is no value."""
-        if self.plain:
-            return numbers
-        values = _decoded(numbers, self.coded)
-        with np.errstate(invalid="ignore"):
-            out = np.isin(values, self.fills[1:] if self.whole else self.fills)
-            out |= False if self.low is None else values < self.low
-            out |= False if self.high is None else values > self.high
-        values = values.astype(self.dtype, copy=False)
-        void = np.nan if self.nodata is None else self.nodata
-        return np.where(out, values.dtype.type(void), values) if out.any() else values
+    return unpack, None
 
 
 def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
     """Return numbers of a file as values, decoded by xarray."""
+    import xarray as xr
+
     packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
     return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
 
@@ -199,57 +196,64 @@ def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> f
     return float(_decoded(np.array([held], stored), coded)[0])
 
 
-def _end_as_value(end: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
-    """Return an end of the valid range as a value; None if it leaves nothing out.
-
-    Floating ends of whole numbers with a scale are values, others are packed as the numbers are (NetCDF Users Guide,
-    Attribute Conventions).
-    """
-    if stored.kind in "biu" and np.asarray(end).dtype.kind == "f" and set(coded) - {"_Unsigned"}:
-        return float(end)
-    return _as_value(end, coded, stored)
-
-
-def _place_of(cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any]) -> Place:
+def _place_of(
+    name: str, dims: Sequence[str], order: Sequence[int], arrays: Arrays, attributes: Mapping[str, Any]
+) -> Place:
     """Return the place of a cube by the arrays beside it, of which only coordinates along its axes are read."""
-    dims = [dim or f"axis {at}" for at, dim in enumerate(cube.dims[: cube.array.ndim])]
-    sizes = dict(zip(dims, cube.array.shape, strict=True))
+    sizes = dict(zip(dims, arrays[name].shape, strict=True))
+    import xarray as xr
+
     read: dict[str, xr.Variable] = {}
     named: dict[str, xr.Variable] = {}
-    for name, one in arrays.items():
-        axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if name.lower() in words), None)
-        by_name = name if name in dims or axis is None else dims[cube.order[axis]]
+    for key, one in arrays.items():
+        axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if key.lower() in words), None)
+        by_name = key if key in dims or axis is None else dims[order[axis]]
         own = one.dims or (by_name,) * one.ndim  # a scale of HDF5 is its own axis
         fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
         if one.ndim < 2 and fits and one.dtype.kind in "iuf":
-            plain = {key: value for key, value in one.attrs.items() if key not in (*_CODED, *_FILLS, *_ENDS)}
-            read[name] = xr.Variable(own, one[...], plain | _packing_of(one.attrs))
+            plain = {text: value for text, value in one.attrs.items() if text not in (*_CODED, *_FILLS, *_ENDS)}
+            read[key] = xr.Variable(own, one[...], plain | _packing_of(one.attrs))
         else:
-            own = tuple(dims) if name == cube.name else tuple(f"{name} {axis}" for axis in range(one.ndim))
-            named[name] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
+            own = tuple(dims) if key == name else tuple(f"{key} {axis}" for axis in range(one.ndim))
+            named[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
     dataset = xr.decode_cf(xr.Dataset(read, attrs=dict(attributes)), decode_times=False, decode_coords=False)
-    return place_of_dataset(dataset.assign(named), cube.name, (dims[cube.order[0]], dims[cube.order[1]]))
+    return place_of_dataset(dataset.assign(named), name, (dims[order[0]], dims[order[1]]))
 
 
-def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
-    """Return wavelengths and widths in nm; none if their unit is no length."""
-    axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
-    found = _vector(arrays, WAVELENGTHS, count)
-    if found is None and _is_line(arrays, axis, count) and _is_spectral(arrays[axis]):
-        found = axis
-    if found is None:
-        return Bands()
-    centres = np.asarray(arrays[found][...], np.float64).ravel()
-    unit = _unit(arrays[found].attrs)
-    known = {**dict.fromkeys(NANOMETRES, 1.0), **dict.fromkeys(MICROMETRES, 1000.0), **dict.fromkeys(METRES, 1e9)}
-    scale = (1000.0 if centres.max() <= 20 else 1.0) if unit in UNSAID else known.get(unit)  # [nm]
-    if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
-        return Bands()
-    source = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
-    beside = _vector(arrays, ("fwhm",), count)
-    widths = None if beside is None else np.asarray(arrays[beside][...], np.float64).ravel() * scale
-    widths = None if widths is None or not (widths > 0).all() else widths
-    return Bands(centres * scale, widths, f"wavelengths from the array {found}, {source}")
+def _bands_of(
+    cube: str, array: FileArray, axis: str, arrays: Arrays, count: int
+) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
+    """Return facts of the bands by the arrays beside a cube and its attributes; bad bands (from 0), and notes on them.
+
+    Arrays have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``.
+    """
+    fields: dict[str, Any] = {}
+    notes: list[str] = []
+    for name, one in arrays.items():
+        word = _word(name)
+        is_centre, is_width = (kind.fullmatch(letters(word)) is not None for kind in (CENTRES, WIDTHS))
+        if name == axis and not is_centre and is_spectral(one.attrs):
+            word, is_centre = "wavelength", True
+        if is_centre and not _is_line(arrays, name, count):
+            notes.append(f"the array {name} is left out: it has shape {one.shape} for {count} bands")
+        elif (is_centre or is_width or letters(word) in GOOD_BANDS) and _is_line(arrays, name, count):
+            fields |= {word: one[...], f"{word} units": _unit(one.attrs)} if word not in fields else {}
+    if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
+        values = arrays[axis][...].astype(np.float64).ravel()
+        if are_wavelengths(values):
+            fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
+    usable = {key: value for key, value in array.attrs.items() if np.asarray(value).dtype.kind in "iufU"}
+    names = _names_of(arrays, (axis, "band_names", "band_name"), count)
+    found = bands_of_fields(usable | fields, names, cube or "the file")
+    return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
+
+
+def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | None]:
+    """Return the texts, one a band, of the first array of texts that has one of the names; None each without one."""
+    listed = [arrays[name] for name in names if name in arrays]
+    texts = next((one for one in listed if one.shape == (count,) and one.dtype.kind in "SOUT"), None)
+    each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
+    return [None if one is None else np.asarray(one).astype(str).item() for one in each]
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
@@ -278,8 +282,8 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int
     raise SceneError(f"{path} has no array of numbers with the axes y, x and band; {listing}")
 
 
-def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the axes of rows, columns and (if there are some) bands, by their names or in this order; and notes."""
+def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], bool]:
+    """Return the axes of rows, columns and (if there are some) bands, and whether they have names or this order."""
     array = arrays[name]
     named = array.dims
     if array.ndim not in (2, 3):
@@ -287,38 +291,27 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], tuple
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
         )
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS) or dim in arrays for dim in named):
-        counts = {math.prod(one.shape) for key, one in arrays.items() if one.ndim and _word(key) in WAVELENGTHS}
+        counts = {
+            math.prod(one.shape) for key, one in arrays.items() if one.ndim and CENTRES.fullmatch(letters(_word(key)))
+        }
         if array.ndim == 3 and counts & set(array.shape[:2]) and array.shape[2] not in counts:
             raise SceneError(
                 f"{path} holds shape {array.shape} without names of its axes and {max(counts)} wavelengths; expected"
                 " (y, x, band): store it in this order, or name the axes"
             )
-        return tuple(range(array.ndim)), (UNNAMED,)
+        return tuple(range(array.ndim)), False
     words = [_word(dim) for dim in named]
     found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
-    found[2] = found[2] or [at for at, dim in enumerate(named) if _is_spectral(arrays.get(dim))]
+    found[2] = found[2] or [at for at, dim in enumerate(named) if dim in arrays and is_spectral(arrays[dim].attrs)]
     if any(len(places) != 1 for places in found[: array.ndim]) or (array.ndim == 2 and found[2]):
         raise SceneError(f"{path} has dims {', '.join(named)}; expected y, x, band (or band, y, x); rename them")
-    return tuple(places[0] for places in found[: array.ndim]), ()
-
-
-def _is_spectral(coordinate: FileArray | None) -> bool:
-    """Return whether a coordinate has wavelengths, by its standard name or unit."""
-    if coordinate is None or coordinate.ndim != 1:
-        return False
-    return coordinate.attrs.get("standard_name") in WAVELENGTHS or _unit(coordinate.attrs) in NANOMETRES | MICROMETRES
-
-
-def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:
-    """Return the first array of ``count`` numbers that has one of the names, in their order."""
-    found = (name for word in words for name in arrays if _word(name) == word and _is_line(arrays, name, count))
-    return next(found, None)
+    return tuple(places[0] for places in found[: array.ndim]), True
 
 
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
     """Return whether an array has ``count`` numbers along one of its axes."""
     shape = arrays[name].shape if name in arrays else ()
-    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "uif"
+    return bool(shape) and math.prod(shape) == max(shape) == count and arrays[name].dtype.kind in "buif"
 
 
 def _word(name: str) -> str:
@@ -329,7 +322,7 @@ def _unit(attributes: Mapping[str, Any]) -> str:
     return str(attributes.get("units", attributes.get("unit", ""))).strip().lower()
 
 
-def check_picture(shape: tuple[int, ...], where: object) -> None:
+def _check_picture(shape: tuple[int, ...], where: object) -> None:
     """Refuse a scene of one band that is a table of spectra (SceneError)."""
     if max(shape) < max(MOST_UNEVEN * min(shape), 1000):
         return
@@ -341,21 +334,12 @@ def check_picture(shape: tuple[int, ...], where: object) -> None:
     )
 
 
-def in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
+def _in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
     """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
-    groups = name.split("/")[:-1]
-    heads = ["".join(f"{group}/" for group in groups[:depth]) for depth in range(len(groups) + 1)]
-    return {
-        path.removeprefix(head): array
-        for head in heads
-        for path, array in arrays.items()
-        if path.startswith(head) and "/" not in path.removeprefix(head)
-    } | {path: array for path, array in arrays.items() if "/" in path}
-
-
-def marked_bands(arrays: Arrays, count: int) -> tuple[int, ...]:
-    """Return the bands (from 0) that a list of good bands marks by 0."""
-    for name, array in arrays.items():
-        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
-            return tuple(np.flatnonzero(array[...] == 0).tolist())
-    return ()
+    group = f"/{name}".rpartition("/")[0]
+    near: dict[str, FileArray] = {}
+    for path, array in sorted(arrays.items(), key=lambda one: one[0].count("/")):
+        home, _, own = f"/{path}".rpartition("/")
+        if f"{group}/".startswith(f"{home}/"):
+            near[own] = array
+    return near | {path: array for path, array in arrays.items() if "/" in path}

@@ -8,42 +8,43 @@ from __future__ import annotations
 
 import base64
 import importlib
-import json
 import math
 import mmap
 import os
 import struct
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-import xarray as xr
 import zarr
 from numpy.typing import NDArray
+from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.checked_chunks import WIDEST, CheckedStore, outside_links, read_hdf5, unpack
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
+from spectralzoom.storage.readers.own_files import within
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 ARRAY_ENDINGS = (".npy", ".mat")
 HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
 METADATA = ("zarr.json", ".zarray", ".zgroup")
-CODECS = {
-    *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),  # checksums
-    *("blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "pcodec", "zfpy", "packbits"),  # packers
-    *("bytes", "transpose", "sharding_indexed", "shuffle"),  # orders
-    *("delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"),  # of numbers
-}
 _CLASSIC = b"CDF"  # with which NetCDF 3 begins
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
 _SIZES = (("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("lines", "samples"), ("height", "width"))
+_MAT_MATRIX, _MAT_PACKED = 14, 15  # kinds of elements
+_MAT_HEAD = 4096  # bytes for sizes and name of an array
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -124,23 +125,63 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str, kind: str) -> NDArray[Any]:
+    def load(name: str, number: int, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
+        most = 2 * WIDEST * math.prod(shape) + _MAT_HEAD  # complex numbers are two
         with _mapped(path) as content:
-            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
+            values = np.asarray(scipy_io.loadmat(_plain_mat(content, most, number), variable_names=[name])[name])
         if np.iscomplexobj(values):
             raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
         return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
     with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of repeated names
-        listed = scipy_io.whosmat(content)
-    size = path.stat().st_size
-    ratio = 8 * DEFLATE_RATIO  # a double may be one byte
+        listed = scipy_io.whosmat(_plain_mat(content, _MAT_HEAD))
+    size, most = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
-        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, ratio)
-        for name, shape, kind in listed
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, at, shape, kind), size, most)
+        for at, (name, shape, kind) in enumerate(listed)
         if kind in _MATLAB
     }
+
+
+def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> mmap.mmap:
+    """Return a .mat file without packing: the first ``most`` bytes of each element, or all of the ``wanted`` one.
+
+    ValueError: the wanted element has more of them.
+    """
+    if 0 in content[:4]:  # version 4 packs nothing
+        return content
+    parts = [content[:128]]
+    order = "<II" if content[126:128] == b"IM" else ">II"
+    at, number = 128, 0
+    while at + 8 <= len(content):
+        kind, size = struct.unpack(order, content[at : at + 8])
+        if wanted in (None, number):
+            body = content[at + 8 : at + 8 + (size if kind == _MAT_PACKED else min(size, most))]
+            if kind == _MAT_PACKED:
+                plain = zlib.decompressobj().decompress(body, most) if wanted is None else unpack("zlib", body, most)
+                kind, body = _MAT_MATRIX, plain[8:]
+            _check_parts(body, order, 3 if wanted is None else 5)  # flags, sizes and name, and numbers
+            parts += [struct.pack(order, kind, len(body)), body]
+        at += 8 + size
+        number += 1
+    whole = b"".join(parts)
+    plain_file = mmap.mmap(-1, len(whole))
+    plain_file.write(whole)
+    plain_file.seek(0)
+    return plain_file
+
+
+def _check_parts(body: bytes, order: str, count: int) -> None:
+    """Refuse an element of which one of the first parts claims more bytes than it has (ValueError)."""
+    at = 0
+    for _ in range(count):
+        if at + 8 <= len(body):
+            kind, size = struct.unpack(order, body[at : at + 8])
+            size = 0 if kind >> 16 else size  # up to four bytes lie within the eight
+            if size > len(body) - at - 8:
+                raise ValueError(f"a part of an array claims {size} bytes, and {len(body) - at - 8} are there")
+            at += 8 + -(-size // 8) * 8
 
 
 @contextmanager
@@ -168,55 +209,47 @@ def as_pictures(arrays: dict[str, FileArray]) -> dict[str, FileArray]:
     """
     words = {name.lower().replace("_", ""): one for name, one in arrays.items() if math.prod(one.shape) == 1}
     pair = next((names for names in _SIZES if set(names) <= set(words)), None)
-    if pair is None:
+    sides = () if pair is None else tuple(float(words[name][...].item()) for name in pair)
+    if not sides or not all(side.is_integer() and side > 0 for side in sides):
         return arrays
-    height, width = (float(words[name][...].item()) for name in pair)
-    if not (height.is_integer() and width.is_integer() and min(height, width) > 0):
-        return arrays
-    shape = int(height), int(width)
-    tables = {name: one for name, one in arrays.items() if one.ndim == 2 and math.prod(shape) in one.shape}
-    return {**arrays, **{name: _as_picture(one, shape) for name, one in tables.items() if one.shape != shape}}
+    height, width = map(int, sides)
 
+    def turned(table: FileArray) -> FileArray:
+        bands_first = table.shape[1] == height * width
+        bands = table.shape[0 if bands_first else 1]
 
-def _as_picture(table: FileArray, shape: tuple[int, int]) -> FileArray:
-    """Return a table of spectra as a cube (y, x, band)."""
-    pixels = shape[0] * shape[1]
-    bands_first = table.shape[1] == pixels
-    bands = table.shape[0] if bands_first else table.shape[1]
+        def load() -> NDArray[Any]:
+            values = table[...].T if bands_first else table[...]
+            return values.reshape(height, width, bands, order="F")
 
-    def load() -> NDArray[Any]:
-        values = table[...].T if bands_first else table[...]
-        return values.reshape(*shape, bands, order="F")
+        cube = _whole(table.where, (height, width, bands), table.dtype, load, table.stored, table.ratio)
+        order = "(band, pixel)" if bands_first else "(pixel, band)"
+        of_sizes = f"{height} x {width} px (y x x), as the sizes beside it say; pixels go down columns"
+        return replace(cube, notes=(f"a table {order} of {of_sizes}",))
 
-    order = "(band, pixel)" if bands_first else "(pixel, band)"
-    note = f"a table {order} of {shape[0]} x {shape[1]} px (y x x), as the sizes beside it say; pixels go down columns"
-    cube = _whole(table.where, (*shape, bands), table.dtype, load, table.stored, table.ratio)
-    return replace(cube, notes=(note,))
+    tables = {name: one for name, one in arrays.items() if one.ndim == 2 and height * width in one.shape}
+    return {**arrays, **{name: turned(one) for name, one in tables.items() if one.shape != (height, width)}}
 
 
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     """List the arrays of a NetCDF file of version 3."""
-    with xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False) as opened:
-        listed, attributes = {str(name): one for name, one in opened.variables.items()}, dict(opened.attrs)
+    import xarray as xr
+
+    opened = partial(xr.open_dataset, path, engine="scipy", decode_cf=False, cache=False)
 
     def read(name: str, part: Any) -> NDArray[Any]:
-        with xr.open_dataset(path, engine="scipy", decode_cf=False, cache=False) as file:
+        with opened() as file:
             return np.asarray(file.variables[name][part].values)
 
-    size = path.stat().st_size
-    return {
-        name: FileArray(
-            f"{path}:{name}",
-            one.shape,
-            one.dtype,
-            dict(one.attrs),
-            partial(read, name),
-            (1,) * one.ndim,
-            size,
-            tuple(map(str, one.dims)),
+    def array(name: str, one: xr.Variable) -> FileArray:
+        shape, size = one.shape, path.stat().st_size
+        get = partial(read, name)
+        return FileArray(
+            f"{path}:{name}", shape, one.dtype, one.attrs, get, (1,) * one.ndim, size, tuple(map(str, one.dims))
         )
-        for name, one in listed.items()
-    }, attributes
+
+    with opened() as file:
+        return {str(name): array(str(name), one) for name, one in file.variables.items()}, dict(file.attrs)
 
 
 def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
@@ -226,14 +259,14 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     def read(name: str, part: Any) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
-            return np.asarray(file[name][part])
+            return read_hdf5(file[name], part)
 
     def visit(name: str, item: Any) -> None:
-        """Add an array of numbers, or a single text such as GDAL's grid mapping."""
+        """Add an array of numbers, a single text such as GDAL's grid mapping, or a list of texts such as band names."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
         about = _plain(item.attrs)
-        is_text = item.dtype.kind in "SO" and not item.ndim
+        is_text = item.dtype.kind in "SO" and item.ndim < 2
         if (item.dtype.kind in "buif" or is_text) and not str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION):
             dims = tuple(dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims)
             chunks = item.chunks or (1,) * item.ndim
@@ -243,6 +276,8 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone
+        if not any(one.ndim > 1 for one in arrays.values()) and (led := outside_links(file)):
+            raise SceneError(f"{path}: {led[0]}, which is not followed; copy what it leads to into the file (h5copy)")
         return arrays, _plain(file.attrs)
 
 
@@ -264,19 +299,14 @@ def find_zarr_store(path: Path) -> Path | None:
     """Return the Zarr store at a path, or the ``cube.zarr`` in it."""
     for folder in (path, path / "cube.zarr"):
         if any((folder / name).is_file() for name in METADATA):
-            return folder
+            return within(path, folder)
     return None
 
 
 def _zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     """List the arrays of a store (SceneError: a codec is not allowed, a link leads out, or it is a survey's own)."""
     _check_store(path)
-    # consolidated metadata of a group are not used: only those of its members were checked
-    is_group = (path / ".zgroup").is_file() or (
-        (path / "zarr.json").is_file() and _read_json(path / "zarr.json").get("node_type") == "group"
-    )
-    options: dict[str, Any] = {"use_consolidated": False} if is_group else {}
-    node = zarr.open(path, mode="r", **options)
+    node = zarr.open(CheckedStore(LocalStore(path, read_only=True)), mode="r")
     if not isinstance(node, zarr.Group):
         return {"": _zarr_array(path, node)}, {}
     if "sweep" in node.attrs:
@@ -324,36 +354,10 @@ def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
 
 
 def _check_store(path: Path) -> None:
-    """Refuse links out of the store, special files, and unknown codecs (SceneError)."""
-    home = path.resolve()
+    """Refuse links out of the store and special files (SceneError)."""
     for place, folders, files in os.walk(path):
         for entry in (Path(place, name) for name in (*folders, *files)):
-            if entry.is_symlink() and not entry.resolve().is_relative_to(home):
-                raise SceneError(f"{entry} is a link out of the store, which is not followed; copy what it leads to")
+            if entry.is_symlink():
+                within(path, entry)
             if entry.name in files and not entry.is_file():  # reading a pipe may never end
                 raise SceneError(f"{entry} is no file; take it out of the store")
-    for folder in (path, *(entry for entry in sorted(path.iterdir()) if entry.is_dir())):
-        for file in (folder / "zarr.json", folder / ".zarray"):
-            for codec in _codecs(_read_json(file)) if file.is_file() else ():
-                if codec.lower().removeprefix("numcodecs.") not in CODECS:
-                    raise SceneError(
-                        f"{file} asks for the codec {codec!r}, which is not read; store plain numbers with blosc, zstd "
-                        "or gzip"
-                    )
-
-
-def _read_json(path: Path) -> Mapping[str, Any]:
-    content = json.loads(path.read_bytes())
-    if not isinstance(content, dict):
-        raise SceneError(f"{path} holds no table; copy the store again")
-    return content
-
-
-def _codecs(content: object) -> Iterator[str]:
-    """Yield the names of all codecs in an array's metadata, nested ones too."""
-    if isinstance(content, dict):
-        for key in ("codecs", "index_codecs", "filters", "compressor", "compressors"):
-            listed = content.get(key) or []
-            for codec in listed if isinstance(listed, list) else [listed]:
-                yield str(codec.get("name", codec.get("id"))) if isinstance(codec, dict) else str(codec)
-                yield from _codecs(codec.get("configuration") if isinstance(codec, dict) else None)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -15,17 +15,14 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-import odc.geo.xr as odc_xr
-import xarray as xr
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from xarray.backends import BackendArray
-from xarray.core import indexing
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.pipeline.source import References
+from spectralzoom.storage.readers.band_facts import Bands
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
@@ -81,7 +78,6 @@ DIMS = ("y", "x", "band")
 MOST_MISSING = 1 << 14  # lines that a cube may claim beyond those in its file
 
 ReadLines = Callable[[int, int], NDArray[Any]]
-Guard = Callable[[], AbstractContextManager[None]]  # turns errors of reading into SceneError
 
 
 @dataclass(frozen=True)
@@ -91,15 +87,6 @@ class LineFacts:
     valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
     exposure_ms: NDArray[np.float64] | None = None  # (line,)
-
-
-@dataclass(frozen=True)
-class Bands:
-    """Facts of the bands; None if not known."""
-
-    wavelength_nm: NDArray[np.float64] | None = None  # (band,)
-    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
-    origin: str = ""  # one sentence
 
 
 @dataclass(frozen=True)
@@ -129,55 +116,6 @@ class CubeSource:
     def valid(self) -> NDArray[np.bool_]:
         """Return (line,) whether each line is whole in its file."""
         return np.ones(self.shape[0], np.bool_) if self.lines.valid is None else self.lines.valid
-
-    def data_array(self) -> xr.DataArray:
-        """Return the cube for xarray; values are read when they are needed."""
-        marked = np.isin(np.arange(self.shape[2]), self.bad_bands)
-        facts: dict[str, tuple[str | tuple[str, ...], Any, dict[str, str]]] = {
-            "wavelength": ("band", self.bands.wavelength_nm, {"units": "nm"}),
-            "fwhm": ("band", self.bands.fwhm_nm, {"units": "nm"}),
-            "bad_band": ("band", marked if marked.any() else None, {}),
-            "valid": ("y", self.lines.valid, {}),
-            "time_s": ("y", self.lines.time_s, {"units": "s"}),
-            "exposure_ms": ("y", self.lines.exposure_ms, {"units": "ms"}),
-            "dark": (("x", "band"), self.dark, {}),
-            "white": (("x", "band"), self.white, {}),
-            "void": (("y", "x"), self.void, {}),
-        }
-        known = {name: fact for name, fact in facts.items() if fact[1] is not None}
-        places = {} if self.geobox is None else odc_xr.xr_coords(self.geobox, dims=("y", "x"))
-        about: dict[str, Any] = {
-            "notes": self.notes,
-            "files": tuple(map(str, self.files)),
-            "wavelengths_from": self.bands.origin,
-        }
-        about |= {} if self.nodata is None else {"_FillValue": self.nodata}
-        about |= {} if self.acquired is None else {"acquired": self.acquired}
-        lines = indexing.LazilyIndexedArray(_Lines(self))
-        return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=self.name, attrs=about)
-
-
-class _Lines(BackendArray):
-    """Lines of a cube as xarray asks for them."""
-
-    def __init__(self, source: CubeSource) -> None:
-        self.source, self.shape, self.dtype = source, source.shape, source.dtype
-
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[Any]:
-        basic = indexing.IndexingSupport.BASIC
-        return indexing.explicit_indexing_adapter(key, self.shape, basic, self._part)  # type: ignore[no-any-return]
-
-    def _part(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
-        """Return a part by whole numbers and slices."""
-        numbers = range(self.shape[0])[key[0]]
-        if isinstance(numbers, int):
-            return self.source.read(numbers, numbers + 1)[(0, *key[1:])]
-        if not numbers:
-            return np.empty((0, *self.shape[1:]), self.dtype)[(slice(None), *key[1:])]
-        first = min(numbers)
-        block: NDArray[Any] = self.source.read(first, max(numbers) + 1)
-        part: NDArray[Any] = block[np.array(numbers) - first][(slice(None), *key[1:])]
-        return part
 
 
 def check_cube_source(source: CubeSource) -> None:

@@ -1,13 +1,8 @@
 """Open ENVI cubes: one file, or the parts of one cube in a folder of a Headwall camera.
 
-::
-
-    raw_0  raw_0.hdr  raw_2000  raw_2000.hdr     parts of one cube, each named by its first frame
-    frameIndex_0.txt  frameIndex_2000.txt        when each frame was taken
-    darkReference(.hdr)  whiteReference(.hdr)    found by how their names begin
-
-Folders have the layout of the Nano-Hyperspec. The reader was tested on small folders in this layout, and on the
-references of a real MV.X.
+A folder has the layout of the Nano-Hyperspec: ``raw_<frame>``, each named by its first frame, times of the frames in
+``frameIndex_<frame>.txt``, ``darkReference`` and ``whiteReference``. The reader was tested on small folders in this
+layout, and on the references of a real MV.X.
 """
 
 from __future__ import annotations
@@ -34,8 +29,10 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, Bands, CubeSource, LineFacts
-from spectralzoom.storage.readers.image_files import bad_bands, rescaled
+from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields, numbers_of_list
+from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
+from spectralzoom.storage.readers.image_files import rescaled
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
@@ -107,13 +104,13 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
             raise SceneError(
                 f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
             )
-        return path, data
+        return path, within(path, data)
     names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
     header = next((file for file in map(path.with_name, names) if file.is_file()), None)
     if header is None:
         wanted = " or ".join(dict.fromkeys(names[:2]))
         raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
-    return header, path
+    return within(path, header), path
 
 
 def load_envi_header(path: Path) -> EnviHeader:
@@ -153,11 +150,10 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:
     """Return the numbers of a list in a header, one a band; the default where there is none. SceneError: others."""
-    words = [word for word in re.split(r"[{},\s]+", fields.get(name, "")) if word]
-    found = [finite_number(word) for word in words] or [default] * count
-    if len(found) != count or None in found:
+    found = numbers_of_list(fields[name], count) if fields.get(name) else np.full(count, default)
+    if found is None or not np.isfinite(found).all():
         raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} numbers; correct the header")
-    return np.array(found, np.float64)
+    return found
 
 
 def open_headwall_cube(folder: Path) -> CubeSource:
@@ -166,12 +162,12 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     Lines are missing between parts, and at the end of a file that is cut off. Empty parts are left out. Raises
     SceneError: a part cannot be used, parts differ in their frames, or too many lines are missing.
     """
-    files = ((_PART.fullmatch(entry.name), entry) for entry in folder.iterdir() if entry.suffix.lower() == ".hdr")
-    headers = dict(sorted((int(match[1]), entry) for match, entry in files if match is not None and entry.is_file()))
-    for entry in sorted(folder.iterdir()):
-        match = _PART.fullmatch(entry.name)
-        if headers and match is not None and entry.is_file() and int(match[1]) not in headers:
-            raise SceneError(f"{entry} has no header {entry.stem}.hdr; copy the header, or move {entry.name} elsewhere")
+    entries = [entry for entry in sorted(folder.iterdir()) if entry.is_file()]
+    numbered = [(int(match[1]), entry) for entry in entries if (match := _PART.fullmatch(entry.name)) is not None]
+    headers = dict(sorted(one for one in numbered if one[1].suffix.lower() == ".hdr"))
+    if headers and (lone := [entry for number, entry in numbered if number not in headers]):
+        name = lone[0].name
+        raise SceneError(f"{lone[0]} has no header {lone[0].stem}.hdr; copy the header, or move {name} elsewhere")
     if not headers:
         raise SceneError(
             f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
@@ -180,7 +176,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     notes: list[str] = []
     opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        data = find_envi_pair(header)[1]
+        data = find_envi_pair(within(folder, header))[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
@@ -196,7 +192,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     if any("map info" in cube.header.fields for cube in opened.values()):
         notes.append("the map info of its parts is not read: lines of a folder are on no map; name one file")
     source = _joined(folder.resolve().name, dict(zip(starts, opened.values(), strict=True)), notes)
-    listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in folder.iterdir() if file.is_file())
+    listed = ((FRAME_INDEX.fullmatch(file.name), file) for file in entries)
     indices = {int(match[1]): file for match, file in listed if match is not None and int(match[1]) in opened}
     if not indices:
         return source
@@ -205,13 +201,20 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         if number not in indices:
             notes.append(f"there is no frame index for {cube.path.name}")
             continue
-        index = load_frame_index(indices[number])
+        index = load_frame_index(within(folder, indices[number]))
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
         times.put(start, own)
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
-    return replace(
-        source, files=(*source.files, *indices.values()), lines=_timed(source.lines, times), notes=tuple(notes)
-    )
+    lines, known = source.lines, times.stamp_us >= 0
+    if known.any() and np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
+        lines = replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
+    return replace(source, files=(*source.files, *indices.values()), lines=lines, notes=tuple(notes))
+
+
+def bands_of_header(header: EnviHeader, where: str) -> Bands:
+    """Return (band,) wavelengths and widths of a header, of a library (sample,), or the notes on why there are none."""
+    count = header.samples if "spectral library" in header.kind.lower() else header.bands
+    return bands_of_fields(header.fields, [None] * count, where)
 
 
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
@@ -228,11 +231,10 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
     taken, exposure_ms = _taken(parts, height, notes)
-    with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
-    bands = Bands()
-    if with_bands is not None:
-        header = with_bands.header
-        bands = Bands(header.wavelength_nm, header.fwhm_nm, f"wavelengths from {with_bands.header_path.name}")
+    of_parts = [bands_of_header(one.header, one.header_path.name) for one in cubes]
+    bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
+    bad, doubts = bad_bands(cubes[0].header.fields, count)
+    notes += [*bands.notes, *doubts]
 
     acquired = acquired_of({**cubes[0].header.settings, **cubes[0].header.fields})
 
@@ -258,7 +260,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         taken=taken,
         bands=bands,
         nodata=cubes[0].header.nodata,
-        bad_bands=bad_bands(cubes[0].header.fields.get("bbl"), count),
+        bad_bands=bad,
         acquired=acquired.text,
         notes=(*notes, *acquired.notes),
     )
@@ -274,24 +276,17 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
         for start, part in parts.items()
     }
     first = next(iter(every.values()))
+    for one in every.values():
+        check_parts(one, first)
+    if all(one.exposure_ms is None for one in every.values()):
+        return first, None
     exposure_ms = np.full(height, np.nan)
     for start, one in every.items():
-        check_parts(one, first)
         exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
-    if np.isnan(exposure_ms).all():
-        return first, None
     usual = float(np.nanmedian(exposure_ms))
     unknown = [one.where for one in every.values() if one.exposure_ms is None]
     notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]
     return first, np.nan_to_num(exposure_ms, nan=usual)
-
-
-def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
-    """Add the times of frame indices."""
-    known = times.stamp_us >= 0
-    if not known.any() or not np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
-        return lines
-    return replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
 
 
 def load_frame_index(path: Path) -> FrameIndex:

@@ -14,6 +14,7 @@ from spectralzoom.pipeline.exposures import Frames, Taken, taken_with
 from spectralzoom.storage.readers.array_files import load_npy
 from spectralzoom.storage.readers.cube_sources import reading
 from spectralzoom.storage.readers.envi_files import open_envi_cube
+from spectralzoom.storage.readers.own_files import within
 
 KINDS = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
 
@@ -35,7 +36,7 @@ def find_reference(folder: Path, kind: str) -> Path | None:
     if len(found) > 1:
         names = ", ".join(entry.name for entry in found)
         raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
-    return found[0] if found else None
+    return within(folder, found[0]) if found else None
 
 
 def find_frames(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Frame]:
@@ -48,7 +49,7 @@ def find_frames(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Fram
         beside = (stem.with_name(f"{stem.name}.{kind}{ending}") for ending in (".hdr", ".npy"))
         if (file := stated.get(kind)) is not None and not file.exists():
             raise SceneError(f"there is no file {file}; check the name (seen from {Path.cwd()})")
-        file = file or next((one for one in beside if one.is_file()), None)
+        file = file or next((within(stem.parent, one) for one in beside if one.is_file()), None)
         file = find_reference(stem.parent, kind) if file is None and kind != "bad" else file
         if file is not None:
             frames[kind] = load_frame(file, kind)
@@ -77,5 +78,5 @@ def load_frame(path: Path, kind: str = "reference") -> Frame:
 
 
 def taken_of(frames: Mapping[str, Frame]) -> Frames:
-    """Return values of frames and how they were taken."""
+    """Return the values of frames and how they were taken."""
     return {kind: (frame.values, frame.taken) for kind, frame in frames.items()}

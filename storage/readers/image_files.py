@@ -8,25 +8,25 @@ from __future__ import annotations
 
 import importlib
 import math
-import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
-from spectralzoom.pipeline.envi_headers import finite_number, wavelengths_nm
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
+from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
     MOST_RATIO,
-    Bands,
     CubeSource,
     check_claim,
     check_memory,
@@ -34,7 +34,7 @@ from spectralzoom.storage.readers.cube_sources import (
     reading,
     unpacked,
 )
-from spectralzoom.storage.readers.orientation import orientation_of, upright
+from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 from spectralzoom.storage.readers.places import place_of_file
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
@@ -49,15 +49,6 @@ ALPHA_NOTE = (
     "its alpha channel says where there are pixels, and is no band; if it is one, write so into the file"
     " (gdal_edit.py -colorinterp_4 undefined)"
 )
-RGB_NM = (640.0, 550.0, 460.0)
-NEAR_INFRARED_NM = 800.0
-GREY_NM = 550.0
-_COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
-    ("gray",): (GREY_NM,),
-    ("red", "green", "blue"): RGB_NM,
-    ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
-    ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
-}
 
 
 def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
@@ -69,7 +60,9 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     driver = _DRIVERS[path.suffix.lower()]
+    check_sidecars(path)
     with _opened(path) as file:
+        check_overviews(file, path)
         if len(file.subdatasets) > 1:
             raise SceneError(
                 f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
@@ -77,19 +70,30 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             )
         block = max(file.block_shapes)
         item = max(np.dtype(one).itemsize for one in file.dtypes)
-        claimed = (file.height, file.width, file.count)
-        _check_size(path, driver, claimed, item, math.prod(block) * file.count)
+        claimed = file.height * file.width * file.count * item
+        if driver != "JPEG":  # its blocks may have no byte each
+            check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
+        at_a_time = math.prod(block) * file.count * item + claimed // file.height * BLOCK_LINES
+        check_memory(path, at_a_time if driver in _CALLED else claimed * 3)
         kinds = [kind.name for kind in file.colorinterp]
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
+        of_all = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
+        if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
+            alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
-        kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
+        void = _void(file, alpha)
+        masked = void if scaled and void is not None and not void.all() else None
+        kinds_of_kept = (np.dtype(file.dtypes[band]) for band in keep or [0])
+        kind = np.dtype(np.float32) if masked is not None else np.result_type(*kinds_of_kept)
         height, width = file.height, file.width
         geobox, where = place_of_file(file)
-        known, of_bands = _bands_of(file, keep, [kinds[band] for band in keep], path)
+        tags, (names, colours) = _tags_of(file, keep), ([one[at] for at in keep] for one in (file.descriptions, kinds))
+        known = bands_of_fields(tags, names, str(path), colours)
+        bad, doubts = bad_bands(tags, len(keep))
         acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
-        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands, *acquired.notes]
+        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
 
@@ -97,9 +101,11 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             """Return some rows, (y, x, band) (SceneError: they are damaged)."""
             with _opened(path) as opened:
                 planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
-            return np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+            lines = np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+            if masked is not None:
+                lines[masked[first:last]] = np.nan
+            return lines
 
-        bad = set(bad_bands(_file_tags(file).get("bbl"), file.count))
         source = CubeSource(
             name=path.name,
             shape=(height, width, len(keep)),
@@ -109,23 +115,13 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             bands=known,
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
-            bad_bands=tuple(place for place, band in enumerate(keep) if band in bad),
-            void=_void(file, alpha),
+            bad_bands=bad,
+            void=void,
             acquired=acquired.text,
             notes=tuple(notes),
         )
-    read = source.read
-    void = source.void
-    if scaled and void is not None and not void.all():
-        source = replace(
-            source,
-            dtype=np.dtype(np.float32),
-            read=lambda first, last: np.where(
-                void[first:last, :, None], np.float32(np.nan), np.float32(read(first, last))
-            ),
-        )
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return upright(source if plain else rescaled(source, scale, offset), orientation_of(path))
+    return _upright(source if plain else rescaled(source, scale, offset), _orientation_of(path))
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
@@ -159,14 +155,6 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
 
 
-def _check_size(path: Path, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
-    """Refuse more than the file's bytes or the memory can hold (SceneError)."""
-    claimed = math.prod(shape) * item
-    if driver != "JPEG":  # its blocks may have no byte each
-        check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
-    check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
-
-
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
     """Return (y, x) pixels that are transparent or masked; None without a mask."""
     kinds = importlib.import_module("rasterio").enums.MaskFlags
@@ -182,59 +170,65 @@ def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
     return found if found.any() else None
 
 
-_UNIT = "wavelength_units"
-_LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
-_DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)  # Band 12 (660.5 Nanometers)
+def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
+    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own."""
+    tags: dict[str, str | Sequence[str]] = {}
+    for name, value in (file.tags() | file.tags(ns="ENVI")).items():
+        words = split_list(value, file.count)
+        tags[name] = value if words is None else [words[band] for band in bands]
+    of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
+    names = dict.fromkeys(name for own in of_bands for name in own)
+    return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
 
 
-def _of_colours(colours_nm: Sequence[float]) -> Bands:
-    listed = ", ".join(f"{nm:g}" for nm in colours_nm)
-    return Bands(np.array(colours_nm), None, f"wavelengths assumed from the file's colours: {listed} nm")
+_ORIENTATION = 274  # tag of Exif 2.32
+_TURNS: Mapping[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: np.swapaxes(image, 0, 1),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: np.swapaxes(image[::-1, ::-1], 0, 1),
+    8: lambda image: np.rot90(image),
+}
 
 
-def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
-    """Return wavelengths and widths by the tags of an open file, else its band names, else its colours; and notes."""
-    notes: list[str] = []
-    of_file = _file_tags(file)
-    of_bands = []
-    for band in keep:  # counted from 0; GDAL's own tags take precedence
-        tags = _lower(file.tags(band + 1))
-        imagery = file.tags(band + 1, ns="IMAGERY")
-        if "CENTRAL_WAVELENGTH_UM" in imagery:
-            tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], _UNIT: "um"}
-            tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
-        of_bands.append(tags)
-    fields = {"wavelength units": next(iter(of_bands), {}).get(_UNIT) or of_file.get(_UNIT, "")}
-    for key in ("wavelength", "fwhm"):
-        values = [tags.get(key, "") for tags in of_bands]
-        if all(values):
-            fields[key] = ", ".join(values)
-        elif key in of_file:
-            words = [word for word in re.split(r"[,\s{}]+", of_file[key]) if word]
-            fields[key] = ", ".join([words[band] for band in keep] if len(words) == file.count else words)
-    centres, scale = wavelengths_nm(fields, len(keep), notes)
-    if centres is not None:
-        widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
-        known = len(widths) == len(keep) and all(width is not None and width > 0 for width in widths)
-        fwhm = np.array(widths, np.float64) * scale if known else None
-        return Bands(centres, fwhm, f"wavelengths from the tags of {path}"), tuple(notes)
-    named = [_DESCRIBED.search(file.descriptions[band] or "") for band in keep]
-    if named and None not in named:
-        nm = [float(one[1]) * (1.0 if one[2].lower().startswith("n") else 1000.0) for one in named if one is not None]
-        return Bands(np.array(nm), None, f"wavelengths from the band names of {path}"), tuple(notes)
-    colours_nm = _COLOURS_NM.get(tuple(kinds))
-    return Bands() if colours_nm is None else _of_colours(colours_nm), tuple(notes)
+def _orientation_of(path: Path) -> int:
+    """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP; 1 (upright) without a valid one."""
+    try:
+        if path.suffix.lower() in (".tif", ".tiff"):  # of any number of bands, which Pillow does not open
+            with tifffile.TiffFile(path) as file:
+                tag = file.pages.first.tags.get(_ORIENTATION)
+                found = 1 if tag is None else tag.value
+        else:
+            with warnings.catch_warnings(), Image.open(path) as image:
+                warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
+                found = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # of a kind without such tags; a damaged file is refused where it is read
+        return 1
+    return int(found) if found in _TURNS else 1
 
 
-def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
-    """Return the bands (from 0) that a list of ``count`` flags marks by 0, such as ``{1, 1, 0}``."""
-    flags = [finite_number(word) for word in re.split(r"[,\s{}]+", listed or "") if word]
-    return tuple(band for band, flag in enumerate(flags) if flag == 0) if len(flags) == count else ()
+def _upright(source: CubeSource, tag: int) -> CubeSource:
+    """Return an image as its orientation tag says, with a note; one with a place on the earth stays as it is."""
+    if tag == 1:
+        return source
+    if source.geobox is not None:
+        left = f"its orientation tag {tag} is not applied, since the file says where its pixels lie on the earth"
+        return replace(source, notes=(*source.notes, left))
+    turn = _TURNS[tag]
+    height, width, bands = source.shape
+    shape = (width, height, bands) if tag >= 5 else source.shape
+    check_memory(source.name, 2 * height * width * bands * source.dtype.itemsize)
 
+    def read_all(_first: int, _last: int) -> NDArray[Any]:
+        return np.ascontiguousarray(turn(source.read(0, height)))
 
-def _file_tags(file: Any) -> dict[str, str]:
-    return _lower(file.tags()) | _lower(file.tags(ns="ENVI"))
-
-
-def _lower(tags: Mapping[str, str]) -> dict[str, str]:
-    return {"_".join(name.lower().split()): value for name, value in tags.items()}
+    return replace(
+        source,
+        shape=shape,
+        read=read_by_chunks(read_all, shape[0], shape[0]),
+        void=None if source.void is None else turn(source.void),
+        scaling=f"{source.scaling} orientation {tag}".strip(),
+        notes=(*source.notes, f"the picture is turned upright, as its orientation tag {tag} says"),
+    )

@@ -1,9 +1,8 @@
 """Find and read the label files of scenes.
 
-Labels are pictures, or polygons if there is no picture. They lie beside their images (``001_mask.png``,
-``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels. That folder lies there, or beside a folder of images
-(``labels/001.png``, ``annotations/001_annotation.png``). Names are equal, or differ by a word such as ``_mask``. Upper
-and lower case are alike.
+Labels are pictures, or polygons if there is no picture. They lie beside their images with a word in their name
+(``001_mask.png``, ``field_a.gpkg``), or in a folder of such a name (``labels/001.png``) there or beside a folder of
+images. Upper and lower case are alike.
 """
 
 from __future__ import annotations
@@ -17,7 +16,8 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
-from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS
+from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.readers.polygons import (
     POLYGON_ENDINGS,
     is_polygon_file,
@@ -27,17 +27,10 @@ from spectralzoom.storage.readers.polygons import (
 )
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
 
-LABEL_WORDS = (
-    *("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg"),
-    *("lulc", "landcover", "land_cover"),
-)
-LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
-IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
+WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "ground_truth")  # of files and folders
 SHOWN = 5  # names in a message
-_LABEL_WORD, _IMAGE_WORD = (
-    re.compile(rf"^(?:{'|'.join(words)})[_\-. ]+|[_\-. ]+(?:{'|'.join(words)})$")
-    for words in (LABEL_WORDS, IMAGE_WORDS)
-)
+_LABEL_WORD = re.compile(rf"^(?:{'|'.join(WORDS)})[_\-. ]+|[_\-. ]+(?:{'|'.join(WORDS)})$")
+_IMAGE_WORD = re.compile(r"^(?:image|img|rgb)[_\-. ]+|[_\-. ]+(?:image|img|rgb)$")
 
 
 @dataclass(frozen=True)
@@ -93,14 +86,11 @@ def scene_entries(folder: Path) -> list[Path]:
 def image_folder(folder: Path) -> Path:
     """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
     inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
-    return min(inner, key=lambda entry: entry.name != "images", default=folder)
+    return within(folder, min(inner, key=lambda entry: entry.name != "images", default=folder))
 
 
 def find_files(path: Path) -> MatchedFiles:
-    """Match the images of a folder, or the one image, to their labels.
-
-    Raises SceneError: there is no image, or as `match_folder`.
-    """
+    """Match the images of a folder, or the one image, to their labels (SceneError: no image, or as `match_folder`)."""
     if not path.exists():
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir() or is_store(path):
@@ -133,6 +123,8 @@ def match_folder(folder: Path) -> MatchedFiles:
                 f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
+    for entry in (*images, *labels.values()):
+        within(folder, entry, _home(folder))
     return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in owner))
 
 
@@ -144,13 +136,19 @@ def find_label(scene: Path) -> Path | None:
         pictures, polygons = _labels_near(scene.parent)
     except PermissionError:  # the folder cannot be listed
         return None
-    return _label_of(scene, [entry for entry in pictures if entry != scene]) or _label_of(scene, polygons)
+    found = _label_of(scene, [entry for entry in pictures if entry != scene]) or _label_of(scene, polygons)
+    return None if found is None else within(scene, found, _home(scene.parent))
+
+
+def _home(folder: Path) -> Path:
+    """Return the folder that images and labels share."""
+    return folder.parent if is_image_folder(folder) else folder
 
 
 def is_label_name(path: Path) -> bool:
     """Return whether a file's name is that of labels: ``001_mask.png``, ``labels.png``."""
     stem = path.stem.lower()
-    return stem in LABEL_WORDS or _LABEL_WORD.search(stem) is not None
+    return stem in WORDS or _LABEL_WORD.search(stem) is not None
 
 
 def folders_within(folder: Path) -> str:
@@ -176,8 +174,8 @@ def _labels_near(folder: Path) -> tuple[list[Path], list[Path]]:
     They lie in the folder or in folders of labels there, and beside it if it has images.
     """
     around = [folder, folder.parent] if is_image_folder(folder) else [folder]
-    inside = [entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS]
-    inside = [entry for entry in inside if entry.is_dir() and entry != folder]
+    inside = [one for place in around for one in sorted(place.iterdir()) if one.name.lower() in WORDS and one.is_dir()]
+    inside = [one for one in inside if one != folder]
     pictures = [entry for entry in scene_entries(folder) if is_label_name(entry)]
     pictures += [entry for place in inside for entry in scene_entries(place)]
     visible = [entry for place in [*around, *inside] for entry in sorted(place.glob("[!.]*"))]
@@ -185,33 +183,29 @@ def _labels_near(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
-    """Return the file with the image's name, else the one that differs by a word for images."""
-    for word in (re.compile("(?!)"), _IMAGE_WORD):
-        wanted = word.sub("", image.stem.lower())
-        stems = {one: (one.stem.lower(), _LABEL_WORD.sub("", one.stem.lower(), count=1)) for one in candidates}
-        found = [one for one, both in stems.items() if wanted in [word.sub("", stem) for stem in both]]
-        if len(found) > 1:
-            names = " and ".join(str(one) for one in found[:SHOWN])
-            raise SceneError(
-                f"{image} has several files of labels by their names: {names}; keep one, or name it with labels in a"
-                f" {SETTINGS_NAME}"
-            )
-        if found:
-            return found[0]
-    return None
+    """Return the file with the image's name, both without a word for images and labels."""
+    wanted = _IMAGE_WORD.sub("", image.stem.lower())
+    stems = {one: _LABEL_WORD.sub("", one.stem.lower(), count=1) for one in candidates}
+    found = [one for one, stem in stems.items() if wanted in (one.stem.lower(), stem, _IMAGE_WORD.sub("", stem))]
+    if len(found) > 1:
+        names = " and ".join(str(one) for one in found[:SHOWN])
+        raise SceneError(
+            f"{image} has several files of labels by their names: {names}; keep one, or name it with labels in a"
+            f" {SETTINGS_NAME}"
+        )
+    return found[0] if found else None
 
 
 def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
-    """Return the label file of a scene by scene.toml, else by its name; and a note if scene.toml names a missing one.
-
-    Raises SceneError: several files fit by their names.
-    """
+    """Return the label file of a scene by scene.toml, else by its name; and a note if the named one is missing."""
     if settings.labels is None or settings.path is None:
         return find_label(scene), ""
     if not settings.labels:
         return None, ""
     name = settings.labels.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
     address = settings.path.parent / name
+    file, _ = split_variable(split_layer(name)[0])
+    stated_file(settings.path.parent, str(file), f"{settings.path}: labels")
     if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""

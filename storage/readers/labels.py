@@ -76,8 +76,7 @@ def load_labels(
     """Read a label file of numbers or exact colours; without ``classes`` every value is a class.
 
     Labels with a place on the earth are resampled to the scene's ``geobox``. Raises SceneError: the file cannot be
-    read, lies beside the scene, has another size and no place, has a value that is no class, or more than 64 values
-    without ``classes``.
+    read, does not fit the scene, has a value that is no class, or more than 64 values without ``classes``.
     """
     by_colour = any(isinstance(value, tuple) for value in (*classes.values(), unlabelled))
     read = load_codes(address, geobox, classes=classes.values())
@@ -89,10 +88,11 @@ def load_labels(
             f"labels {address} are {codes.shape[0]} x {codes.shape[1]} px, the scene is {shape[0]} x {shape[1]} px "
             f"(y x x){why}; give labels on the scene's own pixels"
         )
-    if by_colour and not read.of_colours:
+    if (classes or by_colour) and by_colour != read.of_colours:
+        have, want = ("colours", "numbers") if read.of_colours else ("numbers", "colours")
         raise SceneError(
-            f"labels {address} have numbers, and [classes] or unlabelled has colours; write the number of each class"
-            " there, or give labels of colours"
+            f"labels {address} have {have}, and [classes] or unlabelled has {want}; write those of the labels there, or"
+            f" give labels of {want}"
         )
     none = None if unlabelled is None else _code(unlabelled)
     stated = dict(classes) or found_codes(codes, none, read.of_colours, str(address))
@@ -101,7 +101,7 @@ def load_labels(
     if not (by_colour or read.of_colours or map_values(tuple(stated.values()))) and stated:
         notes.append("maps number the classes from 0, as a label is not 0 to 254")
     return Labels(
-        index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address), of_colours=read.of_colours),
+        index=_index(np.where(negative, NO_VALUE, codes), stated, none, str(address)),
         names=tuple(stated),
         values=tuple(stated.values()),
         colours=class_colours(stated, colours),
@@ -222,7 +222,7 @@ def found_codes(codes: NDArray[np.int64], none: int | None, is_colour: bool, whe
 
 
 def _index(
-    codes: NDArray[np.int64], classes: Mapping[str, ClassValue], none: int | None, where: str, *, of_colours: bool
+    codes: NDArray[np.int64], classes: Mapping[str, ClassValue], none: int | None, where: str
 ) -> NDArray[np.uint8]:
     """Return the class indices of codes, 255 for none (SceneError: a code is no class, or two things at once)."""
 
@@ -236,11 +236,6 @@ def _index(
         name = tuple(classes)[table[none]]
         raise SceneError(f"scene.toml has {shown(none)} as unlabelled and as class {name}; keep one")
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, NO_VALUE)]
-    if unknown and of_colours and not by_colour:
-        raise SceneError(
-            f"labels {where} have colours, such as {list(colour_of(unknown[0]))}, and the classes are numbers; "
-            "write the colour of each class into [classes], or give labels of numbers"
-        )
     if unknown:
         count = int((codes == unknown[0]).sum())
         others = f" (and {len(unknown) - 1} more such values)" if len(unknown) > 1 else ""

@@ -2,51 +2,39 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text, taken_with
-from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.array_cubes import (
-    UNNAMED,
-    check_picture,
-    cube_source,
-    find_cube,
-    in_scope,
-    marked_bands,
-)
-from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, FileArray, find_zarr_store, list_arrays
-from spectralzoom.storage.readers.cube_sources import Bands, CubeSource, check_cube_source, reading
+from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
+from spectralzoom.storage.readers.array_cubes import open_arrays
+from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store
+from spectralzoom.storage.readers.band_facts import Bands
+from spectralzoom.storage.readers.cube_sources import CubeSource, check_cube_source
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_source, open_headwall_cube
 from spectralzoom.storage.readers.frames import find_reference, load_frame, taken_of
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
-NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 _WITH_VARIABLE = re.compile(
-    r"^(?P<path>.+\.(?:mat|zarr|npy)):(?P<variable>[^/\\:]+)$"
-    r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+)$",
-    re.IGNORECASE | re.DOTALL,
+    r"(.+\.(?:(?:mat|zarr|npy)(?=:[^/\\:]+$)|nc4?|h5|hdf5|he5)):([^:]+)", re.IGNORECASE | re.DOTALL
 )
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
     """Return path and variable of ``scene.mat:cube``."""
-    found = _WITH_VARIABLE.match(str(address))
-    if found is None:
-        return Path(address), None
-    return Path(found["path"] or found["path2"]), found["variable"] or found["variable2"]
+    found = _WITH_VARIABLE.fullmatch(str(address))
+    return (Path(address), None) if found is None else (Path(found[1]), found[2])
 
 
 def reader_of(address: str | Path) -> Literal["zarr", "headwall", "envi", "image", "array", "none"]:
@@ -81,7 +69,9 @@ def open_cube(address: str | Path) -> xr.DataArray:
     is no such file, it is damaged, or its kind or shape cannot be used.
     """
     source = open_cube_source(address)
-    return with_wavelengths(source, address, None).data_array()
+    from spectralzoom.storage.readers.data_arrays import data_array
+
+    return data_array(with_wavelengths(source, address, None))
 
 
 def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource:
@@ -94,7 +84,7 @@ def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource
     path, variable = split_variable(address)
     match reader_of(address):
         case "zarr":
-            source = _open_arrays(find_zarr_store(path) or path, variable, labels=labels)
+            source = open_arrays(find_zarr_store(path) or path, variable, labels=labels)
         case "headwall":
             source = _with_frames(open_headwall_cube(path), path)
         case "envi":
@@ -102,9 +92,7 @@ def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource
         case "image":
             source = open_image(path, scaled=not labels)
         case "array":
-            source = _open_arrays(path, variable, labels=labels)
-            if path.suffix.lower() in ARRAY_ENDINGS and source.shape[2] == 1 and not labels and min(source.shape):
-                check_picture(source.shape[:2], address)
+            source = open_arrays(path, variable, labels=labels)
         case "none" if not path.exists():
             raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
         case "none":
@@ -135,47 +123,6 @@ def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
         files=(*source.files, *(file for frame in frames.values() for file in frame.files)),
         notes=(*source.notes, *notes),
     )
-
-
-def _open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource:
-    """Open an array of a file or Zarr store as a cube; only attributes and coordinates are read.
-
-    ``variable`` is its name, alone or with its groups (``SERC/Reflectance/Reflectance_Data``). Raises SceneError: the
-    file is damaged, or claims far more than it can hold; it has no such array or several; or the axes are not y, x and
-    band.
-    """
-    ending = path.suffix.lower()
-    guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
-    with guard():
-        arrays, about = list_arrays(path)
-        cube = find_cube(arrays, variable, path, labels=labels)
-        near = in_scope(arrays, cube.name)
-        source = cube_source(path, cube, near, {**about, **cube.array.attrs}, guard)
-        unit = str(cube.array.attrs.get("units", "")).strip()
-        notes = [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
-        acquired = acquired_of({**about, **cube.array.attrs, **_time_of(near)})
-        notes += acquired.notes
-        plain = tuple(note for note in source.notes if ending not in ARRAY_ENDINGS or note != UNNAMED)
-        bad = marked_bands(near, source.shape[2])
-        source = replace(source, bad_bands=bad, acquired=acquired.text, notes=(*notes, *plain))
-        taken = taken_with(path.name, about, cube.array.attrs)
-        if taken.exposure_ms is not None:
-            exposure_ms = np.full(source.shape[0], taken.exposure_ms)
-            source = replace(source, lines=replace(source.lines, exposure_ms=exposure_ms))
-        source = replace(source, taken=taken)
-        if path.is_dir():
-            source = replace(source, files=tuple(sorted(file for file in path.rglob("*") if file.is_file())))
-        return source
-
-
-def _time_of(near: Mapping[str, FileArray]) -> dict[str, Any]:
-    """Return the value of a coordinate ``time`` with one element, by its units; empty where there is none."""
-    found = near.get("time")
-    if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
-        return {}
-    about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
-    time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
-    return {"time": xr.decode_cf(time)["time"].values}
 
 
 def load_labels_array(address: str | Path) -> NDArray[Any]:

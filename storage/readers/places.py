@@ -10,43 +10,37 @@ import importlib
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import odc.geo.crs as odc_crs
 import odc.geo.geobox as odc_geobox
-import xarray as xr
 from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from odc.geo.math import affine_from_axis
 from pyproj import CRS, Transformer
 from pyproj.database import get_units_map
-from pyproj.exceptions import CRSError, ProjError
+from pyproj.exceptions import ProjError
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
+from spectralzoom.storage.readers.own_files import check_sidecars
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Place = tuple[GeoBox | None, tuple[str, ...]]
 
-_CRS_TEXTS = ("crs_wkt", "spatial_ref", "esri_pe_string", "proj4_params", "proj4text", "epsg_code")  # grid mapping
+_WKT = ("crs_wkt", "spatial_ref")  # of a grid mapping, before CF's parameters
+_CRS_TEXTS = ("esri_pe_string", "proj4_params", "proj4text", "epsg_code")  # behind them
 _CRS_ATTRIBUTES = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg", "crs_wkt", "crs")  # image, then dataset
-_NAMES = {"y": ("y", "lat", "latitude"), "x": ("x", "lon", "longitude")}
-_STANDARD = {"y": ("latitude", "grid_latitude"), "x": ("longitude", "grid_longitude")}
+_NAMES = {"y": ("lat", "latitude"), "x": ("lon", "longitude")}
 _DIRECTIONS = {"y": r"degrees?_?n(orth)?", "x": r"degrees?_?e(ast)?"}
-_PIXELS = {"pixel", "pixels", "px"}  # units of coordinates that are no places
-_SPELLINGS = (
-    (r"deg(?:ree)?s?(?: ?(?:[nsew]|north|south|east|west))?|°", "degree"),
-    (r"us[ -]?(?:survey )?(?:foot|feet|ft)|(?:ft|foot|feet)[ -]?us|survey (?:foot|feet)", "us survey foot"),
-    (r"(?:international )?(?:feet|foot)", "foot"),
-    (r"(.*)meters?|(.*)metres", r"\1\2metre"),
-    (r"(km|radian|yard|nautical mile)s", r"\1"),
-    (r"(?:statute )?miles?", "statute mile"),
-)
+_DEGREES = r"deg(ree)?s?( ?([nsew]|north|south|east|west))?|°"
 _ALLOWED = "m, km, ft or us-ft on a projected CRS, degrees or rad on a geographic one, rad on a geostationary one"
 _ENVI_PLACES = ("map info", "geo points", "rpc info", "coordinate system string")
 _WGS84 = r"(?i)wgs[- _]*(19)?84|world geodetic system 1984"
@@ -60,13 +54,13 @@ class _Axis:
     values: NDArray[np.float64]
     precision: float  # by which stored numbers may be rounded
     unit: str  # as stated; degree for a latitude or longitude without one
-    geographic: bool  # a latitude or longitude, by unit, standard name or name
+    geographic: bool  # a latitude or longitude, by standard name, unit or name
 
     @property
     def counts(self) -> bool:
         """Return whether the coordinates count pixels."""
         from_start = self.values[0] in (0.0, 0.5, 1.0) and bool((np.diff(self.values) == 1).all())
-        return self.unit.lower() in _PIXELS or (self.unit in ("", "1") and from_start)
+        return self.unit.lower() in ("pixel", "pixels", "px") or (self.unit in ("", "1") and from_start)
 
 
 def place_of_dataset(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> Place:
@@ -86,39 +80,43 @@ def place_of_dataset(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> P
     mapping = _grid_mapping(dataset, cube, known, notes)
     attributes = {**_plain(dataset.attrs), **_plain(cube.attrs)}
     crs = _crs(mapping, attributes, known, notes)
-    stated = _stated_transform(mapping, attributes, shape, dims, notes)
-    if crs is None:
-        there = stated is not None or any(not axis.counts for axis in known)
-        if there and not notes:
-            notes.append("it has coordinates and no CRS (write one: rio.write_crs of rioxarray)")
-        return None, (*notes, *_other_places(dataset, cube, dims))
-    if not _is_map(crs):
+    stated = _stated_transform(mapping, attributes, shape, notes)
+    if crs is not None and not _is_map(crs):
         return _placed(shape, Affine.identity(), crs, notes)
-    transform = _transform(axes, stated, crs, shape, notes)
-    if transform is None:
-        reason = () if notes else ("it has a CRS, and neither coordinates along its axes nor a GeoTransform",)
-        return None, (*notes, *reason, *_other_places(dataset, cube, dims))
-    return _placed(shape, transform, crs, notes)
+    transform = None if crs is None else _transform(axes, stated, crs, shape, notes)
+    if crs is not None and transform is not None:
+        return _placed(shape, transform, crs, notes)
+    if crs is not None and not notes:
+        notes.append("it has a CRS, and neither coordinates along its axes nor a GeoTransform")
+    elif not notes and (stated is not None or any(not axis.counts for axis in known)):
+        notes.append("it has coordinates and no CRS (write one: rio.write_crs of rioxarray)")
+    for other, one in dataset.variables.items():
+        of_name = re.match(r"lat(itude)?(?![a-z])", str(other).rpartition("/")[2].lower())
+        if one.shape == shape and (of_name or one.attrs.get("standard_name") == "latitude"):
+            notes.append(f"its place is given by latitudes of each pixel ({other}), not read; resample it to a grid")
+    return None, tuple(notes)
 
 
 def _axis(dataset: xr.Dataset, dim: str, kind: str) -> _Axis | None:
     """Return the coordinates along one axis: those of its name, else others that CF's attributes mark."""
-    marks = (*_STANDARD[kind], f"projection_{kind}_coordinate", f"projection_{kind}_angular_coordinate")
+    angle = "latitude" if kind == "y" else "longitude"
+    marks = (angle, f"grid_{angle}", f"projection_{kind}_coordinate", f"projection_{kind}_angular_coordinate")
     for name in (dim, *dataset.variables):
         found = dataset.variables.get(name)
         if found is None or found.dims != (dim,) or found.dtype.kind not in "iuf" or not found.size:
             continue
         standard, axis, unit = (str(found.attrs.get(key, "")).strip() for key in ("standard_name", "axis", "units"))
         word = str(name).rpartition("/")[2]
-        if name != dim and standard not in marks and axis.lower() != kind and word.lower() not in _NAMES[kind]:
+        if not (
+            name == dim or standard in marks or kind in (axis.lower(), word.lower()) or word.lower() in _NAMES[kind]
+        ):
             continue
         values = np.asarray(found.values)
         rounded = float(np.spacing(np.abs(values).max())) if values.dtype.kind == "f" else 0.0
-        packed = abs(float(np.ravel(found.encoding.get("scale_factor", 0.0))[0])) / 2
-        by_name = bool(re.fullmatch(_DIRECTIONS[kind], unit.lower())) or word.lower() in _NAMES[kind][1:]
-        geographic = standard == _STANDARD[kind][0] if standard else by_name
-        unit = unit or ("degree" if geographic or standard in _STANDARD[kind] else "")
-        return _Axis(word, values.astype(np.float64), max(rounded, packed), unit, geographic)
+        by_name = bool(re.fullmatch(_DIRECTIONS[kind], unit.lower())) or word.lower() in _NAMES[kind]
+        geographic = standard == angle if standard else by_name
+        unit = unit or ("degree" if geographic or standard in marks[:2] else "")
+        return _Axis(word, values.astype(np.float64), rounded, unit, geographic)
     return None
 
 
@@ -134,22 +132,17 @@ def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
 
 def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, axes: list[_Axis], notes: list[str]) -> dict[str, Any]:
     """Return the attributes of the grid mapping that the cube names for its axes, else of the only one there is."""
-    named: dict[str, list[str]] = {}
-    text = str(cube.encoding.get("grid_mapping", cube.attrs.get("grid_mapping", "")))
-    for word in text.replace(":", ": ").split():
-        if word.endswith(":") or not named:  # "crs", or "crs: x y other: lat lon"
-            named[word.removesuffix(":")] = []
-        else:
-            named[list(named)[-1]].append(word)
-    named = {key.removeprefix("/"): of_axes for key, of_axes in named.items()}
-    fitting = [key for key, of_axes in named.items() if {axis.name for axis in axes} & set(of_axes)]
-    for key in (*fitting, *named):
-        if key in dataset.variables:
-            return _plain(dataset.variables[key].attrs)
+    text = str(cube.encoding.get("grid_mapping", cube.attrs.get("grid_mapping", ""))).strip()
+    several = re.findall(r"(\S+):((?:\s+[^\s:]+(?!\S))+)", text)  # "crs: x y other: lat lon"
+    names = {axis.name for axis in axes}
+    several.sort(key=lambda pair: not names & set(pair[1].split()))
+    for key in [pair[0] for pair in several] or text.split():
+        if key.removeprefix("/") in dataset.variables:
+            return _plain(dataset.variables[key.removeprefix("/")].attrs)
         notes.append(f"its grid mapping {key} is not in the file")
-    single = {str(key): _plain(one.attrs) for key, one in dataset.variables.items() if not one.ndim}
-    single = {key: about for key, about in single.items() if {"grid_mapping_name", *_CRS_TEXTS[:2]} & set(about)}
-    if len(single) > 1 and any(about != next(iter(single.values())) for about in single.values()):
+    scalars = {str(key): _plain(one.attrs) for key, one in dataset.variables.items() if not one.ndim}
+    single = {key: about for key, about in scalars.items() if {"grid_mapping_name", *_WKT} & set(about)}
+    if len(single) > 1:
         notes.append(f"the file has several grid mappings ({', '.join(single)}), and the cube names none of them")
         return {}
     return next(iter(single.values()), {})
@@ -157,10 +150,10 @@ def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, axes: list[_Axis], not
 
 def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_Axis], notes: list[str]) -> CRS | None:
     """Return the first CRS that can be read: of the grid mapping, of attributes, WGS 84 of latitudes and longitudes."""
-    given = [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS[:2] if mapping.get(key)]
+    given = [(f"{key} of its grid mapping", mapping[key]) for key in _WKT if mapping.get(key)]
     if mapping.get("grid_mapping_name"):
         given.append(("its grid mapping", mapping))
-    given += [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS[2:] if mapping.get(key)]
+    given += [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS if mapping.get(key)]
     given += [(key, attributes[key]) for key in _CRS_ATTRIBUTES if attributes.get(key)]
     if isinstance(attributes.get("_CRS"), dict):  # GDAL's in Zarr
         given += [("_CRS", attributes["_CRS"][key]) for key in ("wkt", "projjson") if key in attributes["_CRS"]]
@@ -168,8 +161,9 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of old texts such as +init=epsg
-                by_cf = value is mapping
-                return CRS(CRS.from_cf(_in_metres(mapping, axes, notes)).to_wkt() if by_cf else value)
+                if re.search(r"init=(?!\w+:)", str(value)):
+                    raise ValueError("it names a file, which is not opened")
+                return _crs_of_cf(mapping, axes) if value is mapping else CRS(value)
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
             notes.append(f"the CRS cannot be read from {where}: {lacks}")
@@ -179,35 +173,27 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
     return None
 
 
-def _in_metres(mapping: Mapping[str, Any], axes: list[_Axis], notes: list[str]) -> dict[str, Any]:
-    """Return CF's parameters with a name, false easting and northing in metres: CF has them in the axes' unit."""
-    parameters = {key: value for key, value in mapping.items() if key not in _CRS_TEXTS}
+def _crs_of_cf(mapping: Mapping[str, Any], axes: list[_Axis]) -> CRS:
+    """Return the CRS by CF's parameters, whose false easting and northing are in the unit of the axes."""
+    shifted = any(mapping.get(key) for key in ("false_easting", "false_northing"))
+    for unit in [axis.unit for axis in axes if shifted and (_unit(axis.unit) or ("", 1.0))[1] != 1]:
+        raise ValueError(f"false easting and northing may be in {unit} or m; add crs_wkt")
+    parameters = {key: value for key, value in mapping.items() if key not in (*_WKT, *_CRS_TEXTS)}
     parameters.setdefault("projected_crs_name", str(mapping["grid_mapping_name"]).replace("_", " "))
-    for axis, key in zip(axes, ("false_northing", "false_easting"), strict=False):
-        category, factor = _unit(axis.unit) or ("", 1.0)
-        if category == "linear" and factor != 1 and parameters.get(key):
-            notes.append(
-                f"its {key} of {parameters[key]:g} is read in {axis.unit}, the unit of {axis.name}, as CF says"
-            )
-            parameters[key] *= factor
-    return parameters
+    return CRS(CRS.from_cf(parameters).to_wkt())
 
 
 def _stated_transform(
-    mapping: Mapping[str, Any],
-    attributes: Mapping[str, Any],
-    shape: tuple[int, int],
-    dims: tuple[str, str],
-    notes: list[str],
+    mapping: Mapping[str, Any], attributes: Mapping[str, Any], shape: tuple[int, int], notes: list[str]
 ) -> Affine | None:
     """Return the transform of pixel corners by a GeoTransform or GeoZarr's attributes; None without one."""
     of_gdal = mapping.get("GeoTransform")
     numbers = of_gdal or attributes.get("spatial:transform") or (attributes.get("crs") and attributes.get("transform"))
     if not numbers:
         return None
-    pair = attributes.get("spatial:dimensions", [*dims]), attributes.get("spatial:shape", [*shape])
-    if not of_gdal and pair != ([*dims], [*shape]):
-        notes.append("its spatial:transform is that of an image of another shape")
+    of_centres = attributes.get("spatial:registration") == "node"
+    if not of_gdal and (of_centres or list(attributes.get("spatial:shape", shape)) != [*shape]):
+        notes.append("its spatial:transform is that of an image of another shape, or not of its pixels' corners")
         return None
     try:
         words = [float(word) for word in re.split(r"[\s,\[\]()]+", str(numbers)) if word]
@@ -217,8 +203,7 @@ def _stated_transform(
     if not math.isfinite(found.determinant) or not found.determinant:
         notes.append("its transform is no grid of pixels")
         return None
-    of_centres = not of_gdal and attributes.get("spatial:registration") == "node"
-    return found * Affine.translation(-0.5, -0.5) if of_centres else found
+    return found
 
 
 def _transform(
@@ -235,9 +220,8 @@ def _transform(
     if stated is not None and (stated.b or stated.d):
         notes.append(f"its grid is turned, so that {y.name} and {x.name} are not used")
         return stated
-    doubts: list[str] = []  # which a stated transform settles
-    along_x = _line(x, _per_unit(x, crs, doubts), None if stated is None else stated.a, notes)
-    along_y = _line(y, _per_unit(y, crs, doubts), None if stated is None else stated.e, notes)
+    along_x = _line(x, _per_unit(x, crs, notes), None if stated is None else stated.a, notes)
+    along_y = _line(y, _per_unit(y, crs, notes), None if stated is None else stated.e, notes)
     if along_x is None or along_y is None:
         return None
     (left, width, x_px), (top, height, y_px) = along_x, along_y
@@ -247,11 +231,10 @@ def _transform(
     found = Affine(width, 0.0, left, 0.0, height, top)
     flipped = Affine(1, 0, 0, 0, -1, shape[0])  # GDAL stores NetCDF from the bottom up
     for other in () if stated is None else (stated, stated * flipped):
-        a, _, c, _, e, f = (~found * other)[:6]
-        away_x, away_y = max(abs(c), abs(c + (a - 1) * shape[1])), max(abs(f), abs(f + (e - 1) * shape[0]))
-        if away_x <= max(OFF_GRID_PX, x_px) and away_y <= max(OFF_GRID_PX, y_px):
+        corners = [np.subtract(~found * (other * corner), corner) for corner in ((0, 0), shape[::-1])]
+        if (np.abs(corners) <= np.maximum(OFF_GRID_PX, (x_px, y_px))).all():
             return other
-    notes += doubts if stated is None else [*doubts, f"its transform contradicts {y.name} and {x.name}, which are used"]
+    notes += [] if stated is None else [f"its transform contradicts {y.name} and {x.name}, which are used"]
     return found
 
 
@@ -267,11 +250,9 @@ def _line(axis: _Axis, per_unit: float, stated: float | None, notes: list[str]) 
         steps = np.diff(values)
         step = float(values[-1] - values[0]) / (count - 1)
         off = np.abs(values - values[0] - step * np.arange(count)).max()
-    if not np.isfinite(off) or not step or off > max(OFF_GRID_PX * abs(step), axis.precision):
+    rounded = axis.precision if axis.precision <= abs(step) / 2 else 0.0
+    if not np.isfinite(off) or not step or off > max(OFF_GRID_PX * abs(step), rounded):
         notes.append(f"{axis.name} is not evenly spaced (steps of {steps.min():g} to {steps.max():g}); resample it")
-        return None
-    if off > OFF_GRID_PX * abs(step) and axis.precision > abs(step) / 2:
-        notes.append(f"{axis.name} is stored to {axis.precision:.2g}, too coarse for its steps of {abs(step):.2g}")
         return None
     return (float(values[0]) - step / 2) * per_unit, step * per_unit, axis.precision / abs(step)
 
@@ -312,46 +293,27 @@ def _satellite_m(crs: CRS) -> float | None:
 
 def _unit(text: str) -> tuple[str, float] | None:
     """Return linear or angular, and the metres or radians of one unit by PROJ's table; None if it is not there."""
-    text = re.sub(r"[\s_]+", " ", text.strip().lower())
-    many = re.match(r"\d[\d.]*(?:e[+-]?\d+)? ", text)  # such as 1000 m
+    text = re.sub(r"[\s_]+", " ", text.strip().lower()).replace("meter", "metre").replace("feet", "foot")
+    many = re.match(r"\d[\d.]*(?:e[+-]?\d+)? ", text)  # such as 0.3048 metre, of pyproj
     word = text[many.end() :] if many else text
-    name = next((found.expand(to) for like, to in _SPELLINGS if (found := re.fullmatch(like, word))), word)
+    word = re.sub(r"^(us )?survey foot$|^us foot$", "us-ft", re.sub(f"^({_DEGREES})$", "degree", word))
     for category in ("linear", "angular"):
         for unit in get_units_map(category=category).values():
-            if name in (unit.name.lower(), unit.proj_short_name) and unit.conv_factor:
+            if unit.conv_factor and {unit.name.lower(), unit.proj_short_name} & {word, word.removesuffix("s")}:
                 return category, float(unit.conv_factor) * float(many[0] if many else 1)
     return None
 
 
-def _other_places(dataset: xr.Dataset, cube: xr.Variable, dims: tuple[str, str]) -> Iterator[str]:
-    """Yield notes on other places that the file states, which are not read."""
-    for name, one in dataset.variables.items():
-        word = str(name).rpartition("/")[2].lower()
-        swath = word in _NAMES["y"][1:] or one.attrs.get("standard_name") == "latitude"
-        if swath and one.shape == (cube.sizes[dims[0]], cube.sizes[dims[1]]):
-            yield f"its place is given by latitudes of each pixel ({name}), which are not read; resample it to a grid"
-        elif one.ndim == 2 and word == "glt_x":
-            yield f"its place is given by a geolocation table ({name}), which is not read; orthorectify it first"
-    for name in (*dataset.variables, *dataset.attrs):
-        if str(name).rpartition("/")[2].startswith("StructMetadata"):
-            yield f"its place is given by HDF-EOS ({name}), which is not read; write it as GeoTIFF (gdal_translate)"
-
-
 def place_of_file(file: Any) -> Place:
     """Return the grid on the earth of an open rasterio file, or None with a note."""
-    if file.transform.is_identity:
-        others = {
-            "ground control points": file.gcps[0],
-            "RPCs": file.rpcs,
-            "arrays of geolocation": file.tags(ns="GEOLOCATION"),
-        }
-        if other := " and ".join(name for name, there in others.items() if there):
-            return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",)
-        lacks = "it has a CRS and no transform (gdal_edit -a_ullr), so that its place on the earth is not known"
-        return None, () if file.crs is None else (lacks,)
-    if file.crs is None or not file.transform.determinant:
+    plain = file.transform.is_identity
+    if plain and (file.gcps[0] or file.rpcs or file.tags(ns="GEOLOCATION")):
+        what = "ground control points, RPCs or arrays of geolocation"
+        return None, (f"its place is given by {what}, which are not read; warp it first (gdalwarp)",)
+    if plain or file.crs is None or not file.transform.determinant:
         lacks = "a transform and no CRS (gdal_edit -a_srs)" if file.crs is None else "a transform that is no grid"
-        return None, (f"it has {lacks}, so that its place on the earth is not known",)
+        lacks = "a CRS and no transform (gdal_edit -a_ullr)" if plain else lacks
+        return None, () if plain and file.crs is None else (f"it has {lacks}: its place on the earth is not known",)
     try:
         crs = CRS.from_wkt(file.crs.to_wkt())
     except Exception as error:  # of PROJ and of GDAL
@@ -390,6 +352,7 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     if not set(_ENVI_PLACES) & set(header):
         return None, ()
     rasterio = importlib.import_module("rasterio")
+    check_sidecars(data)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
@@ -400,24 +363,15 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     if found is None or found.crs is None:
         stated = " and ".join(key for key in _ENVI_PLACES if key in header)
         return None, notes or (f"the header has {stated}, which give no grid; its place on the earth is not known",)
-    crs, wkt = CRS(found.crs.to_wkt()), header.get("coordinate system string", "").strip("{} ")
+    crs = CRS(found.crs.to_wkt())
     words = [word.strip() for word in header.get("map info", "").strip("{} ").split(",")]
     unit = next((word.partition("=")[2].strip() for word in words if word.lower().startswith("units")), "")
-    scale = 1.0
-    if unit.lower() == "feet" and (in_feet := _in_survey_feet(wkt)) is not None:  # GDAL takes all as international
-        crs = in_feet
-    elif unit and not (crs.is_geographic and unit.lower() in ("minutes", "seconds")):  # which GDAL reads
-        scale = _in_crs("map info", unit, crs)
+    of_gdal = ("minutes", "seconds") if crs.is_geographic else ("feet",)  # which it reads, all as international feet
+    scale = _in_crs("map info", unit, crs) if unit and unit.lower() not in of_gdal else 1.0
+    if unit.lower() == "feet" and re.search(r"(?i)foot_us|us[ _]survey", header.get("coordinate system string", "")):
+        scale = 1200 / 3937 / 0.3048
     datum = next((word for word in words[9 if words[0].lower() == "utm" else 7 : 10] if "=" not in word), "WGS-84")
     as_wgs84 = crs.geodetic_crs is not None and re.match(_WGS84, crs.geodetic_crs.name)
-    if as_wgs84 and not wkt and not re.fullmatch(_WGS84, datum):
+    if as_wgs84 and "coordinate system string" not in header and not re.fullmatch(_WGS84, datum):
         notes = (*notes, f"its datum, {datum!r}, is read as WGS 84, so that its place may be some 100 m off")
     return _placed(shape, Affine.scale(scale) * found.affine, crs, notes)
-
-
-def _in_survey_feet(wkt: str) -> CRS | None:
-    """Return a CRS if its coordinates are US survey feet, else None."""
-    with suppress(CRSError):
-        crs = CRS.from_wkt(wkt)
-        return crs if crs.is_projected and math.isclose(crs.axis_info[0].unit_conversion_factor, 1200 / 3937) else None
-    return None

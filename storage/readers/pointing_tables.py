@@ -1,16 +1,4 @@
-"""Read the pointing of lines: a table with a row for each line, as CSV (commas, semicolons or tabs).
-
-Optional columns are ``line`` (from 0), ``sweep``, ``time`` (of mid exposure since the start of the sweep) [s],
-``exposure_ms`` and ``valid`` (0 or 1). A table has exactly one of these kinds of pointing:
-
-::
-
-    mirror_x, mirror_y         mirror position, -1..1, in the device's axes
-    angle_x_deg, angle_y_deg   viewing angle along the line and along the scan
-    angle_deg                  viewing angle along the scan, of a scan through the undeflected direction
-    position_px                place along a straight scan without a mirror: stage, conveyor, drone
-    position_m                 the same in metres
-"""
+"""Read the pointing of lines: a table with a row for each line, as CSV (columns: docs/reference/recordings.md)."""
 
 from __future__ import annotations
 
@@ -27,6 +15,7 @@ from spectralzoom.pipeline.capture.straight_scans import angles_to_positions
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats
+from spectralzoom.storage.readers.own_files import within
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,10 +45,10 @@ class LinePointing:
     part: tuple[str, ...] | None = None  # (line,) names of the sweeps, if a table cuts one cube into several
 
 
-def find_pointing(folder: Path, stem: str) -> Path | None:
+def find_pointing(folder: Path, stem: str, marks: Sequence[str] = (".pointing",)) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
-    names = (f"{stem}.pointing{ending}" for ending in ENDINGS)
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    names = [f"{stem}{mark}{ending}" for mark in marks for ending in ENDINGS]
+    return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
 
 
 def load_pointing(
@@ -68,9 +57,7 @@ def load_pointing(
     """Read the pointing of the cube ``name``: the rows whose ``sweep`` is its name, or all without that column.
 
     If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` transforms the
-    device's positions to the model's. Raises SceneError: the table cannot be read; it has an unknown column, a cell
-    that is no number, or not one kind of pointing; the cube has another number of rows or no valid one; a value is out
-    of range or beyond the mirror; or times do not rise.
+    device's positions to the model's. Raises SceneError: the table cannot be read, or does not describe the cube.
     """
     table = _read_table(path)
     kind = _kind_of(path, list(table.columns))
@@ -116,30 +103,25 @@ def _read_table(path: Path) -> pd.DataFrame:
         separator = max((",", ";", "\t"), key=text.partition("\n")[0].count)
         options = {"dtype": str, "keep_default_na": False, "skip_blank_lines": False}  # numbers of rows stay
         cells = pd.read_csv(StringIO(text), sep=separator, header=None, **options).map(str.strip)
-    except pd.errors.EmptyDataError:
-        raise SceneError(f"{path} is empty; give a header and a row for each line") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError) as error:  # also of pandas
         why = str(error).replace("Error tokenizing data. C error: E", "e").strip()
         raise SceneError(f"{path} cannot be read as a pointing table: {why}; name a text file (CSV)") from error
     cells.columns, cells.index = cells.iloc[0].str.lower(), cells.index + 1
     cells = cells[(cells != "").any(axis=1)].iloc[1:]
-    wrong = [name for name in cells.columns if name not in ACCEPTED]
-    if wrong or not cells.columns.is_unique:
-        twice = next(iter(cells.columns[cells.columns.duplicated()]), None)
-        what = f"the column {wrong[0]!r}, which is not known" if wrong else f"the column {twice!r} twice"
-        raise SceneError(f"{path} has {what}; leave it out; accepted are {', '.join(ACCEPTED)}")
-    if cells.empty:
-        raise SceneError(f"{path} has no row below its header; give a row for each line")
+    wrong = [name for name in cells.columns if name not in ACCEPTED] or list(cells.columns[cells.columns.duplicated()])
+    if wrong or cells.empty:
+        what = f"the column {wrong[0]!r}, unknown or twice" if wrong else "no row below its header"
+        raise SceneError(f"{path} has {what}; give a row for each line, with columns of {', '.join(ACCEPTED)}")
     for name in cells.columns.drop("sweep", errors="ignore"):
         texts = cells[name].mask(cells[name] == "", "nan")
-        cells[name] = pd.to_numeric(texts, errors="coerce")
-        wrong = texts[cells[name].isna() & (texts.str.lower() != "nan")]
-        if len(wrong):
+        cells[name] = pd.to_numeric(texts, errors="coerce").astype(np.float64)
+        bad = texts[cells[name].isna() & (texts.str.lower() != "nan")]
+        if len(bad):
             raise SceneError(
-                f"{path}, row {wrong.index[0]}: {name} = {wrong.iloc[0][:40]!r} is no number; write numbers with a "
+                f"{path}, row {bad.index[0]}: {name} = {bad.iloc[0][:40]!r} is no number; write numbers with a "
                 "decimal point, and 1 or 0 for valid"
             )
-    return cells.astype(dict.fromkeys(cells.columns.drop("sweep", errors="ignore"), np.float64))
+    return cells
 
 
 def _kind_of(path: Path, columns: Sequence[str]) -> Kind:

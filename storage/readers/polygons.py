@@ -28,6 +28,7 @@ from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, N
 from spectralzoom.pipeline.ground.georeference import WGS84
 from spectralzoom.pipeline.ground.zones import on_field
 from spectralzoom.storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels; a .json file may h
 SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".idm", ".ind")
 SHAPEFILE_MAGIC, SQLITE_MAGIC = b"\0\0\x27\x0a", b"SQLite format 3\0"
 GEOPACKAGE_ID = b"GP"  # at byte 68
-VIRTUAL = re.compile(r"(?:\s|/\*.*?\*/|--.*?\n)*create(?:\s|/\*.*?\*/|--.*?\n)+virtual\b", re.IGNORECASE | re.DOTALL)
+VIRTUAL = re.compile(r"\s*create\b.*\bvirtual\b", re.IGNORECASE | re.DOTALL)  # tables that a module of SQLite fills
 INDEX = re.compile(r'create virtual table (?:"[^"]+"|\w+) using (?:rtree|fts)\w*\s*\(', re.IGNORECASE)
 OF_LIBRARIES = (sqlite3.Error, pyproj.exceptions.ProjError, shapely.errors.GEOSException)
 GRID_FILE = re.compile(r'(?:PARAMETERFILE\["[^"]*","|grids=|file=)([^" ]*[/\\:][^" ]*)')  # beyond PROJ's own folder
@@ -83,10 +84,9 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
 def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]:
     """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes, without empty ones; and notes.
 
-    The content decides whether it is GeoJSON, a GeoPackage or a shapefile; no other format is read, and no other file
-    or server. GeoJSON without a CRS is WGS 84. Invalid borders are repaired with a note. The index has the rows of the
-    layer, from 0. Raises ZoneError: there is no such file or layer, the file cannot be read, has no usable CRS, has
-    other shapes than polygons, or a part of it is a link out of its folder.
+    The content decides whether it is GeoJSON, a GeoPackage or a shapefile; no other format, file or server is read.
+    GeoJSON without a CRS is WGS 84. Invalid borders are repaired with a note. The index has the rows of the layer, from
+    0. Raises ZoneError: there is no such file or layer, or it has no polygons on a map that can be read.
     """
     path, layer = split_layer(source)
     if path.suffix.lower() not in ZONE_ENDINGS:
@@ -109,8 +109,6 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
     if kinds or not len(table):
         came = " and ".join(f"{count} {kind}" for kind, count in kinds.items()) or "none"
         raise ZoneError(f"{source}: expected polygons, got {came}; draw areas, zones and plots as closed polygons")
-    if table.crs is None:
-        raise ZoneError(f"{source} has no CRS; save it with one (a shapefile needs a .prj file)")
     crossed = f"{source}: the borders of {sum(~valid)} of {len(table)} polygons cross or touch themselves"
     return table.set_geometry(whole, crs=table.crs), () if valid.all() else (f"{crossed} and were repaired",)
 
@@ -118,18 +116,18 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
 def _check_coordinates(table: geopandas.GeoDataFrame) -> None:
     """Raise ValueError for a CRS that is no map's or names a file, and for places that are none in it."""
     crs = table.crs
-    if crs is not None and not (crs.is_geographic or crs.is_projected):
+    if crs is None:
+        raise ValueError("it has no CRS (a shapefile needs a .prj file)")
+    if not (crs.is_geographic or crs.is_projected):
         raise ValueError(f"its CRS {crs.name} is neither geographic nor projected")
-    if crs is not None and (named := GRID_FILE.search(crs.to_wkt())):
+    if named := GRID_FILE.search(crs.to_wkt()):
         raise ValueError(f"its CRS {crs.name} names the grid file {named[1]}; give one of EPSG")
-    if crs is not None:
-        pyproj.Transformer.from_crs(crs, WGS84)  # fails where PROJ lacks a grid
-    degrees = crs is not None and crs.is_geographic
+    pyproj.Transformer.from_crs(crs, WGS84)  # fails where PROJ lacks a grid
     places = shapely.get_coordinates(table.geometry)
-    wrong = ~(np.abs(places) <= (MOST_DEG if degrees else MOST_M)).all(axis=1)
+    wrong = ~(np.abs(places) <= (MOST_DEG if crs.is_geographic else MOST_M)).all(axis=1)
     if wrong.any():
         x, y = places[wrong][0].tolist()
-        raise ValueError(f"it has a point at x {x:g}, y {y:g}{', in degrees: is its CRS right?' * degrees}")
+        raise ValueError(f"it has a point at x {x:g}, y {y:g}{', in degrees: is its CRS right?' * crs.is_geographic}")
 
 
 def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
@@ -140,7 +138,7 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
     with path.open("rb") as file:
         head = file.read(100)
     if head.startswith(SQLITE_MAGIC) and head[68:70] == GEOPACKAGE_ID:
-        _check_within(path, [path.with_name(path.name + end) for end in ("-wal", "-journal", "-shm")])
+        _check_parts(path, [f"{path.name}{end}" for end in ("-wal", "-journal", "-shm")])
         _check_tables(path)
         address = f"GPKG:{path.absolute()}"
         layers = [str(name) for name, kind in pyogrio.list_layers(address) if kind is not None]
@@ -150,7 +148,7 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
             raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{[*layers, 'LAYER'][0]}")
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(address, layer=found))
     if head.startswith(SHAPEFILE_MAGIC) and path.suffix.lower() == ".shp":
-        _check_within(path, [path.with_suffix(end) for part in SHAPEFILE_PARTS for end in (part, part.upper())])
+        _check_parts(path, [f"{path.stem}{end}" for part in SHAPEFILE_PARTS for end in (part, part.upper())])
         if "!" in str(path.absolute()):
             raise ValueError('a "!" in its path stands for an archive; rename that folder')
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(path.absolute()))
@@ -162,6 +160,13 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
         raise ValueError("it is no valid GeoJSON") from None
 
 
+def _check_parts(path: Path, names: Iterable[str]) -> None:
+    """Refuse parts of a file that are no files, or links out of its folder (SceneError, ValueError)."""
+    for part in map(path.with_name, names):
+        if part.exists() and not within(path, part).is_file():
+            raise ValueError(f"{part} is no file")
+
+
 def _check_tables(path: Path) -> None:
     """Raise ValueError for a table that a module of SQLite fills from another file; rtree and fts are indices."""
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as file:
@@ -169,14 +174,6 @@ def _check_tables(path: Path) -> None:
     for name, sql in made:
         if VIRTUAL.match(sql) and not INDEX.match(sql):
             raise ValueError(f"its table {name} may read other files")
-
-
-def _check_within(path: Path, parts: Iterable[Path]) -> None:
-    """Refuse parts of a file that are no files, or lie outside of its folder (ZoneError)."""
-    homes = {path.parent.resolve(), path.resolve().parent}
-    for part in parts:
-        if part.exists() and not (part.is_file() and part.resolve().parent in homes):
-            raise ZoneError(f"{part} is no file, or a link out of its folder; put a copy of the file in its place")
 
 
 def _read_geojson(text: str) -> geopandas.GeoDataFrame:
@@ -239,8 +236,7 @@ def load_polygon_labels(
     """Burn the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` onto the (y, x) pixels of a scene.
 
     Classes are those of the settings, by name or by number, else every value of the class attribute. Raises SceneError:
-    the file, layer, attribute or a CRS is missing, no polygon lies on the scene, or one has a class that the settings
-    lack.
+    they cannot be read, lie off the scene, or have a class that the settings lack.
     """
     table, attribute, names, repaired = _labelled(address, settings)
     classes = dict(settings.classes) or _named(names, settings, str(address))
@@ -329,10 +325,7 @@ def place_on_earth(place: FieldPlace, address: str | Path, error: type[PipelineE
 
 
 def _moved(table: geopandas.GeoDataFrame, place: FieldPlace, address: str | Path) -> list[BaseGeometry]:
-    """Return the polygons in pixels of the scene, clipped to it.
-
-    Raises SceneError: none lies on the scene, or the scene has no georeference.
-    """
+    """Return the polygons in pixels of the scene (SceneError: none lies on it, or it has no georeference)."""
     on = place_on_earth(place, address, SceneError)
     moved = [polygons_of(on_field(shape, table.crs, on)) for shape in table.geometry]
     height, width = on.shape

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spectralzoom.pipeline.envi_headers import listed_numbers
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -19,12 +18,13 @@ from spectralzoom.pipeline.geometry.scan import Axis, Floats
 from spectralzoom.pipeline.signal.calibrate import find_bad_elements, full_scale_notes
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.array_files import find_zarr_store
+from spectralzoom.storage.readers.band_facts import bands_text, numbers_of_list, why_unknown
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, load_envi_header
 from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, taken_of
 from spectralzoom.storage.readers.open_cubes import open_cube_source, reader_of, with_wavelengths
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import LinePointing
-from spectralzoom.storage.readers.scene_files import bands_text
 
 SAMPLED_LINES = 64  # for bits
 
@@ -82,7 +82,7 @@ def find_cubes(path: Path) -> list[Path]:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     if cubes and stores:
         raise SceneError(f"{path} holds ENVI cubes and the Zarr store {stores[0].name}; name one, or move either kind")
-    return cubes or stores
+    return [within(path, one) for one in cubes or stores]
 
 
 def _stem(path: Path) -> str:
@@ -105,9 +105,11 @@ def open_file_cube(path: Path, wavelengths: Sequence[float] | None, stated: Mapp
         source = with_wavelengths(source, path, wavelengths)
     if source.bands.wavelength_nm is None:
         raise WavelengthError(
-            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm"
+            f"{path} has {source.shape[2]} bands and {why_unknown(source.bands)}; give --wavelengths in nm"
             + (", or write a list 'wavelength' into its header" if reader_of(path) == "envi" else "")
         )
+    if without := bands_text(source.bands.unknown):
+        raise WavelengthError(f"{path} gives no wavelength of bands {without} (from 0); give --wavelengths in nm")
     folder = path if path.is_dir() and find_zarr_store(path) is None else path.parent
     name = _stem(path.absolute())  # of the folder ., too
     fields = load_envi_header(find_envi_pair(path)[0]).fields if reader_of(path) == "envi" else {}
@@ -150,8 +152,8 @@ def references_of(
     """Return the references of a cube by its frames, and notes.
 
     ``exposure_ms`` (line,) are those of its lines, ``white_reference`` is the default value of the white reference, one
-    or (band,). Without a white frame, values are those of the exposure of the camera. Raises SceneError: a frame has
-    other samples, bands, binning or gain than the cube, or white is not brighter than dark.
+    or (band,). Without a white frame, values are those of the exposure of the camera. Raises SceneError: a frame does
+    not fit the cube, or white is not brighter than dark.
     """
     name, source, frames = cube.name, cube.source, cube.frames
     frame = source.shape[1:]
@@ -167,10 +169,8 @@ def references_of(
     notes += more
     for kind, one in frames.items():
         if one.values.shape != frame:
-            raise SceneError(
-                f"the {kind} frame {one.files[0]} is {one.values.shape} (sample, band), the cube {frame}; give one "
-                "taken with the cube's own samples and bands"
-            )
+            is_not = f"the {kind} frame {one.files[0]} is {one.values.shape} (sample, band), the cube {frame}"
+            raise SceneError(f"{is_not}; give one taken with the cube's own samples and bands")
     found = {kind: one.values for kind, one in frames.items()}
     measured = {"dark", "white"} <= set(found)
     if "dark" not in found:
@@ -194,8 +194,8 @@ def references_of(
         bad = find_bad_elements(dark, white)
         notes += full_scale_notes(white, white_dn)
     fields = frames["white"].fields if "white" in frames else {}
-    listed = listed_numbers(fields, "white_reference", frame[1], [])
-    value = np.asarray(white_reference if listed is None else listed, np.float32)
+    listed = numbers_of_list(fields.get("white_reference", ""), frame[1])
+    value = np.asarray(white_reference if listed is None or np.isnan(listed).any() else listed, np.float32)
     if value.shape not in ((), frame[1:]):
         raise SceneError(
             f"the white reference has {value.shape} values, the cube {frame[1]} bands; give one or one a band"

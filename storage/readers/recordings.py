@@ -1,23 +1,9 @@
-"""Open recordings: sweeps of an archive, or of files with a pointing table.
-
-::
-
-    ARCHIVE                               raw cubes of the newest run, or of the run named: ARCHIVE/runs/NAME
-    stages/capture/KEY, NAME.zarr         raw cubes of one capture, or a single one
-    NAME.hdr, NAME.bil, .bip, .bsq        an ENVI cube, or a folder of them
-    a folder with raw_<frame> files       a Headwall camera's capture
-    NAME.zarr                             any Zarr cube
-
-Files beside a cube ``NAME`` are used if no flag names others: ``NAME.pointing.csv``,
-``NAME.dark.hdr``, ``NAME.white.hdr`` and ``NAME.bad.hdr``. Frames for all cubes of the folder are
-``dark*.hdr`` and ``white*.hdr``. The header of an ENVI cube may have ``line axis = y``: lines lie along y of the field,
-and the scan goes along x. The header of a white frame may have ``white_reference = {...}``, the value of the white
-reference per band, and ``mirror at rest = 1``, if it was taken so.
-"""
+"""Open recordings: sweeps of an archive, or of files with a pointing table (layouts: docs/reference/recordings.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,13 +24,8 @@ from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.pointing_tables import (
-    ENDINGS,
-    WITHOUT_MIRROR,
-    LinePointing,
-    find_pointing,
-    load_pointing,
-)
+from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
@@ -122,9 +103,8 @@ def open_recording(
     For files, ``pointing`` is a table or a folder with one for each cube; it and the frames ``dark`` and ``white`` are
     looked for beside the cubes, or assumed with a note. ``wavelengths`` [nm] are of all bands, ``white_reference`` is
     the value of the white reference, one or (band,), and ``mounting`` is of the device whose positions the pointing
-    has. Raises SceneError: there is no recording, or files or pointing cannot be used; WavelengthError: there are no
-    wavelengths; SettingsError: a flag is given for an archive; ArchiveError, IncompleteStoreError: the archive cannot
-    be read, or has neither raw lines nor a signal; PoseError: a position of a raw cube is beyond the mirror.
+    has. Raises SceneError, WavelengthError: files cannot be used; SettingsError: a flag is given for an archive;
+    ArchiveError, IncompleteStoreError, PoseError: the archive or a raw cube cannot be used.
     """
     camera = camera or LineCamera()
     stores = find_raw_cubes(address)
@@ -194,18 +174,15 @@ def _recording_of(
     samples = max(cube.source.shape[1] for cube in cubes)  # the widest are not binned
     camera, more = with_bits(replace(camera, samples=samples), cubes)
     notes += more
-    without = [
-        number for number, one in enumerate(cubes) if one.pointing is None or one.pointing.kind in WITHOUT_MIRROR
-    ]
-    if without and len(cubes) > 1:
-        pointing = cubes[without[0]].pointing
-        raise SceneError(
-            f"{paths[without[0]]} has {'no pointing' if pointing is None else 'places along a scan without a mirror'}, "
-            f"and how {len(cubes)} cubes lie beside each other is not known; give mirror positions or viewing angles "
-            "for each cube, or name one cube"
-        )
-    if without:
-        camera, cubes[0], more = _without_mirror(cubes[0], camera)
+    for path, cube in files.items():
+        if cube.pointing is not None and cube.pointing.kind not in WITHOUT_MIRROR:
+            continue
+        if len(cubes) > 1:
+            raise SceneError(
+                f"{path} has no pointing of a mirror, and how {len(cubes)} cubes lie beside each other is not known; "
+                "give mirror positions or viewing angles for each cube, or name one cube"
+            )
+        camera, cubes[0], more = _without_mirror(cube, camera)
         notes += more
     camera, more = _timed(camera, cubes)
     notes += more
@@ -224,10 +201,9 @@ def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -
     """Return a cube with its pointing by the file given, else by one with the cube's name, if there is one."""
     if file is not None and file.is_dir():
         folder = file
-        names = [f"{cube.name}{middle}{end}" for middle in ("", ".pointing") for end in ENDINGS]
-        file = next((folder / name for name in names if (folder / name).is_file()), None)
+        file = find_pointing(folder, cube.name, ("", ".pointing"))
         if file is None:
-            raise SceneError(f"{folder} has no pointing for {cube.name}; add {names[0]}, or name one table for all")
+            raise SceneError(f"{folder} has no pointing for {cube.name}; add {cube.name}.csv, or name one for all")
     file = find_pointing(cube.folder, cube.name) if file is None else file
     if file is None:
         return cube
@@ -355,25 +331,18 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
 
     Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
     """
-    if (named := _named_run(address)) is not None:
-        return _run_with_cubes(*named)[2]
     path = Path(address)
-    if not path.exists():
-        raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
-    if not path.is_dir():
-        return None
-    found = [path] if _is_raw_cube(path) else sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one))
-    return found or None
+    if (of_archive := _run_with_cubes(address)) is not None:
+        return of_archive[2]
+    beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
+    return [one for one in beside if _is_raw_cube(one)] or None
 
 
 def _is_raw_cube(path: Path) -> bool:
     """Return whether a folder is a store of a survey's lines."""
-    if not (path / "zarr.json").is_file():
-        return False
-    try:
-        return "sweep" in open_group(path).attrs
-    except IncompleteStoreError:
-        return False
+    with suppress(IncompleteStoreError):
+        return (path / "zarr.json").is_file() and "sweep" in open_group(path).attrs
+    return False
 
 
 def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None, GeoBox | None] | None:
@@ -381,12 +350,9 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None,
 
     Raises SceneError, ArchiveError: as `find_raw_cubes`.
     """
-    named = _named_run(address)
-    if named is None:
-        if not Path(address).exists():
-            raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
+    if (found := _run_with_cubes(address)) is None:
         return None
-    archive, run, _ = _run_with_cubes(*named)
+    archive, run, _ = found
     parts = run.products.get("mosaic", "").split("/")  # stages/STAGE/KEY/mosaic.zarr
     params = try_manifest(archive.ref(*parts[1:3]).path)[0]["params"] if len(parts) > 3 else {}
     frame = params.get("frame", {})
@@ -397,22 +363,21 @@ def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None,
     return run, shape, geobox_of_record(frame, shape)
 
 
-def _named_run(address: str | Path) -> tuple[str, str | None] | None:
-    """Return the archive and the run (None: the newest) of an address; None if it is no archive's."""
+def _run_with_cubes(address: str | Path) -> tuple[Archive, Run, list[Path]] | None:
+    """Return the run of an address with its raw cubes: the named one, or the newest with any; None if no archive's."""
     text = str(address).rstrip("/")
-    place, _, run = text.rpartition("/runs/")
-    if place and run and is_archive(place):
-        return place, run
-    return (text, None) if (Path(text) / "stages").is_dir() else None
-
-
-def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
-    """Return a run of an archive with its raw cubes: the named one, or the newest that has any."""
-    archive = Archive.open(address, create=False, write=False)
-    for folder in archive.past_runs() if name is None else [archive.run_folder(name)]:
+    place, _, name = text.rpartition("/runs/")
+    if not (place and name and is_archive(place)):
+        place, name = text, ""
+        if not Path(text).exists():
+            raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
+        if not (Path(text) / "stages").is_dir():
+            return None
+    archive = Archive.open(place, create=False, write=False)
+    for folder in [archive.run_folder(name)] if name else archive.past_runs():
         run = read_run(folder)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
-    which = "no run" if name is None else f"the run {name}"
+    which = f"the run {name}" if name else "no run"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")

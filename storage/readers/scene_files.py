@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,14 +19,8 @@ from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
-from spectralzoom.storage.readers.cube_sources import (
-    BLOCK_LINES,
-    Bands,
-    CubeSource,
-    check_memory,
-    scene_lines,
-    unpacked,
-)
+from spectralzoom.storage.readers.band_facts import Bands, bands_text
+from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, check_memory, scene_lines, unpacked
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
 from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
@@ -98,7 +93,9 @@ def open_scene_file(
     source = open_cube_source(address)
     settings = find_scene_settings(file)
     height, width, count = source.shape
-    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
+    stated = wavelengths is not None or settings.wavelengths_nm is not None or settings.wavelengths_file is not None
+    known = [band for band in range(count) if stated or band not in source.bands.unknown]
+    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands, known)
     light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
@@ -109,7 +106,6 @@ def open_scene_file(
     found, label_note = _labels_of(file, source, labels, settings, classes or {})
     content = _content_hash(file, source.files)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    how, of_mask = values.notes(settings.path)
     scene = SceneFile(
         name=file.stem,
         path=file,
@@ -121,7 +117,7 @@ def open_scene_file(
         filled_px=filled_px,
         light_hash=_light_hash(content, variable, values, light, used=void > 0, stated=settings.nodata),
         content=(content if variable is None else _digest(content, variable),),
-        provenance=(*some, *bad_note, *source.notes, *how, light.origin, *of_mask, *gaps, *label_note),
+        provenance=(*some, *bad_note, *source.notes, *values.notes(settings.path), light.origin, *gaps, *label_note),
         geobox=source.geobox,
         pixel_m=None if source.geobox is not None else settings.pixel_m,
         acquired=source.acquired,
@@ -163,22 +159,26 @@ def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
     """Return the hash of all files, and of their names within a folder."""
     if files == (file,):
         return sha256(file)
-    within = [file.is_dir() and entry.is_relative_to(file) for entry in files]
-    names = [entry.relative_to(file).as_posix() if inside else "" for entry, inside in zip(files, within, strict=True)]
-    return _digest(*((name, sha256(entry)) for name, entry in zip(names, files, strict=True)))
+    within = [entry.relative_to(file).as_posix() if file in entry.parents else "" for entry in files]
+    return _digest(*((name, sha256(entry)) for name, entry in zip(within, files, strict=True)))
 
 
 def _chosen_bands(
-    bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
+    bands: Sequence[int] | None,
+    settings: SceneSettings,
+    count: int,
+    path: Path,
+    bad: Sequence[int],
+    known: Sequence[int],
 ) -> tuple[list[int], tuple[str, ...]]:
-    """Return the chosen bands, else all that the file does not mark as bad, and a note."""
+    """Return the chosen bands, else those of known wavelength that the file does not mark as bad, and a note."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
-        good = [band for band in range(count) if band not in set(bad)]
-        if len(good) == count or not good:
-            return list(range(count)), ()
-        everything, left_out = bands_text(range(count)), bands_text(sorted(bad))
+        good = [band for band in known if band not in set(bad)]
+        if not bad or not good:
+            return list(known), ("every band is marked as bad: the marks are ignored",) if bad else ()
+        everything, left_out = bands_text(known), bands_text(sorted(bad))
         return good, (f"bands {left_out} are left out: the file marks them as bad; --bands {everything} takes all",)
     wrong = [band for band in chosen if not 0 <= band < count]
     if wrong or not chosen:
@@ -186,8 +186,8 @@ def _chosen_bands(
             f"{where}: {f'band {wrong[0]}' if wrong else 'an empty list'}, but {path} has bands 0..{count - 1} "
             f"(counted from 0); correct it"
         )
-    if len(set(chosen)) < len(chosen):
-        raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
+    if twice := sorted(band for band, times in Counter(chosen).items() if times > 1):
+        raise SceneError(f"{where} names bands {bands_text(twice)} twice; name each once")
     return [int(band) for band in chosen], ()
 
 
@@ -203,31 +203,27 @@ def _labels_of(
     address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
     if address is None:
         return None, (why_none,) if why_none else ()
+    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
     try:
-        found, notes = _read(address, source.shape[:2], source.geobox, settings, classes)
+        found = read_labels(address, source.shape[:2], source.geobox, known)
     except SceneError as error:
         turned = "".join(f"; {note}" for note in source.notes if "orientation tag" in note)
         raise SceneError(f"{error}{turned}{FOUND if by_name else ''}") from error
-    return found, ((f"{notes[0]}, found by its name" if by_name else notes[0]), *notes[1:])
+    first = f"{_read_from(address, found, settings)}{', found by its name' if by_name else ''}"
+    return found, (first, *found.notes)
 
 
-def _read(
-    address: str | Path,
-    shape: tuple[int, int],
-    geobox: GeoBox | None,
-    settings: SceneSettings,
-    classes: Mapping[str, ClassValue],
-) -> tuple[Labels, tuple[str, ...]]:
-    """Read labels, and return notes on where they and their classes come from (SceneError: they do not fit)."""
-    known = settings if settings.classes else settings.model_copy(update={"classes": dict(classes)})
-    found = read_labels(address, shape, geobox, known)
+def _read_from(address: str | Path, found: Labels, settings: SceneSettings) -> str:
+    """Return where labels and their classes come from."""
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    return found, (f"labels from {address}, {how}", *found.notes)
+    return f"labels from {address}, {how}"
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
     """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
-    return _read(address, shape, None, find_scene_settings(split_variable(address)[0]), {})
+    settings = find_scene_settings(split_variable(address)[0])
+    found = read_labels(address, shape, None, settings)
+    return found, (_read_from(address, found, settings), *found.notes)
 
 
 def _digest(*parts: object) -> str:
@@ -261,18 +257,18 @@ class FileValues:
         plain = (self.scale, self.offset) == (1.0, 0.0)
         return "" if plain else f"{SETTINGS_NAME} scale {self.scale!r} offset {self.offset!r}"
 
-    def notes(self, settings: Path | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return notes on scaling, by the scene.toml ``settings``, and notes on the mask."""
-        how: list[str] = []
+    def notes(self, settings: Path | None) -> list[str]:
+        """Return notes on the scaling, by the scene.toml ``settings``, and on the mask."""
+        notes: list[str] = []
         if self.source.dark is not None and self.source.white is not None:
-            how.append("values are over the white reference")
+            notes.append("values are over the white reference")
         if self.scaling:
-            how.append(f"values are the file's times {self.scale:g} plus {self.offset:g}, as {settings} says")
-        if self.source.void is None:
-            return tuple(how), ()
-        if self.void is None:
-            return tuple(how), ("every pixel is transparent or masked: the mask is left out",)
-        return tuple(how), (f"{self.void.sum()} transparent or masked pixels have no value, and no class in a map",)
+            notes.append(f"values are the file's times {self.scale:g} plus {self.offset:g}, as {settings} says")
+        if self.void is not None:
+            notes.append(f"{self.void.sum()} transparent or masked pixels have no value, and no class in a map")
+        elif self.source.void is not None:
+            notes.append("every pixel is transparent or masked: the mask is left out")
+        return notes
 
     def converted(self, first: int, stop: int) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:
         """Return rows (y, x, band) as the file's numbers and as float32 with NaN, and which of them are no data."""
@@ -348,20 +344,26 @@ def _find_gaps(
     if not seen.any():
         raise EmptySceneError(f"{path} holds no finite number in the bands used; choose others")
     if not seen.all():
-        without, rest = (
-            [int(band) for band, there in zip(chosen, seen, strict=True) if there == wanted] for wanted in (False, True)
+        without, rest = (bands_text(np.array(chosen)[one].tolist()) for one in (~seen, seen))
+        raise SceneError(
+            f'{path} has no value anywhere in bands {without} (from 0); take the others: bands = "{rest}" in a'
+            f" {SETTINGS_NAME} beside it, or survey --bands {rest}"
         )
-        take = f"take the others: bands = {rest} in a scene.toml beside it, or survey --bands {bands_text(rest)}"
-        raise SceneError(f"{path} has no value anywhere in bands {bands_text(without)} (from 0); {take}")
     if absent:
         notes.append(f"missing samples: {absent} of {missing.size * len(chosen)}")
     return missing, filled_px, void, tuple(notes)
 
 
-def bands_text(bands: Sequence[int]) -> str:
-    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
-    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+def empty_bands(source: CubeSource, settings: SceneSettings) -> tuple[int, ...]:
+    """Return the bands (from 0) without a value anywhere; reading ends where each band has had one (SceneError)."""
+    height, _, count = source.shape
+    values = FileValues.of(source, list(range(count)), settings)
+    empty = np.ones(count, np.bool_)
+    for rows in cuts(height, BLOCK_LINES):
+        if not empty.any():
+            break
+        empty &= ~np.isfinite(values.converted(rows.start, rows.stop)[1]).any(axis=(0, 1))
+    return tuple(np.flatnonzero(empty).tolist())
 
 
 @dataclass(frozen=True)

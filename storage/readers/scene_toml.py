@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -9,10 +10,21 @@ from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictInt,
+    StrictStr,
+    ValidationError,
+    model_validator,
+)
 
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
-from spectralzoom.storage.readers.cube_sources import Bands
+from spectralzoom.pipeline.setting_fields import numbers_of
+from spectralzoom.storage.readers.band_facts import RANGE_NM, Bands, bands_text, why_unknown
+from spectralzoom.storage.readers.own_files import stated_file, within
 from spectralzoom.storage.whole_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
@@ -25,35 +37,39 @@ _Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
 _Value = StrictInt | tuple[_Channel, _Channel, _Channel]
 
 
+def _expanded(value: object) -> object:
+    """Return the numbers of a text with ranges, or of a list of numbers and such texts; other values unchanged."""
+    items = value.split(",") if isinstance(value, str) else value
+    if not isinstance(items, list | tuple):
+        return value
+    numbers = [number for item in items for number in (numbers_of(item) if isinstance(item, str) else [item])]
+    if wrong := [one for one in numbers if isinstance(one, str) and not re.fullmatch(r"\s*\d{1,5}\s*", one)]:
+        raise ValueError(f'{wrong[0]!r} is no band; write numbers and ranges such as "0-103,108-148"')
+    return tuple(int(one) if isinstance(one, str) else one for one in numbers)
+
+
+_Numbers = Annotated[tuple[StrictInt, ...], BeforeValidator(_expanded)]
+
+
 class SceneSettings(BaseModel):
     """Content of one ``scene.toml``. Every key is optional; ``path`` is None if there is no such file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     path: Path | None = None
-    # of the file, counted from 0
-    bands: tuple[StrictInt, ...] | None = None
-    # of ``bands``, or of all bands of the file
-    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = None
-    # rows of nm and FWHM, of all bands of the file and the dropped ones
-    wavelengths_file: StrictStr | None = None
-    # rows of wavelengths_file that the file lacks, counted from 1
-    dropped_bands: tuple[StrictInt, ...] = ()
+    bands: _Numbers | None = None  # of the file, from 0: numbers, or text with ranges such as "0-103,108-148"
+    wavelengths_nm: tuple[Annotated[float, Field(strict=True)], ...] | None = None  # of ``bands``, or of all bands
+    wavelengths_file: StrictStr | None = None  # rows of nm and FWHM, of all bands of the file and the dropped ones
+    dropped_bands: _Numbers = ()  # rows of wavelengths_file that the file lacks, counted from 1: written as bands
     nodata: Annotated[float, Field(strict=True)] | None = None
-    # values = file's * scale + offset
-    scale: _Positive = 1.0
+    scale: _Positive = 1.0  # values = file's * scale + offset
     offset: Annotated[float, Field(strict=True, allow_inf_nan=False)] = 0.0
-    # side of a pixel on the ground
-    pixel_m: _Positive | None = None
-    # relative to scene.toml, with {number} or {name}; "" if there are none
-    labels: StrictStr | None = None
+    pixel_m: _Positive | None = None  # side of a pixel on the ground
+    labels: StrictStr | None = None  # relative to scene.toml, with {number} or {name}; "" if there are none
     unlabelled: _Value | None = None
-    # attribute of polygons with their class
-    class_attribute: StrictStr | None = None
-    # number or colour of each
-    classes: dict[str, _Value] = {}
-    # of classes on maps
-    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}
+    class_attribute: StrictStr | None = None  # of polygons, with their class
+    classes: dict[str, _Value] = {}  # number or colour of each
+    colours: dict[str, tuple[_Channel, _Channel, _Channel]] = {}  # of classes on maps
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -76,8 +92,11 @@ def find_scene_settings(scene: Path) -> SceneSettings:
     Raises SceneError: the file is no TOML, or has an unknown key or a wrong value.
     """
     folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
-    found = next((path for folder in folders if (path := folder / SETTINGS_NAME).is_file()), None)
-    return SceneSettings() if found is None else load_scene_settings(found)
+    home = next((folder for folder in folders if (folder / SETTINGS_NAME).is_file()), None)
+    if home is None:
+        return SceneSettings()
+    beside = None if scene.name == SETTINGS_NAME else scene.resolve().parent
+    return load_scene_settings(within(home, home / SETTINGS_NAME, beside))
 
 
 def is_image_folder(folder: Path) -> bool:
@@ -103,7 +122,6 @@ def load_scene_settings(path: Path) -> SceneSettings:
     raise SceneError(f"{path}: {key}: {why}, got {first['input']!r}; correct it" if key else f"{path} {why}")
 
 
-RANGE_NM = (200.0, 3000.0)
 MICROMETRES = (0.2, 5.0)
 
 
@@ -122,7 +140,8 @@ def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where:
     outside = values[(values < RANGE_NM[0]) | (values > RANGE_NM[1])]
     if outside.size:
         raise WavelengthError(
-            f"{where}: wavelengths {_listed(outside)} lie outside {RANGE_NM[0]:g}-{RANGE_NM[1]:g} nm; write nm"
+            f"{where}: wavelengths {_listed(outside)} lie outside {RANGE_NM[0]:g}-{RANGE_NM[1]:g} nm; write nm, or"
+            " leave these bands out"
         )
     return values
 
@@ -153,19 +172,17 @@ def settle_wavelengths(
         fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
-        return _from_file(
-            settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands, path
-        )
-    if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
-        centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
-        return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
-    why = "nothing says their wavelengths"
-    if known.wavelength_nm is not None:
-        why = f"its header has {len(known.wavelength_nm)} wavelengths; correct that list"
-    raise WavelengthError(
-        f"{path} has {file_bands} bands and {why}; write wavelengths_nm or wavelengths_file into a scene.toml beside "
-        f"it, or give survey --wavelengths in nm (axes are y, x, band)"
-    )
+        table = stated_file(settings.path.parent, settings.wavelengths_file, f"{settings.path}: wavelengths_file")
+        return _from_file(table, settings.dropped_bands, chosen, file_bands, path)
+    advice = f"write wavelengths_nm or wavelengths_file into a {SETTINGS_NAME} beside it, or give survey --wavelengths"
+    if known.wavelength_nm is None:
+        why = why_unknown(known)
+        raise WavelengthError(f"{path} has {file_bands} bands and {why}; {advice} in nm (axes are y, x, band)")
+    centre = known.wavelength_nm[chosen]
+    if without := [band for band, nm in zip(chosen, centre, strict=True) if np.isnan(nm)]:
+        raise WavelengthError(f"{path} gives no wavelength of bands {bands_text(without)} (from 0); {advice} in nm")
+    widths = None if known.fwhm_nm is None else known.fwhm_nm[chosen]
+    return Bands(check_wavelengths(centre, str(path)), widths, known.origin)
 
 
 def _fit(
@@ -194,8 +211,7 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     if len(kept) != file_bands:
         raise WavelengthError(
             f"{path} has {len(table)} rows, {len(set(dropped))} of them dropped, which leaves {len(kept)} wavelengths "
-            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml, or "
-            "give the file of the scene if that is another one"
+            f"for the {file_bands} band{'s' * (file_bands != 1)} of {image}; correct dropped_bands in scene.toml"
         )
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
@@ -211,7 +227,8 @@ def _table(path: Path) -> NDArray[np.float64]:
         raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
     rows: list[list[float]] = []
     for line in lines:
-        fields = line.replace(",", " ").replace(";", " ").split()[:2]
+        commas = re.match(r"\s*\d+,\d+(\s*[;\t]\s*\d+(,\d+)?|\s+\d+,\d+)\b", line)  # 450,5 10,2
+        fields = re.sub("[,;]", " ", line.replace(",", ".") if commas else line).split()[:2]
         for count in range(len(fields), 0, -1):
             with suppress(ValueError):
                 rows.append([float(field) for field in fields[:count]])

@@ -1,9 +1,10 @@
 """Copy the stores and runs of an archive to a bucket, and back into a folder.
 
-Stores and runs never change, so a bucket is a copy. A store's or run's manifest has the same address in the bucket. Its
-files lie below ``<address>/<attempt>/``, where the attempt is the beginning of the SHA-256 of the manifest, so that two
-writers never mix their files. A conditional put of the manifest comes last: the first writer wins. Every file is
-compared with its hash before it is sent, and after it is fetched.
+Stores and runs never change, so a bucket is a copy. The manifest of a store or run is the object
+``<address>/manifest.json``, that of a cleared store ``<address>/cleared.json``. The files lie below
+``<address>/<attempt>/``, where the attempt is the beginning of the SHA-256 of the manifest, so that two writers never
+mix their files. A conditional put of the manifest comes last: the first writer wins. Every file is compared with its
+hash when it is sent, and after it is fetched.
 """
 
 from __future__ import annotations
@@ -11,58 +12,67 @@ from __future__ import annotations
 import hashlib
 import secrets
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
+from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.remote.objects import Objects, some_at_a_time
 from spectralzoom.storage.store import (
-    CLEARED,
     LATEST,
     MANIFEST,
     RESTS_ON,
     Archive,
     check_store,
     is_cleared,
+    is_known,
     lies_ahead,
+    manifest_bytes,
     parse_manifest,
+    try_manifest,
     uri_of,
 )
 
+OF_CLEARED = "cleared.json"  # the manifest of a store without its files
+KINDS = (OF_CLEARED, MANIFEST)
+PROBE = ".conditional-put"
 Report = Callable[[str, float], None]  # address, and the fraction that is done
 
 
 @dataclass(frozen=True)
 class Copied:
-    """Stores and runs that were copied, the bytes of their files, and those that were there before.
+    """Stores and runs that were copied, the bytes of their files, and the number of those that were there before.
 
-    ``conflicts`` are runs that were not copied, since another run has their name.
+    ``conflicts`` are runs that were not copied, since another run has their name; ``missing`` are stores that copied
+    runs name, and that are in neither place.
     """
 
     copied: list[str]
     bytes: int
     there: int
     conflicts: list[str]
+    missing: list[str]
 
 
 def push(archive: Archive, objects: Objects, report: Report) -> Copied:
     """Send the stores and runs that the bucket lacks; stores come first, so that each run finds its own.
 
-    Raises UnreachableError: the bucket refuses or does not answer; IncompleteStoreError: a store or run is damaged;
-    ArchiveError: the bucket ignores conditional puts.
+    Files of stores that were cleared or removed here stay in the bucket. Raises UnreachableError: the bucket refuses or
+    does not answer; IncompleteStoreError: a store or run is damaged; ArchiveError: the bucket ignores conditional puts.
     """
     with archive.in_use():
-        here = list(archive.manifests())
-        there = _published(objects.listing())
-        waiting = [uri for uri in here if uri not in there]
-        if waiting:
-            _check_conditional_puts(objects)
-        sent = 0
-        for number, uri in enumerate(waiting):
-            report(uri, number / len(waiting))
-            sent += _send(archive.root / uri, uri, objects)
-        return Copied(waiting, sent, len(here) - len(waiting), _conflicts(objects, archive, set(here) & set(there)))
+        return send_stores(archive, objects, list(archive.manifests()), report)
+
+
+def send_stores(
+    archive: Archive, objects: Objects, uris: Collection[str], report: Report = lambda uri, done: None
+) -> Copied:
+    """Send these stores and runs, in this order, if the bucket lacks them. Raises as `push`."""
+    there = _published(objects.listing())
+    waiting = [uri for uri in uris if there.get(uri) not in (MANIFEST, _manifest_name(archive.root / uri))]
+    if waiting:
+        _check_conditional_puts(objects)
+    return _copy(archive, objects, uris, waiting, report, lambda uri: _send(archive.root / uri, uri, objects))
 
 
 def pull(objects: Objects, archive: Archive, report: Report, run: str | None = None) -> Copied:
@@ -71,112 +81,106 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
     Raises UnreachableError: the bucket refuses or does not answer; IncompleteStoreError: an object is missing or has
     changed; ArchiveError: there is no archive or no such run in the bucket.
     """
-    listed = objects.listing()
-    there = _published(listed)
+    there = _published(objects.listing())
     if not there:
-        raise ArchiveError(f"{objects.place.url} has no archive: check the address, or push one")
+        raise ArchiveError(f"{objects.url} has no archive: check the address, or push one")
+    archive.reclaim()
     with archive.in_use():
-        wanted = sorted(there, key=lambda uri: (not uri.startswith("stages/"), uri))  # stores before runs
-        if run is not None:
-            wanted = _of_run(objects, run, there)
-        waiting = [uri for uri in wanted if not (archive.root / uri).exists()]
-        fetched = 0
-        for number, uri in enumerate(waiting):
-            report(uri, number / len(waiting))
-            fetched += _fetch(uri, objects, archive, listed)
-        known = set(wanted) - set(waiting)
-        return Copied(waiting, fetched, len(known), _conflicts(objects, archive, known))
+        wanted = _of_run(objects, run, there) if run is not None else sorted(there, key=lambda uri: uri[:4] == "runs")
+        waiting = [uri for uri in wanted if not is_known(archive.root / uri)]
+        return _copy(
+            archive, objects, wanted, waiting, report, lambda uri: fetch_store(uri, there[uri], objects, archive)
+        )
 
 
-def _send(folder: Path, uri: str, objects: Objects) -> int:
-    """Send one store or run, its manifest last; return the bytes of its files."""
-    check_store(folder, every_byte=True)
-    text = (folder / MANIFEST).read_bytes()
-    place = _files_at(uri, text)
-    names: list[str] = [] if is_cleared(folder) else [*_manifest(uri, text)["files"]]
-    if is_cleared(folder):
-        objects.write(f"{place}/{CLEARED}", b"")
-    some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), names)
-    objects.create(f"{uri}/{MANIFEST}", text)  # else another writer was first: its store is as good
-    return sum((folder / name).stat().st_size for name in names)
+def _copy(
+    archive: Archive,
+    objects: Objects,
+    asked: Collection[str],
+    waiting: Collection[str],
+    report: Report,
+    work: Callable[[str], int | None],
+) -> Copied:
+    """Copy what waits, by a function that returns the bytes, or None where another process was first."""
+    copied, total = [], 0
+    for number, uri in enumerate(waiting):
+        report(uri, number / len(waiting))
+        if (size := work(uri)) is not None:
+            copied.append(uri)
+            total += size
+    runs = [uri for uri in asked if uri.startswith("runs/")]
+    named = {one for uri in runs if uri in copied for one in try_manifest(archive.root / uri)[0][RESTS_ON]}
+    both = [uri for uri in runs if uri not in copied and (archive.root / uri / MANIFEST).is_file()]
+    texts = some_at_a_time(lambda uri: objects.read(f"{uri}/{MANIFEST}", parse_manifest), both)
+    others = [
+        uri for uri, text in zip(both, texts, strict=True) if text != (archive.root / uri / MANIFEST).read_bytes()
+    ]
+    missing = sorted(uri for uri in named if not is_known(archive.root / uri))
+    return Copied(copied, total, len(asked) - len(copied) - len(others), others, missing)
 
 
-def _fetch(uri: str, objects: Objects, archive: Archive, listed: Collection[str]) -> int:
-    """Fetch one store or run into the archive; return the bytes of its files."""
-    text = objects.read(f"{uri}/{MANIFEST}")
+def _send(folder: Path, uri: str, objects: Objects) -> int | None:
+    """Send one store or run, its manifest last; return the bytes of its files, None where another writer was first."""
+    check_store(folder)
+    kind, text = _manifest_name(folder), manifest_bytes(folder)
+    files = parse_manifest(text)["files"] if kind == MANIFEST else {}
+    with suppress(FileNotFoundError):  # it is cleared meanwhile, or damaged
+        some_at_a_time(lambda name: objects.write(_address(uri, text, name), folder / name), files)
+    check_store(folder, every_byte=True)  # what was sent is what the manifest lists
+    if kind != _manifest_name(folder) or text != manifest_bytes(folder):  # cleared, or made again
+        return _send(folder, uri, objects)
+    return sum(size for size, _ in files.values()) if objects.create(f"{uri}/{kind}", text) == text else None
+
+
+def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int | None:
+    """Fetch one store or run into the archive; return the bytes of its files, None where it is here or gone."""
+    text = objects.read(f"{uri}/{kind}", parse_manifest)
     if text is None:  # another machine has removed it meanwhile
-        return 0
-    place = _files_at(uri, text)
-    files = _manifest(f"{objects.place.url}/{uri}", text)["files"]
-    is_cleared_there = f"{place}/{CLEARED}" in listed
+        return None
+    if kind == OF_CLEARED:
+        return 0 if archive.adopt(uri, text) else None
+    files = parse_manifest(text)["files"]
 
     def fetch(part: Path) -> None:
         (part / MANIFEST).write_bytes(text)
-        if is_cleared_there:
-            (part / CLEARED).touch()
-        else:
-            some_at_a_time(lambda name: objects.fetch(f"{place}/{name}", part / name, files[name][1]), files)
+        some_at_a_time(lambda name: objects.fetch(_address(uri, text, name), part / name, *files[name]), files)
 
-    fetched = archive.adopt(uri, fetch)  # else another process has fetched or made it
-    return sum(size for size, _ in files.values()) if fetched and not is_cleared_there else 0
+    return sum(size for size, _ in files.values()) if archive.adopt(uri, fetch) else None
 
 
-def _of_run(objects: Objects, run: str, there: Collection[str]) -> list[str]:
+def _of_run(objects: Objects, run: str, there: Iterable[str]) -> list[str]:
     """Return the addresses of the stores that a run names, and of the run."""
     runs = sorted(uri for uri in there if uri.startswith("runs/"))
     uri = f"runs/{run.removeprefix('runs/')}"
     if run == LATEST:
-        uri = next((one for one in reversed(runs) if not _is_ahead(one, objects)), uri)
-    text = objects.read(f"{uri}/{MANIFEST}") if uri in there else None
+        uri = next((one for one in reversed(runs) if not lies_ahead(one.removeprefix("runs/"), "", warns=True)), uri)
+    text = objects.read(f"{uri}/{MANIFEST}", parse_manifest) if uri in runs else None
     if text is None:
         known = ", ".join(name.removeprefix("runs/") for name in runs[-5:]) or "none"
-        raise ArchiveError(f"{objects.place.url} has no run {run!r}; its latest are {known}")
-    return [*sorted(_manifest(uri, text)[RESTS_ON].keys() & set(there)), uri]
+        raise ArchiveError(f"{objects.url} has no run {run!r}; its latest are {known}")
+    return [*sorted(parse_manifest(text)[RESTS_ON].keys() & set(there)), uri]
 
 
-def _is_ahead(uri: str, objects: Objects) -> bool:
-    """Return whether a run lies in the future, which a warning says."""
-    text = objects.read(f"{uri}/{MANIFEST}")
-    return text is None or lies_ahead(uri.removeprefix("runs/"), _manifest(uri, text)["created"], warns=True)
+def _published(listed: Iterable[str]) -> dict[str, str]:
+    """Return the name of the manifest of each store and run in the bucket, by address."""
+    ends = sorted(name.rpartition("/") for name in listed)  # cleared.json, then manifest.json, which wins
+    return {uri: kind for uri, _, kind in ends if kind in KINDS[uri[:5] == "runs/" :] and uri_of(uri) == uri}
 
 
-def _conflicts(objects: Objects, archive: Archive, both: Iterable[str]) -> list[str]:
-    """Return the runs of two machines that have one name."""
-    runs = sorted(uri for uri in both if uri.startswith("runs/"))
-    texts = ((uri, (archive.root / uri / MANIFEST).read_bytes()) for uri in runs)
-    return [uri for uri, text in texts if objects.read(f"{uri}/{MANIFEST}") != text]
+def _manifest_name(folder: Path) -> str:
+    return OF_CLEARED if is_cleared(folder) else MANIFEST
 
 
-def _published(listed: Collection[str]) -> list[str]:
-    """Return the addresses of stores and runs that have a manifest in the bucket."""
-    ends = (name.removesuffix(f"/{MANIFEST}") for name in listed if name.endswith(f"/{MANIFEST}"))
-    return [uri for uri in ends if _is_address(uri)]
-
-
-def _is_address(uri: str) -> bool:
-    return uri_of(uri) == uri
-
-
-def _files_at(uri: str, manifest: bytes) -> str:
-    """Return the address of the files that a manifest lists."""
-    return f"{uri}/{hashlib.sha256(manifest).hexdigest()[:16]}"
-
-
-def _manifest(place: str, text: bytes) -> dict[str, Any]:
-    """Return the content of a manifest. Raises IncompleteStoreError: it is damaged."""
-    try:
-        return parse_manifest(text)
-    except ValueError as error:
-        raise IncompleteStoreError(f"{place}/{MANIFEST} is damaged: {error}") from error
+def _address(uri: str, manifest: bytes, name: str) -> str:
+    """Return the name of the object of a file that a manifest lists."""
+    return f"{uri}/{hashlib.sha256(manifest).hexdigest()[:16]}/{name}"
 
 
 def _check_conditional_puts(objects: Objects) -> None:
     """Check that a second conditional put of one name is refused."""
-    name = f".probe-{secrets.token_hex(8)}"
-    written = objects.create(name, b""), objects.create(name, b"")
-    objects.remove(name)
-    if written != (True, False):
+    objects.create(PROBE, b"")
+    if objects.create(PROBE, mark := secrets.token_bytes(8)) == mark:
         raise ArchiveError(
-            f"{objects.place.url}: this store ignores conditional puts (If-None-Match), without which two machines "
+            f"{objects.url}: this store ignores conditional puts (If-None-Match), without which two machines "
             "would overwrite each other; use one that has them"
         )

@@ -9,91 +9,190 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+from typing import TypeVar
 
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 
-if TYPE_CHECKING:
-    from obstore.store import S3Store
-
 AT_ONCE = 8  # transfers in parallel
 PART_BYTES = 8 << 20  # of the parts of a large object
-RETRIES = 6  # of one request, in about ten seconds
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_ADDRESS = re.compile(r"s3:/{1,2}([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
-_PART = re.compile(r"[A-Za-z0-9_.=+-]+")
-_MEANINGS = (  # parts of a store's answers: their meaning and what to do
-    (("NoSuchBucket",), "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL"),
-    (("169.254.16",), "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"),
-    (("RequestTimeTooSkewed",), "the clock of this machine is wrong: set it and run again"),
-    (("status code: 5", "status code: 429"), "it is overloaded or has a fault: run again later"),
-    (
-        ("HeaderMalformed", "PermanentRedirect", "301 Moved", "redirect without LOCATION"),
-        "the bucket is in another region: set AWS_REGION",
+MOST_BYTES = 256 << 20  # of a manifest, which takes 100 bytes a file
+RETRIES = 4  # of one request, by obstore, in about two seconds
+PAUSES_S = (0.5, 2.0, 8.0)  # before what obstore does not try again
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
+_PART = r"(?!\.+(?:/|$))[A-Za-z0-9_.=+-]+"
+_ADDRESS = re.compile(rf"s3:/{{1,2}}({_PART})((?:/{_PART})*)/?")  # also as a path has it, which makes one slash of two
+_LASTING = {  # of a bucket's answers: a part, and what a person has to do
+    "NoSuchBucket": "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL",
+    r"169\.254\.16": "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    "RequestTimeTooSkewed": "the clock of this machine is wrong: set it and run again",
+    "HeaderMalformed|PermanentRedirect|301 Moved|redirect without LOCATION": (
+        "the bucket is in another region: set AWS_REGION"
     ),
-    (
-        ("SignatureDoesNotMatch", "InvalidAccessKeyId", "ExpiredToken", "AccessDenied", "403 Forbidden", "401 Unauth"),
-        "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
+    "SignatureDoesNotMatch|InvalidAccessKeyId|ExpiredToken|AccessDenied|403 Forbidden|401 Unauth": (
+        "access is denied: check the credentials and the bucket's policy (get, put, list)"
     ),
-    (
-        ("error sending request", "timed out", "response body error"),
-        "it does not answer: check the network and AWS_ENDPOINT_URL",
+}
+_PASSING = {
+    "status code: (5|429)|SlowDown": "it is overloaded or has a fault: run again later",
+    "error sending request|timed out|RequestTimeout|response body": (
+        "it does not answer: check the network and AWS_ENDPOINT_URL"
     ),
-)
+}
+CURE = "remove this store from the bucket, and push it from a machine that has it"
+Answer = TypeVar("Answer")
 
 
 class UnreachableError(ArchiveError):
     """A bucket that refuses, or does not answer."""
 
 
-@dataclass(frozen=True)
-class ObjectPlace:
-    """An archive's place in a bucket. ``endpoint`` is None for AWS itself."""
+class Objects:
+    """The objects below ``s3://bucket/prefix``; names are relative to it.
 
-    bucket: str
-    prefix: str
-    endpoint: str | None = None
-
-    @property
-    def url(self) -> str:
-        """The address that the user gives."""
-        return f"s3://{self.bucket}/{self.prefix}" if self.prefix else f"s3://{self.bucket}"
-
-
-def parse_place(text: str | Path) -> ObjectPlace:
-    """Read ``s3://bucket/prefix``; the endpoint comes from the environment.
-
-    Raises SettingsError: the address or the endpoint is not valid.
+    A request that fails in a way that may pass is tried again, in all for about 20 s: lost connections, answers cut
+    short or damaged, overload, conflicts of two writers. Every method raises UnreachableError where the bucket refuses
+    or does not answer.
     """
-    found = _ADDRESS.fullmatch(str(text))
-    bucket, prefix = ("", "") if found is None else (found[1], found[2].strip("/"))
-    parts = prefix.split("/") if prefix else []
-    if not all(_PART.fullmatch(part) and part.strip(".") for part in (bucket, *parts)):
-        raise SettingsError(
-            f"{str(text)!r} is no archive on S3; expected s3://bucket/prefix in letters, digits and '_.=+-'"
-        )
-    return ObjectPlace(bucket, prefix, _endpoint())
+
+    def __init__(self, address: str | Path) -> None:
+        """Check an address, without a request to the network.
+
+        Raises SettingsError: the address or the endpoint is not valid; ArchiveError: another setting of AWS in the
+        environment is not valid, or obstore is not installed.
+        """
+        found = _ADDRESS.fullmatch(str(address))
+        if found is None:
+            raise SettingsError(
+                f"{str(address)!r} is no archive on S3; expected s3://bucket/prefix in letters, digits and '_.=+-'"
+            )
+        self.url = f"s3://{found[1]}{found[2]}"
+        self.endpoint = _endpoint()
+        try:
+            from obstore.exceptions import BaseError  # an extra
+            from obstore.store import S3Store
+        except ImportError as error:
+            raise ArchiveError(
+                f"{self.url}: archives on S3 need obstore ({error}); pip install 'spectralzoom[s3]'"
+            ) from error
+        self._errors = BaseError
+        try:
+            self._store = S3Store(
+                found[1],
+                prefix=found[2].strip("/") or None,
+                config={"endpoint": self.endpoint} if self.endpoint else {},
+                client_options={
+                    "allow_http": self.endpoint.startswith("http://"),
+                    "connect_timeout": "5s",
+                    "read_timeout": "30s",
+                    "timeout": "15min",
+                },
+                retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)},
+            )
+        except BaseError as error:
+            raise ArchiveError(f"{self.url} cannot be used: {_first_line(error)}") from error
+
+    def read(self, name: str, check: Callable[[bytes], object] = len) -> bytes | None:
+        """Return the content of a small object; None without one.
+
+        Raises IncompleteStoreError: it is damaged, as ``check`` tells by a ValueError.
+        """
+
+        def read() -> bytes:
+            answer = self._store.get(name)
+            try:
+                if answer.meta["size"] > MOST_BYTES:
+                    raise ValueError(f"it has {answer.meta['size']} bytes")
+                content = bytes(answer.bytes())
+                check(content)
+            except ValueError as error:
+                raise IncompleteStoreError(f"{self.url}/{name} is damaged: {error}; {CURE}") from error
+            return content
+
+        try:
+            return self._ask(read)
+        except FileNotFoundError:
+            return None
+
+    def create(self, name: str, content: bytes) -> bytes:
+        """Write a small object unless its name exists (``If-None-Match: *``); return the content that is there then."""
+        from obstore.exceptions import AlreadyExistsError  # an extra
+
+        def write() -> bytes:
+            try:
+                self._store.put(name, content, mode="create", use_multipart=False)
+                return content
+            except AlreadyExistsError as error:  # or two writers at the same time, or one whose answer was lost
+                try:
+                    return bytes(self._store.get(name).bytes())
+                except FileNotFoundError:
+                    raise error from None
+
+        return self._ask(write)
+
+    def write(self, name: str, source: Path | bytes) -> None:
+        """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
+        self._ask(lambda: self._store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2))
+
+    def fetch(self, name: str, path: Path, size: int, sha256: str) -> None:
+        """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has other content."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+        def fetch() -> None:
+            digest = hashlib.sha256()
+            with path.open("wb") as file:
+                answer = self._store.get(name)
+                for block in answer.stream(PART_BYTES) if answer.meta["size"] == size else ():
+                    digest.update(block)
+                    file.write(block)
+            if digest.hexdigest() != sha256:
+                raise IncompleteStoreError(
+                    f"{self.url}/{name} has changed since it was published (its size or SHA-256 differs); {CURE}"
+                )
+
+        try:
+            self._ask(fetch)
+        except FileNotFoundError:
+            raise IncompleteStoreError(f"{self.url}/{name} is missing; {CURE}") from None
+
+    def listing(self) -> set[str]:
+        """Return the names of all objects."""
+        return self._ask(lambda: {one["path"] for batch in self._store.list(chunk_size=1000) for one in batch})
+
+    def explain(self, error: BaseException) -> UnreachableError:
+        """Return the error of an answer of the bucket, with advice."""
+        advice = _advice(error, _LASTING | _PASSING) or _first_line(error)
+        return UnreachableError(f"{self.url}{f' at {self.endpoint}' if self.endpoint else ''}: {advice}")
+
+    def _ask(self, work: Callable[[], Answer]) -> Answer:
+        """Do ``work``, again after a failure that may pass. Raises FileNotFoundError: there is no such object."""
+        for pause_s in (*PAUSES_S, None):
+            try:
+                return work()
+            except (self._errors, FileNotFoundError, IncompleteStoreError) as error:
+                is_lasting = _advice(error, _LASTING) is not None
+                if isinstance(error, FileNotFoundError) and not is_lasting:
+                    raise
+                if pause_s is None or is_lasting:
+                    if isinstance(error, IncompleteStoreError):
+                        raise
+                    raise self.explain(error) from error
+                time.sleep(pause_s)
+        raise AssertionError("unreachable")
 
 
-def _endpoint() -> str | None:
-    text = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
-    if not text:
-        return None
-    try:
-        parts = urlsplit(text)
-    except ValueError:
-        parts = urlsplit("")
-    if parts.scheme not in ("http", "https") or not parts.hostname:
+def _endpoint() -> str:
+    """Return the server that the environment names, or nothing for AWS itself."""
+    text = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+    found = re.match(r"(https?)://(\[[\da-f:]+\]|[^/:\s]+)(:\d+)?(/|$)", text)
+    if text and found is None:
         raise SettingsError(f"AWS_ENDPOINT_URL={text!r} is no address; expected https://HOST, or http://127.0.0.1:PORT")
     allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
-    if parts.scheme == "http" and parts.hostname not in LOOPBACK and not allowed:
+    if found is not None and found[1] == "http" and found[2] not in LOOPBACK and not allowed:
         raise SettingsError(
             f"AWS_ENDPOINT_URL={text}: over plain http others on the way can read and change the data; use https, or "
             "set AWS_ALLOW_HTTP=true"
@@ -101,115 +200,15 @@ def _endpoint() -> str | None:
     return text
 
 
-def connect(place: ObjectPlace) -> S3Store:
-    """Return a store for a place, without a request to the network.
-
-    Raises ArchiveError: a setting of AWS in the environment is not valid, or obstore is not installed.
-    """
-    try:
-        from obstore.exceptions import BaseError  # an extra
-        from obstore.store import S3Store
-    except ImportError as error:
-        raise ArchiveError(
-            f"{place.url}: archives on S3 need obstore ({error}); pip install 'spectralzoom[s3]'"
-        ) from error
-    http = place.endpoint is not None and place.endpoint.startswith("http://")
-    try:
-        return S3Store(
-            place.bucket,
-            prefix=place.prefix or None,
-            config={} if place.endpoint is None else {"endpoint": place.endpoint},
-            client_options={"allow_http": http, "connect_timeout": "5s", "read_timeout": "30s", "timeout": "15min"},
-            retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)},
-        )
-    except BaseError as error:
-        raise ArchiveError(f"{place.url} cannot be used: {_first_line(error)}") from error
-
-
-@contextmanager
-def answers_of(place: ObjectPlace) -> Iterator[None]:
-    """Turn the errors of a store into an UnreachableError with advice."""
-    from obstore.exceptions import BaseError
-
-    try:
-        yield
-    except (BaseError, FileNotFoundError, PermissionError) as error:
-        if isinstance(error, FileNotFoundError) and "NoSuchBucket" not in str(error):
-            raise
-        known = (advice for signs, advice in _MEANINGS if any(sign in str(error) for sign in signs))
-        at = "" if place.endpoint is None else f" at {place.endpoint}"
-        raise UnreachableError(f"{place.url}{at}: {next(known, _first_line(error))}") from error
+def _advice(error: BaseException, known: Mapping[str, str]) -> str | None:
+    return next((advice for signs, advice in known.items() if re.search(signs, str(error))), None)
 
 
 def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-class Objects:
-    """The objects of one place; names are relative to it.
-
-    Every method raises UnreachableError where the bucket refuses or does not answer.
-    """
-
-    def __init__(self, place: ObjectPlace) -> None:
-        self.place = place
-        self.store = connect(place)
-
-    def read(self, name: str) -> bytes | None:
-        """Return the content of a small object; None without one."""
-        with answers_of(self.place):
-            try:
-                return bytes(self.store.get(name).bytes())
-            except FileNotFoundError as error:
-                if "NoSuchBucket" in str(error):
-                    raise
-                return None
-
-    def create(self, name: str, content: bytes) -> bool:
-        """Write an object unless its name exists (``If-None-Match: *``); return whether it was written."""
-        from obstore.exceptions import AlreadyExistsError  # an extra
-
-        with answers_of(self.place):
-            try:
-                self.store.put(name, content, mode="create", use_multipart=False)
-            except AlreadyExistsError:
-                return False
-        return True
-
-    def write(self, name: str, source: Path | bytes) -> None:
-        """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
-        with answers_of(self.place):
-            self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
-
-    def fetch(self, name: str, path: Path, sha256: str) -> None:
-        """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has another SHA-256."""
-        digest = hashlib.sha256()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        advice = "push it again from a machine that has it"
-        try:
-            with path.open("wb") as file, answers_of(self.place):
-                for block in self.store.get(name).stream(PART_BYTES):
-                    digest.update(block)
-                    file.write(block)
-        except FileNotFoundError:
-            raise IncompleteStoreError(f"{self.place.url}/{name} is missing; {advice}") from None
-        if digest.hexdigest() != sha256:
-            raise IncompleteStoreError(
-                f"{self.place.url}/{name} has changed since it was published (its SHA-256 differs); {advice}"
-            )
-
-    def listing(self) -> set[str]:
-        """Return the names of all objects."""
-        with answers_of(self.place):
-            return {one["path"] for batch in self.store.list(chunk_size=1000) for one in batch}
-
-    def remove(self, name: str) -> None:
-        """Remove one object."""
-        with answers_of(self.place):
-            self.store.delete(name)
-
-
-def some_at_a_time(work: Callable[[str], None], names: Iterable[str]) -> None:
-    """Run ``work`` on a few names at a time; raise the first error."""
+def some_at_a_time(work: Callable[[str], Answer], names: Iterable[str]) -> list[Answer]:
+    """Run ``work`` on a few names at a time; return the answers, or raise the first error."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        list(pool.map(work, names))  # which, after an error, cancels what has not begun
+        return list(pool.map(work, names))  # which, after an error, cancels what has not begun

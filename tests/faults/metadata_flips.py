@@ -89,7 +89,7 @@ def metadata_of(whole: Whole) -> list[tuple[str, str]]:
         for path in sorted((whole.out / uri).rglob("*")):
             name = path.relative_to(whole.out / uri).as_posix()
             chunk = re.search(r"\.zarr/(.*/)?c([./]|$)", name) is not None
-            if path.is_file() and not chunk and path.suffix not in (".png", ".html", "") and path.name != "cleared":
+            if path.is_file() and not chunk and path.suffix not in (".png", ".html", ""):
                 found.append((uri, name))
     return found
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from spectralzoom.models.weights.files import save_weights
 from spectralzoom.storage.runs import verify_everything
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, read_manifest
 from tests.conftest import RGB_NM, patchy_scene, random_weights
 from tests.faults.injection import logged_calls
 from tests.faults.nursery import Ended, Nursery
@@ -77,7 +77,8 @@ def stored(archive: Path) -> Stored:
         return {}
     opened = Archive.open(archive, create=False, write=False)
     return {
-        ref.uri: {name: digest for name, (_, digest) in opened.manifest(ref)["files"].items()} for ref in opened.refs()
+        ref.uri: {name: digest for name, (_, digest) in read_manifest(ref.path)["files"].items()}
+        for ref in opened.refs()
     }
 
 

@@ -26,4 +26,4 @@ def test_aimed_flips_are_named_and_removed(whole: Whole, tmp_path: Path) -> None
     found = metadata_flips.try_flips(whole, flips, tmp_path, exported=2, cured=2)
     assert found.wrong == []
     assert {flip.uri for flip in flips} == {*whole.stores, whole.run}
-    assert len(found.tried) > 10
+    assert len(found.tried) >= 10

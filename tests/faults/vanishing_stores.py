@@ -106,7 +106,7 @@ def kept_stores(subject: Subject) -> list[str]:
 
 
 def _count(out: Path) -> int:
-    return len(list(out.glob("stages/*/*/manifest.json")))
+    return len([*out.glob("stages/*/*/manifest.json"), *out.glob("stages/*/*.cleared")])
 
 
 def rows(quick: bool) -> Iterator[Row]:

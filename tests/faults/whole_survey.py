@@ -79,7 +79,7 @@ def survey_whole(subject: Subject) -> Whole:
         ended = nursery.run(words_)
         assert ended.code == 0, ended.text
     (receipt,) = (json.loads(path.read_text()) for path in out.glob("runs/*/receipt.json"))
-    folders = [*sorted((out / "stages").glob("*/*")), *(out / "runs").iterdir()]
+    folders = [*sorted(filter(Path.is_dir, (out / "stages").glob("*/*"))), *(out / "runs").iterdir()]
     numbers = {uri: numbers_of(out, uri) for uri in (folder.relative_to(out).as_posix() for folder in folders)}
     return Whole(nursery, out, stored_files(out), numbers, maps_of(exported), comparable(receipt))
 
@@ -87,7 +87,7 @@ def survey_whole(subject: Subject) -> Whole:
 def stored_files(out: Path) -> dict[str, str]:
     """Return the SHA-256 of every file of an archive's stores except manifests, by address."""
     paths = (path for path in (out / "stages").rglob("*") if path.is_file() and path.name != "manifest.json")
-    return {path.relative_to(out).as_posix(): digest(path.read_bytes()) for path in paths if path.name != "cleared"}
+    return {path.relative_to(out).as_posix(): digest(path.read_bytes()) for path in paths if path.suffix != ".cleared"}
 
 
 def descendants(out: Path, uri: str) -> list[Path]:

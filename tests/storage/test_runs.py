@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
 from spectralzoom.storage import runs
 from spectralzoom.storage.runs import (
     IN_USE,
@@ -26,7 +26,7 @@ from spectralzoom.storage.runs import (
     is_only_copy,
     verify_everything,
 )
-from spectralzoom.storage.store import Archive, inputs_first, publish
+from spectralzoom.storage.store import Archive, ancestors, inputs_first, manifest_path, publish
 from tests.storage.small_archive import flip, grow_old, make_store, problems, publish_receipt, rewrite, small_survey
 
 
@@ -138,12 +138,12 @@ def test_lineage_includes_indirect_inputs(archive: Archive) -> None:
     """A map depends on its mosaic and, through it and directly, on the raw lines; circles end."""
     small = small_survey(archive)
     catalogue = Catalogue.read(archive)
-    assert set(archive.lineage(f"runs/{small.run.name}")) == {f"runs/{small.run.name}", *catalogue.stores}
+    assert set(ancestors(archive.manifests(), [f"runs/{small.run.name}"])) == set(catalogue.stores)
     assert inputs_first(catalogue.stores, catalogue.stores) == [small.raw.uri, small.mosaic.uri, small.map.uri]
     assert [run.folder for run in catalogue.named_by(small.raw.uri)] == [small.run]
     assert catalogue.called(small.raw.uri) == {"capture_coarse"}
     rewrite(small.raw.path / "manifest.json", inputs=[small.map.uri])
-    assert set(archive.lineage(small.raw.uri)) == set(catalogue.stores)
+    assert {small.raw.uri, *ancestors(archive.manifests(), [small.raw.uri])} == set(catalogue.stores)
 
 
 def test_products_are_found_by_address_key_run_and_name(archive: Archive) -> None:
@@ -206,7 +206,7 @@ def test_lines_of_unknown_origin_are_the_only_copy(archive: Archive) -> None:
         archive.clear(refs[name])
     assert only() == {"bare", "rig", "raster", "signal of rig"}
     for ref in refs.values():
-        flip(ref.path / "manifest.json", at=40)
+        flip(manifest_path(ref.path), at=40)
     assert only() == {"bare", "rig", "signal of rig"}
 
 
@@ -464,6 +464,19 @@ def test_a_damaged_run_goes_and_its_stores_stay(archive: Archive) -> None:
     assert problems(archive) == []
     assert len(archive.refs()) == 3
     assert clear_up(archive, keep_days=9).obstacle is None
+
+
+@pytest.mark.parametrize("change", [flip, lambda path: (path.unlink(), path.mkdir())])
+def test_the_damaged_manifest_of_a_cleared_store_goes(archive: Archive, change: Callable[[Path], object]) -> None:
+    """It lies beside the place of its folder."""
+    small = small_survey(archive)
+    archive.clear(small.mosaic)
+    change(manifest_path(small.mosaic.path))
+    with pytest.raises(IncompleteStoreError, match=rf"{small.mosaic.key}\.cleared is damaged"):
+        archive.find("rectify", small.mosaic.key)
+    assert len(problems(archive)) == 1
+    assert small.mosaic.uri in {one.uri for one in remove_damaged(archive).removals}
+    assert not list(small.mosaic.path.parent.iterdir())
 
 
 def test_a_linked_store_goes_and_not_what_it_leads_to(archive: Archive, tmp_path: Path) -> None:

@@ -24,8 +24,20 @@ from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.storage import store
 from spectralzoom.storage.arrays.layout import create_group, open_group, write_image, write_small
-from spectralzoom.storage.store import Archive, Ref, plain, read_table, stage_key, text_of, uri_of
-from spectralzoom.storage.whole_files import PART, take_lock
+from spectralzoom.storage.store import (
+    Archive,
+    Ref,
+    ancestors,
+    is_cleared,
+    listed_bytes,
+    plain,
+    read_manifest,
+    read_table,
+    stage_key,
+    text_of,
+    uri_of,
+)
+from spectralzoom.storage.whole_files import PART, locked
 from tests.storage.small_archive import flip, make_store, problems, rewrite, small_survey
 
 ROOT = Path(__file__).parents[2]
@@ -127,14 +139,14 @@ def test_invalid_names_are_refused(archive: Archive, name: str) -> None:
 def test_a_store_is_found_with_its_manifest(archive: Archive) -> None:
     """Its manifest has parameters, the addresses of inputs, and sizes and hashes of files."""
     raw = make_store(archive, "capture", {"light": {"source": "sim"}}, [])
-    assert archive.find("mosaic", archive.key("mosaic", 1, {"tol": 0.1}, [raw])) is None
+    assert archive.find("mosaic", stage_key("mosaic", 1, {"tol": 0.1}, [raw])) is None
     ref, built = archive.produce("mosaic", two_files, version=1, params={"tol": 0.1}, inputs=[raw])
     assert (built, archive.find("mosaic", ref.key), archive.refs("mosaic")) == (True, ref, [ref])
-    manifest = archive.manifest(ref)
+    manifest = read_manifest(ref.path)
     assert (manifest["version"], manifest["params"], manifest["inputs"]) == (1, {"tol": 0.1}, [raw.uri])
     assert {name: size for name, (size, _) in manifest["files"].items()} == {"inner/a.txt": 7, "plan.json": 37}
-    assert archive.stored_bytes(ref) == 44
-    assert archive.lineage(ref.uri) == [ref.uri, raw.uri]
+    assert listed_bytes(manifest) == 44
+    assert ancestors(archive.manifests(), [ref.uri]) == [raw.uri]
     assert archive.produce("mosaic", Mock(), version=1, params={"tol": 0.1}, inputs=[raw]) == (ref, False)
 
 
@@ -292,22 +304,20 @@ def test_paths_that_are_no_archive_are_refused(tmp_path: Path) -> None:
 # --- locks ------------------------------------------------------------------------------------------------------------
 
 
-def test_releasing_a_lock_twice_keeps_the_next_holders_lock(tmp_path: Path) -> None:
-    """The second release closes no file of the next holder; a lock file that gc removed is made again."""
+def test_a_lock_is_held_by_one_or_shared(tmp_path: Path) -> None:
+    """Also when gc has removed its file; a link in its place is refused."""
     path = tmp_path / "a.lock"
-    first = take_lock(path)
-    assert first is not None
-    assert take_lock(path, wait=False) is None
-    first()
-    second = take_lock(path, wait=False)
-    assert second is not None
-    first()
-    assert take_lock(path, wait=False) is None
+    with locked(path) as first, locked(path, wait=False) as second:
+        assert (first, second) == (True, False)
+        path.unlink()
+        with locked(path, wait=False) as third, locked(path, wait=False) as fourth:
+            assert (third, fourth) == (True, False)
+    with locked(path, shared=True) as first, locked(path, shared=True) as second, locked(path, wait=False) as third:
+        assert (first, second, third) == (True, True, False)
     path.unlink()
-    third = take_lock(path, wait=False)
-    assert third is not None
-    second()
-    third()
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ArchiveError, match="cannot lock"), locked(path):
+        pass
 
 
 def test_an_unknown_refusal_of_locks_is_one_error(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -357,7 +367,7 @@ def test_every_opening_finds_a_flipped_bit_of_metadata(archive: Archive) -> None
     """The error names store, file, what was made of it, and the command; chunks have checksums of their own."""
     ref = produce(archive, with_cube)
     made = make_store(archive, "segment", {}, [ref])
-    for name in archive.manifest(ref)["files"]:
+    for name in read_manifest(ref.path)["files"]:
         path = ref.path / name
         before = path.read_bytes()
         flip(path, at=len(before) // 2)
@@ -476,13 +486,13 @@ def test_a_table_is_read_by_its_hash(archive: Archive) -> None:
 def test_a_cleared_store_keeps_its_manifest_and_is_made_again(archive: Archive) -> None:
     """Its files go; verify finds no problem; a later request has the same bytes at the same address."""
     small = small_survey(archive)
-    before, content = archive.manifest(small.mosaic), (small.mosaic.path / "data.bin").read_bytes()
+    before, content = read_manifest(small.mosaic.path), (small.mosaic.path / "data.bin").read_bytes()
     for _ in range(2):
         assert archive.clear(small.mosaic, wait=False)
-        assert sorted(path.name for path in small.mosaic.path.iterdir()) == ["cleared", "manifest.json"]
-        assert archive.manifest(small.mosaic) == before
+        assert [path.name for path in small.mosaic.path.parent.iterdir()] == [f"{small.mosaic.key}.cleared"]
+        assert read_manifest(small.mosaic.path) == before
     assert archive.find("rectify", small.mosaic.key) is None
-    assert archive.is_known(small.mosaic)
+    assert is_cleared(small.mosaic.path)
     assert problems(archive) == []
     with pytest.raises(IncompleteStoreError, match=r"cleared away\. Run its survey again, for raw lines with --keep"):
         archive.locate(f"{small.mosaic.uri}/mosaic.zarr")
@@ -496,7 +506,7 @@ def test_a_store_made_anew_during_each_look_is_not_damaged(archive: Archive, mon
     """Another process clears it and makes it again, twice, while its files are compared."""
     ref = produce(archive, two_files, scene="a")
     problem, renewals = store.file_problem, iter([True, True])
-    first = Path(next(iter(archive.manifest(ref)["files"]))).name
+    first = Path(next(iter(read_manifest(ref.path)["files"]))).name
 
     def renewed(*given: Any) -> str | None:
         if given[0].name != first or not next(renewals, False):

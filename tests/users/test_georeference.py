@@ -27,7 +27,7 @@ from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.ground.georeference import pixel_rows_m2
 from spectralzoom.storage.arrays.mosaics import open_mosaic
 from spectralzoom.storage.runs import verify_everything
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, read_manifest
 from tests.conftest import QUIET, RGB_NM, patchy_scene
 from tests.prior_work import without_effects
 from tests.storage.readers.test_envi_cubes import write_envi
@@ -188,7 +188,7 @@ def test_keys_of_mosaic_and_map_contain_the_georeference(tmp_path: Path, weights
     for product in ("mosaic", "class_map"):
         frames = []
         for one in (run, here):
-            params = archive.manifest(archive.ref(*one.receipt["products"][product].split("/")[1:3]))["params"]
+            params = read_manifest(archive.ref(*one.receipt["products"][product].split("/")[1:3]).path)["params"]
             frames.append(params.get("gains", params)["frame"])
         assert "georeference" not in frames[0]
         assert frames[1]["georeference"]["crs"] == "EPSG:32632"

@@ -143,7 +143,12 @@ WORKS = {  # address, wavelengths, shape (y, x, band), and the expected note
     "some NaN": ("holes.npy", NM, (12, 16, 5), "missing samples: 60 of 960"),
     "two axes": ("plane.npy", "550", (12, 16, 1), ""),
     "one cube beside vectors": ("one_cube.mat", NM, (12, 16, 5), r"array cube of the file, which also has wl \(1, 5\)"),
-    "nm beside it": ("with_nm.mat", None, (12, 16, 5), "the array wavelengths, without a unit, read by their size"),
+    "nm beside it": (
+        "with_nm.mat",
+        None,
+        (12, 16, 5),
+        "no unit, read as micrometres by their size; wavelengths from the list wavelengths",
+    ),
     "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
     "Zarr v2 of another tool": ("old.zarr", NM, (12, 16, 5), "dims have no names"),
 }

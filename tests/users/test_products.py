@@ -136,10 +136,10 @@ def test_the_catalogue_lists_every_product(posed: Exported) -> None:
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        ({"dose": "weed"}, "expects classes with numbers, weed=2.5, got 'weed'"),
+        ({"dose": "weed"}, "expects each class once with a number, weed=2.5, got 'weed'"),
         ({"dose": "weed=1e9"}, "got 'weed=1e9'; numbers are 0 or more, without an exponent"),
         *((({name: ","}), f"--{name} ',' names nothing") for name in ("dose", "indices")),
-        ({"dose": "weed=1,weed=2"}, "names weed twice; give it one number"),
+        ({"dose": "weed=1,weed=2"}, "expects each class once with a number, weed=2.5, got 'weed=2'"),
         ({"dose": "thistle=1"}, "no class 'thistle'; its classes are soil, maize"),
         ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
     ],

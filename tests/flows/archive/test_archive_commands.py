@@ -20,7 +20,7 @@ from spectralzoom.flows.terminal.figures import format_bytes
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.runs import read_run
-from spectralzoom.storage.store import Archive, publish
+from spectralzoom.storage.store import Archive, manifest_path, publish
 from spectralzoom.storage.whole_files import to_json
 from tests.conftest import QUIET
 from tests.storage.small_archive import flip, small_survey
@@ -72,7 +72,7 @@ def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest
     assert ls(archive.parent / "empty") == DONE
     assert "no runs" in capsys.readouterr().out
     mosaic, coarse = (Archive.open(archive).refs(stage)[0] for stage in ("rectify", "locate"))
-    flip(mosaic.path / "manifest.json", at=40)
+    flip(manifest_path(mosaic.path), at=40)
     (coarse.path / "manifest.json").unlink()
     flip(Archive.open(archive).runs()[0] / "receipt.json", at=40)
     content = _json(capsys, lambda: ls(archive, as_json=True))

@@ -10,7 +10,7 @@ import pytest
 
 from spectralzoom.flows.cli.serve_command import load_fields, schedule_of, survey_deployment
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import take_lock
+from spectralzoom.storage.whole_files import locked
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -45,12 +45,8 @@ def test_refused_before_serving(case: str, field_file: Callable[..., Path], tmp_
 def test_a_second_serve_is_refused(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
     """The lock of the first serve is held."""
     file = field_file()
-    release = take_lock(Archive.open(tmp_path / "archive").root / ".locks" / "serve.lock", wait=False)
-    assert release is not None
-    try:
+    with locked(Archive.open(tmp_path / "archive").root / ".locks" / "serve.lock"):
         command_line("serve", file, "--every", "30m").refused(1, "another serve uses the archive")
-    finally:
-        release()
 
 
 @pytest.mark.parametrize(

@@ -182,9 +182,9 @@ def test_geozarr_attributes_match_the_grid() -> None:
 
 def test_an_angular_store_has_no_geobox(tmp_path: Path) -> None:
     """A store without a position on the earth has no CRS and no grid mapping."""
-    grid = georeference.AngularGrid(1e-4, (20, 30))
-    group = layout.create_group(tmp_path / "a.zarr", "a mosaic", grid.attributes((20, 30)))
-    layout.write_image(group, "values", ("y", "x"), np.zeros((20, 30), np.float32), grid.attributes((20, 30)))
+    place = georeference.map_attributes(georeference.AngularGrid(1e-4, (20, 30)).box((20, 30)))
+    group = layout.create_group(tmp_path / "a.zarr", "a mosaic", place)
+    layout.write_image(group, "values", ("y", "x"), np.zeros((20, 30), np.float32), place)
     assert georeference.load_geobox(tmp_path / "a.zarr") is None
     assert not {"proj:code", "proj:wkt2"} & set(group.attrs)
 

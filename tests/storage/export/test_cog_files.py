@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import ClassNames
-from spectralzoom.storage.export.image_files import CogImage, write_cog
+from spectralzoom.storage.export.image_files import Layer, write_cog
 from tests.storage.export.stac_rules import is_cog
 
 LEGEND = ClassNames(("sugar beet", "soil & stones", "maïs"), np.array([[9, 200, 30], [120, 90, 60], [0, 0, 255]], "u1"))
@@ -45,15 +44,16 @@ def classes_of(shape: tuple[int, int]) -> NDArray[np.uint8]:
     return np.where(rng.random(shape) < 0.1, np.uint8(UNLABELLED), found)
 
 
-def rows_of(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield the image in blocks of 64 rows."""
-    for first in range(0, len(values), 64):
-        yield first, values[first : first + 64]
+def image_of(values: NDArray[Any], geobox: GeoBox, **more: Any) -> Layer:
+    """Return an image whose rows come in blocks of 64."""
+    bands = ("r", "g", "b")[: values.shape[2]] if values.ndim == 3 else ("class",)
+    rows = lambda: ((first, values[first : first + 64]) for first in range(0, len(values), 64))  # noqa: E731
+    return Layer(name="a", title="", geobox=geobox, dtype=values.dtype.name, bands=bands, rows=rows, **more)
 
 
-def class_image(geobox: GeoBox) -> CogImage:
-    """Return the description of a file of classes."""
-    return CogImage(geobox, "uint8", ("class",), UNLABELLED, LEGEND, {"run": "r1"})
+def class_image(values: NDArray[Any], geobox: GeoBox) -> Layer:
+    """Return an image of classes."""
+    return image_of(values, geobox, nodata=UNLABELLED, legend=LEGEND, tags={"run": "r1"})
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733"])
@@ -61,7 +61,7 @@ def test_rasterio_reads_values_and_tags_as_written(tmp_path: Path, crs: str) -> 
     """Values, CRS, transform, nodata, band names and tags of a map are those given."""
     values = classes_of(FEW)
     box = on_map(FEW, crs)
-    write_cog(tmp_path / "a.tif", class_image(box), rows_of(values))
+    write_cog(tmp_path / "a.tif", class_image(values, box))
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(file.read(1), values)
         assert file.crs == rasterio.crs.CRS.from_string(crs)
@@ -74,8 +74,7 @@ def test_rasterio_reads_values_and_tags_as_written(tmp_path: Path, crs: str) -> 
 def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
     """GDAL finds the COG layout with three bands: tiles of 512 px, and halving overviews down to one tile."""
     values = np.random.default_rng(1).integers(0, 200, (1100, 600, 3)).astype(dtype)
-    image = CogImage(angular((1100, 600)), dtype, ("r", "g", "b"), 0)
-    write_cog(tmp_path / "a.tif", image, rows_of(values))
+    write_cog(tmp_path / "a.tif", image_of(values, angular((1100, 600)), nodata=0))
     assert is_cog(tmp_path / "a.tif")
     with rasterio.open(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal(np.moveaxis(file.read(), 0, -1), values)
@@ -87,7 +86,7 @@ def test_overviews_of_classes_show_the_commonest_class(tmp_path: Path) -> None:
     """Three white pixels and a black one give white, though grey is nearer to the mean of their colours."""
     greys = ClassNames(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
     values = np.tile(np.array([[0, 2], [2, 2]], np.uint8), (300, 280))
-    write_cog(tmp_path / "a.tif", replace(class_image(on_map(values.shape)), legend=greys), rows_of(values))
+    write_cog(tmp_path / "a.tif", replace(class_image(values, on_map(values.shape)), legend=greys))
     with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
         assert set(np.unique(file.read(1))) == {2}
 
@@ -96,8 +95,7 @@ def test_overviews_of_confidence_ignore_nan(tmp_path: Path) -> None:
     """The mean of two known pixels and two NaN is the mean of the known."""
     values = np.full((1300, 1100), 0.25, np.float32)
     values[1::2] = np.nan
-    image = CogImage(angular(values.shape), "float32", ("confidence",), np.nan)
-    write_cog(tmp_path / "a.tif", image, rows_of(values))
+    write_cog(tmp_path / "a.tif", image_of(values, angular(values.shape)))
     with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
         assert (file.read(1) == 0.25).all()
 
@@ -105,8 +103,8 @@ def test_overviews_of_confidence_ignore_nan(tmp_path: Path) -> None:
 @pytest.mark.parametrize("numbers", [(0, 1, 2), (4, 1, 2)])
 def test_classes_have_colours_and_names(tmp_path: Path, numbers: tuple[int, ...]) -> None:
     """The file has a colour table, tags, and GDAL's own category names, which a VRT made by GDAL repeats."""
-    image = replace(class_image(on_map(FEW)), legend=replace(LEGEND, values=numbers))
-    write_cog(tmp_path / "a.tif", image, rows_of(classes_of(FEW)))
+    image = class_image(classes_of(FEW), on_map(FEW))
+    write_cog(tmp_path / "a.tif", replace(image, legend=replace(LEGEND, values=numbers)))
     with rasterio.open(tmp_path / "a.tif") as file:
         table = file.colormap(1)
         tags = file.tags(1)
@@ -130,7 +128,6 @@ def test_a_truncated_file_gets_no_name(tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(rasterio.shutil, "copy", cut)
     values = np.random.default_rng(2).random(FEW).astype(np.float32)
-    image = CogImage(on_map(FEW), "float32", ("confidence",), np.nan)
     with pytest.raises(ArchiveError, match=r"a\.tif (cannot be written|does not read back as written)"):
-        write_cog(tmp_path / "a.tif", image, rows_of(values))
+        write_cog(tmp_path / "a.tif", image_of(values, on_map(FEW)))
     assert list(tmp_path.iterdir()) == []

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pickle
+import shutil
 import signal
 import socket
 import subprocess
@@ -11,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -21,6 +24,9 @@ from dask.distributed import LocalCluster
 from spectralzoom.pipeline.errors import SettingsError, ShapeError, WorkerError
 from spectralzoom.storage.parallel import pool as pool_module
 from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
+from spectralzoom.storage.remote.worker_stores import FetchingWork
+from spectralzoom.storage.store import Archive, Ref
+from tests.storage.small_archive import make_store
 
 ROOT = Path(__file__).parents[3]
 # dask does not close its handshake with a worker that dies
@@ -165,6 +171,42 @@ def elsewhere() -> Iterator[WorkerPool]:
 def test_workers_of_a_dask_scheduler_give_the_same_results(elsewhere: WorkerPool) -> None:
     """Results are in the order of the items."""
     assert run_blocks(square, range(6), elsewhere) == [square(item) for item in range(6)]
+
+
+@dataclass(frozen=True)
+class ReadStore:
+    """Work that reads a store."""
+
+    store: Ref
+
+    def read(self, item: int) -> bytes:
+        """Return one byte of its file."""
+        return (self.store.path / "data.bin").read_bytes()[item : item + 1]
+
+
+def test_workers_without_the_archive_fetch_stores_from_a_bucket(
+    elsewhere: WorkerPool, bucket: str, tmp_path: Path
+) -> None:
+    """The survey has sent the stores that the work names, wherever they stand in it."""
+    archive = Archive.open(tmp_path / "archive")
+    store = make_store(archive, "capture", {}, [])
+    there = (store.path / "data.bin").read_bytes()
+    work = ReadStore(store).read
+    assert run_blocks(work, range(3), WorkerPool(elsewhere.scheduler, bucket=bucket)) == [b"[", b'"', b"c"]
+    shutil.rmtree(archive.root)
+    elsewhere_work = pickle.loads(pickle.dumps(FetchingWork(work, (store,), bucket)))
+    assert [elsewhere_work(item) for item in range(3)] == [b"[", b'"', b"c"]
+    assert (store.path / "data.bin").read_bytes() == there
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "bucket", "words"),
+    [("threads", "s3://bucket/x", "for workers on other machines"), ("tcp://host:1", "bucket", "no archive on S3")],
+)
+def test_a_bucket_for_workers_is_checked_before_a_survey(scheduler: str, bucket: str, words: str) -> None:
+    """Without a dask scheduler it would do nothing."""
+    with pytest.raises(SettingsError, match=words):
+        WorkerPool(scheduler, bucket=bucket)
 
 
 STALE_S = 0.6

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.envi_files import load_envi_header, open_envi_cube
+from spectralzoom.storage.readers.envi_files import bands_of_header, load_envi_header, open_envi_cube
 from spectralzoom.storage.readers.open_cubes import open_cube_source
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
@@ -110,32 +110,7 @@ def test_comment_lines_hold_settings() -> None:
     text = "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
     header = parse_envi_header(PLAIN + text)
     assert header.settings == {"exposure (ms)": "100.25", "post aoi width": "1600", "x": "1"}
-    np.testing.assert_array_equal(header.wavelength_nm, [400, 402])
-
-
-@pytest.mark.parametrize(
-    ("unit", "listed", "found"),
-    [
-        ("Nanometers", "400, 500", [400, 500]),
-        ("Micrometers", "0.4, 0.5", [400, 500]),
-        ("um", "0.4, 2.5", [400, 2500]),
-        ("", "400, 500", [400, 500]),
-        ("Unknown", "0.4, 0.5", [400, 500]),
-        ("Wavenumber", "400, 500", None),
-        ("", "1, 500", None),
-        ("nm", "400, 500, 600", None),
-        ("nm", "400, x", None),
-    ],
-)
-def test_wavelengths_are_converted_to_nm(unit: str, listed: str, found: list[float] | None) -> None:
-    """Without a unit they are read by their size; wavelengths that cannot be read are left out with a note."""
-    header = parse_envi_header(PLAIN + f"wavelength units = {unit}\nwavelength = {{{listed}}}\n")
-    if found is None:
-        assert header.wavelength_nm is None
-        assert "left out" in header.notes[0]
-    else:
-        np.testing.assert_allclose(header.wavelength_nm, found)
-        assert bool(header.notes) == (unit in ("", "Unknown"))
+    assert header.fields["wavelength"].split() == ["400", ",402"]
 
 
 @pytest.mark.parametrize(
@@ -191,11 +166,13 @@ def test_headers_of_real_instruments(real_data: Path) -> None:
         "emit_l1b__reference.hdr": (288, 365.80463, 2504.28),
     }
     for name, (count, first, last) in spans.items():
-        found = read[name].wavelength_nm
+        found = bands_of_header(read[name], name).wavelength_nm
         assert (len(found), found[0], found[-1]) == pytest.approx((count, first, last))
     assert read["hdr_gdal__uint16_envi_bigendian.hdr"].dtype == np.dtype(">u2")
     assert read["headwall_mvx__darkReference.hdr"].settings["exposure (ms)"] == "100.0033437"
-    assert read["plantcv__darkReference2.hdr"].notes == ("wavelength is left out: 35 for 978 bands",)
+    assert bands_of_header(read["plantcv__darkReference2.hdr"], "").notes == (
+        "wavelength is left out: 35 for 978 bands",
+    )
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ def test_the_orientation_tag_of_labels_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("pixel", "unlabelled", "words"),
     [
-        ((0, 120, 0), None, r"have colours, such as \[0, 120, 0\], and the classes are numbers"),  # no packed number
+        ((0, 120, 0), None, r"have colours, and \[classes\] or unlabelled has numbers"),  # no packed number
         (0, 1, "value 1 as unlabelled and as class soil"),
     ],
 )

@@ -41,6 +41,11 @@ def write_hdf(path: Path) -> None:
         file["cube"], file["wavelength"] = CUBE, NM
 
 
+def write_matlab_73(path: Path) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["cube"] = CUBE.T
+
+
 def write_zarr(path: Path) -> None:
     group = zarr.create_group(path)
     group.create_array("cube", data=CUBE, chunks=(3, 6, 5), dimension_names=("y", "x", "band"))
@@ -56,6 +61,7 @@ KINDS: dict[str, Callable[[Path], object]] = {
     "a.h5": write_hdf,
     "a.zarr": write_zarr,
     "a.mat": lambda path: scipy.io.savemat(path, {"cube": CUBE}),
+    "a73.mat": write_matlab_73,
     "a.npy": lambda path: np.save(path, CUBE),
 }
 
@@ -70,7 +76,7 @@ def test_every_kind_is_one_data_array(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(cube[2].values, CUBE[2])
     np.testing.assert_array_equal(cube[5:1:-2, 1:, [3, 0]].values, CUBE[5:1:-2, 1:, [3, 0]])
     np.testing.assert_array_equal(cube.isel(y=slice(0, 0)).values, CUBE[:0])
-    if name not in ("a.mat", "a.npy"):
+    if name not in ("a.mat", "a73.mat", "a.npy"):
         np.testing.assert_allclose(cube.wavelength, NM)
     assert (cube.odc.crs is not None) == (name == "a.tif")
 

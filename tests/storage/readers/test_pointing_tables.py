@@ -83,10 +83,13 @@ def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is empty; give a header and a row for each line"),
+        ("", "cannot be read as a pointing table: No columns to parse from file"),
         ("mirror_x,mirror_y\n", "has no row below its header"),
-        ("mirror_x,mirror_y,roll\n0,0,0\n", "column 'roll', which is not known; leave it out; accepted are "),
-        ("mirror_x,mirror_x\n0,0\n", "has the column 'mirror_x' twice"),
+        (
+            "mirror_x,mirror_y,roll\n0,0,0\n",
+            "has the column 'roll', unknown or twice; give a row for each line, with columns of line, sweep",
+        ),
+        ("mirror_x,mirror_x\n0,0\n", "has the column 'mirror_x', unknown or twice"),
         ("mirror_x\n0\n", "one kind of pointing, but mirror_y is missing"),
         ("time\n0\n", "one kind of pointing, but it has none"),
         ("angle_deg,position_m\n0,0\n", "one kind of pointing, but it has 2 kinds"),

@@ -158,7 +158,7 @@ def test_init_uses_the_class_attribute_of_scene_toml(tmp_path: Path) -> None:
         ((WEST, EAST), 32632, {"owner": ["a", "b"]}, PLACE, r"lack an attribute that says the class; they have owner;"),
         ((WEST, EAST), 32632, {"crop": [None, None]}, PLACE, "have no class for any polygon"),
         ((WEST, EAST), 32632, {}, None, r"has polygons, and this field has no georeference"),
-        ((WEST, EAST), None, {}, PLACE, "has no CRS; save it with one"),
+        ((WEST, EAST), None, {}, PLACE, "has no CRS"),
         (
             ELSEWHERE,
             32632,

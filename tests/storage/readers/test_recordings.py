@@ -207,7 +207,9 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
     """Without pointing the cubes' relative position is unknown; cubes of other bands are not one recording."""
     write_envi_cube(tmp_path / "a", VALUES)
     write_envi_cube(tmp_path / "b", VALUES)
-    with pytest.raises(SceneError, match=r"a\.hdr has no pointing, and how 2 cubes lie beside each other is not known"):
+    with pytest.raises(
+        SceneError, match=r"a\.hdr has no pointing of a mirror, and how 2 cubes lie beside each other is not"
+    ):
         open_recording(tmp_path)
     write_envi_cube(tmp_path / "b", VALUES, wavelength="{400, 500, 600}")
     with pytest.raises(SceneError, match=r"b\.hdr has other wavelengths than .*a\.hdr"):
@@ -219,7 +221,7 @@ def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
         open_recording(tmp_path)
     (tmp_path / "c.img").unlink()  # a table alone may be another recording's
     (tmp_path / "tables").mkdir()
-    with pytest.raises(SceneError, match=r"has no pointing for a; add a\.csv, or name one table for all"):
+    with pytest.raises(SceneError, match=r"has no pointing for a; add a\.csv, or name one for all"):
         open_recording(tmp_path, pointing=tmp_path / "tables")
 
 

@@ -39,7 +39,7 @@ def test_xarray_dataset_is_read(tmp_path: Path, cube: NDArray[np.uint16], dims: 
     scene = load_scene_file(path)
     np.testing.assert_array_equal(scene.values, cube)
     np.testing.assert_array_equal(scene.wavelength_nm, NM)
-    assert "wavelengths from the array wavelength, in nm" in scene.provenance
+    assert any("wavelengths from the list wavelength" in one for one in scene.provenance)
 
 
 def test_zarr_arrays_without_dims_are_read(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
@@ -136,7 +136,7 @@ def test_links_out_of_a_store_are_refused(tmp_path: Path, cube: NDArray[np.uint1
     for target in (tmp_path / "secret" / "key", Path("../../../../secret/key"), Path("/dev/zero"), tmp_path / "none"):
         chunk.unlink()
         chunk.symlink_to(target)
-        with pytest.raises(SceneError, match="is a link out of the store"):
+        with pytest.raises(SceneError, match="is a link out of its folder"):
             open_cube_source(path)
     chunk.unlink()
     os.mkfifo(chunk)
@@ -145,7 +145,7 @@ def test_links_out_of_a_store_are_refused(tmp_path: Path, cube: NDArray[np.uint1
     chunk.unlink()
     chunk.write_bytes(whole)
     (path / "more").symlink_to(tmp_path / "secret")
-    with pytest.raises(SceneError, match="is a link out of the store"):
+    with pytest.raises(SceneError, match="is a link out of its folder"):
         open_cube_source(path)
     (path / "more").unlink()
     (tmp_path / "linked.zarr").symlink_to(path)

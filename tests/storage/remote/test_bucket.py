@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from itertools import count
 from pathlib import Path
+from threading import Barrier
+from typing import Any
 
 import pytest
 
@@ -11,22 +22,24 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from spectralzoom.flows.cli.main import main
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from spectralzoom.storage.remote import objects as requests
 from spectralzoom.storage.remote.bucket import Copied, pull, push
-from spectralzoom.storage.remote.objects import Objects, UnreachableError, answers_of, parse_place
+from spectralzoom.storage.remote.objects import Objects, UnreachableError
 from spectralzoom.storage.runs import clear_up, verify_everything
-from spectralzoom.storage.store import Archive, Ref
-from tests.storage.small_archive import small_survey
+from spectralzoom.storage.store import Archive, Ref, is_cleared, manifest_text
+from tests.faulty_proxy import FAULTS, Choose, faulty_proxy
+from tests.storage.small_archive import make_store, publish_receipt, small_survey
 
 
 def send(archive: Archive, bucket: str) -> Copied:
     """Push an archive without a progress bar."""
-    return push(archive, Objects(parse_place(bucket)), lambda uri, part: None)
+    return push(archive, Objects(bucket), lambda uri, part: None)
 
 
 def fetch(bucket: str, folder: Path, run: str | None = None) -> tuple[Archive, Copied]:
     """Pull an archive into a folder without a progress bar."""
     archive = Archive.open(folder)
-    return archive, pull(Objects(parse_place(bucket)), archive, lambda uri, part: None, run)
+    return archive, pull(Objects(bucket), archive, lambda uri, part: None, run)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -42,11 +55,25 @@ def problems(root: Path) -> list[str]:
 
 def flip(bucket: str, ending: str) -> None:
     """Flip one bit of the first object whose name ends so."""
-    objects = Objects(parse_place(bucket))
+    objects = Objects(bucket)
     name = min(name for name in objects.listing() if name.endswith(ending))
     content = bytearray(objects.read(name) or b"")
     content[-9] ^= 4
     objects.write(name, bytes(content))
+
+
+@pytest.fixture
+def broken(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Choose], None]]:
+    """Return a function that puts a proxy with the chosen faults before the server."""
+    with ExitStack() as proxies:
+
+        def start(choose: Choose) -> None:
+            monkeypatch.setenv("AWS_ENDPOINT_URL", proxies.enter_context(faulty_proxy(s3_server, choose)))
+
+        yield start
+
+
+Broken = Callable[[Choose], None]
 
 
 @pytest.fixture
@@ -67,14 +94,145 @@ def test_another_machine_gets_the_same_bytes(archive: Archive, bucket: str, tmp_
     assert (send(archive, bucket).bytes, fetch(bucket, other.root)[1].copied) == (0, [])
 
 
-def test_additions_of_another_machine_come_back(archive: Archive, bucket: str, tmp_path: Path) -> None:
-    """Two machines survey in turns, by pull and push."""
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_of_the_network_change_no_byte(bucket: str, tmp_path: Path, broken: Broken, fault: str) -> None:
+    """Two machines push and pull while the first request of each kind fails."""
+    asked: set[tuple[str, str]] = set()
+
+    def choose(method: str, path: str) -> str | None:
+        kind = method, path.rpartition("/")[2]
+        is_new = kind not in asked
+        asked.add(kind)
+        return fault if is_new else None
+
+    broken(choose)
+    one, two = (Archive.open(tmp_path / name) for name in ("one", "two"))
+    for seed, machine in enumerate((one, two)):
+        run = small_survey(machine, seed=seed).run
+        run.rename(run.with_name(f"2026010{seed + 1}T000000-farm"))
+        send(machine, bucket)
+        asked.clear()
+    assert [len(fetch(bucket, machine.root)[1].copied) for machine in (one, two)] == [4, 4]
+    assert contents(one.root) == contents(two.root)
+    assert problems(one.root) == []
+
+
+def test_large_objects_travel_in_parts(bucket: str, tmp_path: Path, broken: Broken) -> None:
+    """Of three parts each is lost or cut once on its way."""
+    counter = count()
+    broken(lambda method, path: (None, "lost", None, "cut", None, "503")[next(counter) % 6])
+    one = Archive.open(tmp_path / "here")
+    content = os.urandom(2 * requests.PART_BYTES + 5)
+    one.produce("capture", lambda folder: (folder / "lines.bin").write_bytes(content), version=1, params={})
+    send(one, bucket)
+    assert contents(fetch(bucket, tmp_path / "there")[0].root) == contents(one.root)
+
+
+@pytest.mark.parametrize("fault", ["reset", "503", "flip"])
+def test_a_fault_that_stays_leaves_nothing_partial(
+    archive: Archive, bucket: str, tmp_path: Path, broken: Broken, fault: str
+) -> None:
+    """It ends in one message, and the same command continues later."""
     send(archive, bucket)
-    other, _ = fetch(bucket, tmp_path / "there")
-    small_survey(other, seed=1)
-    send(other, bucket)
-    assert len(fetch(bucket, archive.root)[1].copied) == 4
-    assert contents(other.root) == contents(archive.root)
+    failing = [fault]
+    broken(lambda method, path: failing[0] if failing and "data.bin" in path and "rectify" in path else None)
+    with pytest.raises(
+        (ArchiveError, IncompleteStoreError), match=f"^{bucket}.*(run again|check the network|remove this store)"
+    ):
+        fetch(bucket, tmp_path / "there")
+    assert [uri.split("/")[1] for uri in contents(tmp_path / "there")] == ["capture"] * 2
+    assert not [*(tmp_path / "there").rglob("*.part")]
+    failing.clear()
+    assert contents(fetch(bucket, tmp_path / "there")[0].root) == contents(archive.root)
+
+
+PULL = """
+import sys
+from pathlib import Path
+from spectralzoom.storage.remote.bucket import pull
+from spectralzoom.storage.remote.objects import Objects
+from spectralzoom.storage.store import Archive
+print("begun", flush=True)
+pull(Objects(sys.argv[1]), Archive.open(sys.argv[2]), lambda uri, part: None)
+"""
+
+
+def test_a_killed_pull_continues(archive: Archive, bucket: str, tmp_path: Path, broken: Broken) -> None:
+    """It is killed while it waits for a file: what is there is whole, and the leftover goes with the next pull."""
+    send(archive, bucket)
+    killed: list[subprocess.Popen[bytes]] = []
+
+    def kill(method: str, path: str) -> str | None:
+        if "segment" in path and "data.bin" in path and killed:
+            killed[0].send_signal(signal.SIGKILL)
+            killed.pop().wait()
+        return None
+
+    broken(kill)
+    command = [sys.executable, "-c", PULL, bucket, str(tmp_path / "there")]
+    with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdout=subprocess.PIPE) as process:
+        killed.append(process)
+        assert process.wait() == -signal.SIGKILL
+    assert problems(tmp_path / "there") == []
+    assert len([*(tmp_path / "there").rglob("*.part")]) == 1
+    assert len(fetch(bucket, tmp_path / "there")[1].copied) == 2
+    assert contents(tmp_path / "there") == contents(archive.root)
+    assert not [*(tmp_path / "there").rglob("*.part")]
+
+
+def test_two_machines_push_at_the_same_time(bucket: str, tmp_path: Path, broken: Broken) -> None:
+    """Both have made one store with other manifests, and other runs of one name: the first writer of each wins."""
+    together, listed = Barrier(2), count()
+
+    def meet(method: str, path: str) -> str | None:
+        if method == "GET" and "list-type" in path and next(listed) < 2:
+            together.wait(20)  # so that both find the bucket empty
+        return None
+
+    broken(meet)
+    machines = [Archive.open(tmp_path / name) for name in ("one", "two")]
+    for machine, name in zip(machines, ("one", "two"), strict=True):
+        run = publish_receipt(machine, {"made by": name}, make_store(machine, "capture", {}, []))
+        run.rename(run.with_name("20260101T000000-farm"))
+    with ThreadPoolExecutor(2) as pool:
+        sent = [*pool.map(lambda machine: send(machine, bucket), machines)]
+    assert sorted(len(one.copied) + len(one.conflicts) for one in sent) in ([1, 2], [1, 3], [2, 2])
+    assert sorted(one.conflicts for one in sent) == [[], ["runs/20260101T000000-farm"]]
+    other, _ = fetch(bucket, tmp_path / "other")
+    assert problems(other.root) == []
+    winner = next(machine for machine, one in zip(machines, sent, strict=True) if not one.conflicts)
+    assert (other.runs()[0] / "receipt.json").read_bytes() == (winner.runs()[0] / "receipt.json").read_bytes()
+
+
+def test_a_pull_during_a_push_gets_whole_stores(archive: Archive, bucket: str, tmp_path: Path, broken: Broken) -> None:
+    """At each manifest that is sent another machine pulls; a run comes with its stores alone."""
+    seen: list[int] = []
+
+    def pull_now(method: str, path: str) -> str | None:
+        if method == "PUT" and path.endswith("manifest.json") and Objects(bucket).listing() > {".conditional-put"}:
+            with suppress(ArchiveError):  # no archive yet
+                seen.append(len(fetch(bucket, tmp_path / "there")[1].copied))
+                assert problems(tmp_path / "there") == []
+        return None
+
+    broken(pull_now)
+    send(archive, bucket)
+    assert seen == [1, 1, 1]
+
+
+def test_a_store_cleared_meanwhile_is_sent_as_cleared(archive: Archive, bucket: str, broken: Broken) -> None:
+    """Another survey deletes its raw lines while they are sent."""
+    raw = archive.refs("capture")[0]
+
+    def clear(method: str, path: str) -> str | None:
+        if method == "PUT" and "capture" in path and archive.is_there(raw.uri):
+            archive.clear(raw)
+        return None
+
+    broken(clear)
+    assert raw.uri in send(archive, bucket).copied
+    assert f"{raw.uri}/cleared.json" in Objects(bucket).listing()
+    assert f"{raw.uri}/manifest.json" not in Objects(bucket).listing()
 
 
 def test_one_run_comes_with_the_stores_that_it_names(archive: Archive, bucket: str, tmp_path: Path) -> None:
@@ -95,7 +253,7 @@ def test_a_flipped_bit_here_is_not_sent(archive: Archive, bucket: str) -> None:
     file.write_bytes(b"\0" + file.read_bytes()[1:])
     with pytest.raises(IncompleteStoreError, match=r"rectify/.*data\.bin has changed"):
         send(archive, bucket)
-    assert not [one for one in Objects(parse_place(bucket)).listing() if re.search("rectify.*manifest", one)]
+    assert not [one for one in Objects(bucket).listing() if re.search("rectify.*manifest", one)]
 
 
 @pytest.mark.parametrize("ending", ["data.bin", "receipt.json", "manifest.json"])
@@ -115,7 +273,7 @@ def test_a_stopped_push_continues(
     """A store whose manifest is missing does not count for others; the same command sends the rest."""
     create = Objects.create
 
-    def stopped(self: Objects, name: str, content: bytes) -> bool:
+    def stopped(self: Objects, name: str, content: bytes) -> bytes:
         return pytest.fail("stopped") if "segment" in name else create(self, name, content)
 
     with monkeypatch.context() as patched:
@@ -159,14 +317,27 @@ def test_runs_of_two_machines_with_one_name_are_named(archive: Archive, bucket: 
 
 
 def test_a_cleared_store_stays_cleared(archive: Archive, bucket: str, tmp_path: Path) -> None:
-    """Its manifest and its mark are copied."""
+    """Its manifest and its mark are copied; when it was made again, its files are."""
     raw = archive.refs("capture")[0]
     archive.clear(raw)
     send(archive, bucket)
     other, _ = fetch(bucket, tmp_path / "there")
     assert other.find(raw.stage, raw.key) is None
-    assert other.is_known(raw)
+    assert is_cleared(other.ref(raw.stage, raw.key).path)
     assert problems(other.root) == []
+    small_survey(archive, named=False)
+    assert send(archive, bucket).copied == [raw.uri]
+    assert fetch(bucket, tmp_path / "later")[0].find(raw.stage, raw.key) is not None
+    archive.clear(raw)
+    assert send(archive, bucket).copied == []
+
+
+def test_stores_in_neither_place_are_named(archive: Archive, bucket: str, tmp_path: Path) -> None:
+    """A run names a store that gc has removed as damaged."""
+    mosaic = archive.refs("rectify")[0].uri
+    archive.discard(mosaic)
+    assert send(archive, bucket).missing == [mosaic]
+    assert fetch(bucket, tmp_path / "there", "latest")[1].missing == [mosaic]
 
 
 def test_gc_works_on_a_copy(archive: Archive, bucket: str, tmp_path: Path) -> None:
@@ -178,24 +349,44 @@ def test_gc_works_on_a_copy(archive: Archive, bucket: str, tmp_path: Path) -> No
     assert len(fetch(bucket, other.root)[1].copied) == 3
 
 
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"../../../x": [1, ""]}, "no file of this folder"),
+        ({"/etc/x": [1, ""]}, "no file of this folder"),
+        ({"a": [-1, ""]}, "has changed"),
+        ({"a": [1, ""], "a/b": [1, ""]}, "has changed|cannot write to the archive"),
+        ({"n" * 300: [1, ""]}, "cannot write to the archive"),
+    ],
+)
+def test_a_hostile_manifest_is_refused(bucket: str, tmp_path: Path, files: dict[str, Any], words: str) -> None:
+    """Nothing is written outside of its store, nor more than it declares."""
+    text = manifest_text({"files": files}).encode()
+    place, objects = "stages/x/y", Objects(bucket)
+    objects.write(f"{place}/manifest.json", text)
+    for name in ("a", "a/b", "n" * 300):
+        objects.write(f"{place}/{hashlib.sha256(text).hexdigest()[:16]}/{name}", bytes(9))
+    with pytest.raises((ArchiveError, IncompleteStoreError), match=words):
+        fetch(bucket, tmp_path / "there")
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    assert contents(tmp_path / "there") == {}
+
+
 def test_addresses_that_lead_out_of_the_archive_are_ignored(archive: Archive, bucket: str, tmp_path: Path) -> None:
     """Objects of other programs lie in the bucket, some with hostile names."""
     send(archive, bucket)
     for name in ("manifest.json", "runs/a b/manifest.json", "stages/x/.hidden/manifest.json", "notes/manifest.json"):
-        Objects(parse_place(bucket)).write(name, b"{}")
+        Objects(bucket).write(name, b"{}")
     other, _ = fetch(bucket, tmp_path / "there")
     assert contents(other.root) == contents(archive.root)
 
 
-def test_a_store_without_conditional_puts_is_refused(
-    archive: Archive, bucket: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_without_conditional_puts_is_refused(archive: Archive, bucket: str, broken: Broken) -> None:
     """There two machines could destroy each other's stores: nothing is sent."""
-    monkeypatch.setattr(Objects, "create", lambda self, name, content: True)
-    monkeypatch.setattr(Objects, "remove", lambda self, name: None)
+    broken(lambda method, path: "unconditional")
     with pytest.raises(ArchiveError, match="ignores conditional puts"):
         send(archive, bucket)
-    assert Objects(parse_place(bucket)).listing() == set()
+    assert Objects(bucket).listing() == {".conditional-put"}
 
 
 def test_the_verbs_copy_an_archive(
@@ -218,7 +409,7 @@ BAD = ["s3://", "s3:///bucket", "s3://ok/../x", "s3://bucket/a//b", "s3://bucket
 def test_invalid_addresses_are_refused(text: str) -> None:
     """A prefix has plain letters only and cannot lead upwards."""
     with pytest.raises(SettingsError, match=r"expected s3://bucket/prefix"):
-        parse_place(text)
+        Objects(text)
 
 
 @pytest.mark.parametrize("text", ["s3://bucket/x", "gs://bucket/x", "http://host/x", "S3://bucket/x"])
@@ -238,7 +429,7 @@ def test_unusable_endpoints_are_refused(endpoint: str, words: str, monkeypatch: 
     """Plain http is allowed for this machine only, unless a setting permits it."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
     with pytest.raises(SettingsError, match=words):
-        parse_place("s3://bucket/x")
+        Objects("s3://bucket/x")
 
 
 def test_a_missing_bucket_or_archive_is_one_clear_error(archive: Archive, bucket: str, tmp_path: Path) -> None:
@@ -264,5 +455,4 @@ def test_errors_of_a_bucket_are_explained(bucket: str, answer: str, words: str) 
     """The message separates failures that pass by themselves from those that a person has to fix."""
     from obstore.exceptions import GenericError
 
-    with pytest.raises(UnreachableError, match=re.escape(words)), answers_of(parse_place(bucket)):
-        raise GenericError(answer)
+    assert words in str(Objects(bucket).explain(GenericError(answer)))

@@ -1,0 +1,414 @@
+"""Read wavelengths, widths, colours and bad bands from the numbers, tags and band names of any file.
+
+No file is opened here. A fact that cannot be read without a guess is left out, and a note gives the reason.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import repeat
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+RANGE_NM = (200.0, 3000.0)
+THERMAL_NM = 20_000.0  # end of the longest wavelengths in cameras' files
+LEAST_WIDTH_NM = 0.02
+RGB_NM = (640.0, 550.0, 460.0)
+NEAR_INFRARED_NM = 800.0
+GREY_NM = 550.0
+# spelling of a unit: its length [nm]; the first ones may stand behind a number in the name of a band
+_LENGTHS: Mapping[str, float] = {
+    r"nm|nano ?-?met(?:er|re)s?": 1.0,
+    r"[uμ]m|microns?|micro ?-?met(?:er|re)s?": 1000.0,
+    r"å|[aå]ngstr(?:o|ö|oe)ms?": 0.1,
+    r"a": 0.1,
+    r"m|met(?:er|re)s?": 1e9,
+    r"cm|centimet(?:er|re)s?": 1e7,
+    r"mm|millimet(?:er|re)s?": 1e6,
+}
+_BY_SIZE = {"nm": 1.0, "micrometres": 1000.0, "metres": 1e9}
+_UNSAID = ("", "unknown", "none", "unspecified", "-", "1")
+_MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
+_NUMBER = r"(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[+-]?\d+)?"
+_UNIT = rf"(?:{'|'.join(list(_LENGTHS)[:3])})(?![a-z])"
+_ITEM = re.compile(rf"([+-]?{_NUMBER})\s*(?![\d.,])(.*)")
+_BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE)  # also of np.float64(450.0)
+_KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
+CENTRES = re.compile(
+    rf"(?:(?:band|cent(?:er|re)|central|peak|nominal|mean|radiation)*wavelengths?(?:cent(?:er|re)|value|list|d)?s?"
+    rf"|(?:band|spectral)cent(?:er|re)s?|wls?|lambdas?|(?=nm)){_KEY_UNIT}"
+)
+WIDTHS = re.compile(
+    rf"(?:(?:band|wavelength)?fwhms?|fullwidth(?:at)?halfmax(?:imum)?|bandwidths?|spectralwidths?){_KEY_UNIT}"
+)
+GOOD_BANDS = ("bbl", "good", "goodband", "goodbands", "goodwavelength", "goodwavelengths", "goodbandlist")  # 0 is bad
+_BAD_BAND = ("bad", "badband", "isbad")  # of one band: 1 is bad
+_TRUTH = {"true": 1.0, "yes": 1.0, "good": 1.0, "false": 0.0, "no": 0.0, "bad": 0.0}
+
+MOST_NAME = 200  # characters of a band name that are read
+_COUNTED = r"(?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*"  # words before a band's number
+_BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)(?!\s*{_UNIT})[\s_:.)-]*")
+_DASH = r"\s*(?:[-~\u2010-\u2015\u2212]|\.{2,3}|to|bis|and|through)\s*"
+_SPAN = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})?{_DASH}({_NUMBER})\s*({_UNIT})")
+_LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})")
+# a number beside the length that may be another length, a width or the number of a band
+_DOUBTFUL = re.compile(
+    rf"(?<![a-z\d.])[\d.]+\s*(?:[,/;&+*|@±]|at)\s*{_NUMBER}\s*{_UNIT}|fwhm|width"
+    rf"|{_COUNTED}\d+{_DASH}{_NUMBER}\s*{_UNIT}|(?<!\d)(?:[2-9]\d\d|[12]\d{{3}})[\s_]+{_NUMBER}\s*{_UNIT}"
+)
+# words of a colour: its usual wavelength [nm]; the first that fits counts
+_COLOURS: Mapping[str, float] = {
+    "coastal(?: aerosol| blue)?|aerosol": 443.0,
+    "red ?edge ?(?:1|071)": 705.0,
+    "red ?edge ?(?:2|075)": 740.0,
+    "red ?edge ?(?:3|078)": 783.0,
+    "red ?edge": 717.0,
+    "near ?(?:infra ?red|ir)|nir": NEAR_INFRARED_NM,
+    "infra ?red": np.nan,  # short, middle or thermal
+    "swir ?(?:16|1)": 1610.0,
+    "swir ?(?:22|2)": 2200.0,
+    "blue": RGB_NM[2],
+    "green": RGB_NM[1],
+    "yellow": 590.0,
+    "orange": 620.0,
+    "red": RGB_NM[0],
+    "gr[ae]y|pan(?:chromatic)?": GREY_NM,
+}
+_LETTERS = dict(zip("rgbn", (*RGB_NM, NEAR_INFRARED_NM), strict=True))
+_COLOUR = re.compile("|".join(f"(?<![a-z])({words})(?![a-z])" for words in _COLOURS))
+_PLAIN = re.compile(
+    rf"(?:(?:{'|'.join(_COLOURS)}|r|x|wl|w|λ|lambda|wavelength|refl|reflectance|rho|rrs|radiance)[\s_-]*)*({_NUMBER})"
+)
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Facts of the bands; None if not known."""
+
+    wavelength_nm: NDArray[np.float64] | None = None  # (band,), NaN of a band without one
+    fwhm_nm: NDArray[np.float64] | None = None  # (band,)
+    origin: str = ""  # one sentence
+    notes: tuple[str, ...] = ()  # assumptions, or reasons why nothing is known
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Return the bands (from 0) without a wavelength where others have one."""
+        return () if self.wavelength_nm is None else tuple(np.flatnonzero(np.isnan(self.wavelength_nm)).tolist())
+
+
+def why_unknown(bands: Bands) -> str:
+    """Return why there are no wavelengths, with every reason that was found."""
+    reasons = "; ".join(bands.notes)
+    return f"their wavelengths cannot be read ({reasons})" if reasons else "nothing says their wavelengths"
+
+
+def scale_nm(unit: object) -> float | None:
+    """Return the nm of a unit of length; None for other and unknown units."""
+    text = _plain_text(unit).strip(" .[](){}'\"")
+    return next((nm for words, nm in _LENGTHS.items() if re.fullmatch(words, text)), None)
+
+
+def is_spectral(attrs: Mapping[str, Any]) -> bool:
+    """Return whether attributes are those of wavelengths, by their standard name or a unit of nm, um or Angstrom."""
+    short = scale_nm(attrs.get("units", attrs.get("unit")))
+    return "wavelength" in str(attrs.get("standard_name", "")) or (short is not None and short <= 1000)
+
+
+def bands_of_numbers(
+    values: object, unit: object, origin: str, widths: object = None, width_unit: object = None
+) -> Bands:
+    """Return bands by numbers (band,) in a unit; numbers that are not above 0 are missing.
+
+    Without a unit they are nm, micrometres or metres by their size, with a note. Widths without a unit have that of
+    the wavelengths. Numbers in a unit that is no length, or with most of them missing, give a note alone.
+    """
+    centres = _above_zero(values)
+    known = np.isfinite(centres)
+    if 2 * known.sum() < max(len(centres), 1):
+        return Bands(notes=(f"the wavelengths are left out: {known.sum()} of {len(centres)} bands have one",))
+    scale, doubt = _scale(unit, centres[known])
+    if scale is None:
+        return Bands(notes=(f"the wavelengths are left out: {doubt}",))
+    notes = [doubt] if doubt else []
+    if not known.all():
+        notes.append(f"the file gives no wavelength of bands {bands_text(np.flatnonzero(~known).tolist())} (from 0)")
+    if widths is None:
+        return Bands(centres * scale, None, origin, tuple(notes))
+    fwhm = _above_zero(widths) * (scale if _plain_text(width_unit) in _UNSAID else scale_nm(width_unit) or np.nan)
+    fits = fwhm.shape == centres.shape and bool(((fwhm >= LEAST_WIDTH_NM) & (fwhm < centres * scale))[known].all())
+    notes += [] if fits else ["the widths (fwhm) are left out: not every band has one that fits its wavelength"]
+    return Bands(centres * scale, fwhm if fits else None, origin, tuple(notes))
+
+
+def _above_zero(values: object) -> NDArray[np.float64]:
+    """Return a flat copy, NaN where a number is masked, infinite or not above 0."""
+    numbers = np.ma.filled(np.ma.array(values, np.float64), np.nan).ravel()
+    return np.where(np.isfinite(numbers) & (numbers > 0), numbers, np.nan)
+
+
+def _scale(unit: object, numbers: NDArray[np.float64]) -> tuple[float | None, str]:
+    """Return the nm of a unit, and a note; a unit that is not stated is that of usual wavelengths of this size."""
+    if (known := scale_nm(unit)) is not None:
+        return known, ""
+    if _plain_text(unit) not in _UNSAID:
+        return None, f"their unit {unit!r} is no length; expected nm, um, Angstrom or m"
+    low, high = numbers.min(), numbers.max()
+    if high <= 20 and (numbers % 1 == 0).all():
+        return None, f"they have no unit, and {low:g} to {high:g} may count the bands"
+    for name, scale in _BY_SIZE.items():
+        if RANGE_NM[0] <= low * scale <= RANGE_NM[1] and high * scale <= THERMAL_NM:
+            return scale, f"the wavelengths have no unit, read as {name} by their size"
+    fits = "may be Angstrom or nm" if low > RANGE_NM[1] and high <= 10 * RANGE_NM[1] else "fit no unit of wavelengths"
+    return None, f"they have no unit, and {low:g} to {high:g} {fits}"
+
+
+def split_list(text: str, count: int) -> list[str] | None:
+    """Return the ``count`` numbers of a list as texts; None if it is no such list.
+
+    They are separated by semicolons, commas or spaces, and may be missing, or have decimal commas and units.
+    """
+    bare = _BRACKET.sub(" ", text).strip()
+    for between in (";", ",", r"[,\s]+", r",?\s+") if bare else ():
+        words = [word.strip() for word in re.split(between, bare)]
+        words = words[:-1] if len(words) == count + 1 and not words[-1] else words
+        if len(words) == count and all(map(_item, words)):
+            pairs = [_to_number(part) for word in words for part in word.split(",")]
+            doubled = len(pairs) == 2 * count and all(RANGE_NM[0] <= one <= RANGE_NM[1] for one in pairs)
+            return None if doubled and ";" not in bare else words  # 450,550 650,750
+    return None
+
+
+def numbers_of_list(text: str, count: int) -> NDArray[np.float64] | None:
+    """Return the (``count``,) numbers of a list, NaN where one is missing; None if it is no such list."""
+    words = split_list(text, count)
+    return None if words is None else np.array([_to_number(word) for word in words], np.float64)
+
+
+def _words(value: object) -> list[Any]:
+    """Return the items of a list in one text, with any separators, or of an array."""
+    if isinstance(value, str):
+        return re.findall(r"[^,;\s]+", _BRACKET.sub(" ", value))
+    return list(np.asarray(value).ravel().tolist())
+
+
+def _item(word: object) -> tuple[float, str] | None:
+    """Return number, NaN if it is missing, and unit, "" without one, of an item of a list; None for other texts."""
+    if _plain_text(word) in _MISSING:
+        return np.nan, ""
+    found = _ITEM.fullmatch(_plain_text(word))
+    return None if found is None or (found[2] and scale_nm(found[2]) is None) else (_to_number(found[1]), found[2])
+
+
+def _to_number(text: object) -> float:
+    """Return the number at the beginning of a text, with a point or a comma; NaN without one."""
+    found = re.match(rf"[+-]?{_NUMBER}", _plain_text(text))
+    return np.nan if found is None else float(found[0].replace(",", "."))
+
+
+def _plain_text(text: object) -> str:
+    """Return text of one line in lower case, with one sign for each of micro and Angstrom."""
+    return " ".join(unicodedata.normalize("NFKC", "" if text is None else str(text)).lower().split())
+
+
+def letters(key: str) -> str:
+    """Return the small letters of a key alone, as they are compared: ``Band centres (µm)`` is ``bandcentresμm``."""
+    return re.sub(r"[^a-zμ]+", "", _plain_text(key))
+
+
+def bands_of_fields(
+    fields: Mapping[str, object], names: Sequence[str | None], where: str, colours: Sequence[str] = ()
+) -> Bands:
+    """Return (band,) facts by a file's fields, else by the names of its bands, else by its colours; with all notes.
+
+    A field such as ``wavelength`` or ``band centres (um)`` is a list in one text, or has one text or number a band.
+    ``colours`` are GDAL's colour interpretations.
+    """
+    count = len(names)
+    fields = _gathered(fields, count)
+    notes: list[str] = []
+    for key, numbers, unit in _lists(fields, CENTRES, count, notes):
+        _, *widths = next(_lists(fields, WIDTHS, count, notes), ("",))
+        found = bands_of_numbers(numbers, unit, f"wavelengths from the list {key} of {where}", *widths)
+        notes += found.notes
+        if found.wavelength_nm is not None:
+            return replace(found, notes=tuple(notes))
+    names = names if any(names) else _listed_names(fields, count)
+    found = bands_of_names(names, where, () if notes else colours)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _gathered(fields: Mapping[str, object], count: int) -> dict[str, object]:
+    """Return fields with those such as ``Band_1``, ``Band_2``, one a band, as one list."""
+    groups: dict[str, dict[int, str]] = defaultdict(dict)
+    for key, value in fields.items():
+        if isinstance(value, str) and (found := re.fullmatch(r"(.*?\D)[ _]*(\d{1,5})", key)):
+            groups[found[1]][int(found[2])] = value
+    whole = {base: one for base, one in groups.items() if len(one) == count and min(one) in (0, 1)}
+    counted = {base: one for base, one in whole.items() if max(one) - min(one) + 1 == count}
+    return {**fields, **{base: [one[at] for at in sorted(one)] for base, one in counted.items()}}
+
+
+def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
+    """Return the names that a field lists, one a band; None each without such a list."""
+    for key, value in fields.items():
+        if letters(key) in ("band", "bandname", "bandnames", "longname"):
+            by = (",", r",(?!\d)", ";") if isinstance(value, str) else ()
+            ways = [re.split(one, str(value)) for one in by] or [_words(value)]
+            if found := [way for way in ways if len(way) == count]:
+                return list(map(str, found[0]))
+    return [None] * count
+
+
+def _lists(
+    fields: Mapping[str, object], kind: re.Pattern[str], count: int, notes: list[str]
+) -> Iterator[tuple[str, NDArray[np.float64], object]]:
+    """Yield key, (band,) numbers and unit of each list of a kind; ``notes`` say why others are left out."""
+    of_lists = {_before_unit(letters(key)): value for key, value in fields.items()}
+    stated = {key: value for key, value in of_lists.items() if kind.fullmatch(key)}
+    for key in sorted(fields, key=len):
+        if (known := kind.fullmatch(letters(key))) is None:
+            continue
+        value, unit = fields[key], stated.get(letters(key), next(iter(stated.values()), ""))
+        said = repeat(unit) if isinstance(unit, str) else _words(unit)
+        words = (split_list(value, count) if isinstance(value, str) else None) or _words(value)
+        items = [item for word in words if (item := _item(word)) is not None]
+        if len(items) < len(words) or len(words) != count:
+            wrong = next((word for word in words if _item(word) is None), None)
+            why = f"{len(words)} for {count} bands" if wrong is None else f"{str(wrong)!r} is no number"
+            notes.append(f"{key} is left out: {why}")
+            continue
+        units = [str(own or known[1] or of_band) for (_, own), of_band in zip(items, said, strict=False)]
+        numbers = np.array([number for number, _ in items], np.float64)
+        if len(different := set(filter(None, units))) > 1:
+            numbers, different = numbers * [scale_nm(unit) or np.nan for unit in units], {"nm"}
+        yield key, numbers, "".join(different)
+
+
+def _before_unit(key: str) -> str:
+    """Return the name of the list that a key such as ``wavelengthunits`` belongs to; "" for other keys."""
+    found = re.fullmatch("(.+?)units?", key)
+    return "" if found is None else found[1]
+
+
+def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[str] = ()) -> Bands:
+    """Return (band,) facts by the lengths, numbers or colours in band names, else by the file's own colours.
+
+    A range is its mean, with its width. A name with several lengths, and colours that contradict the file's, give a
+    note alone.
+    """
+    texts = [_without_number(name, place) for place, name in enumerate(names)]
+    found = [_lengths(text) for text in texts]
+    origin = f"wavelengths from the band names of {where}"
+    if any(found):
+        for name, lengths in zip(names, found, strict=True):
+            if len(lengths) > 1:
+                return Bands(notes=(f"the band name {name!r} may give several lengths",))
+            if lengths and not RANGE_NM[0] <= lengths[0][0] <= THERMAL_NM:
+                return Bands(notes=(f"the band name {name!r} gives {lengths[0][0]:g} nm, which is no wavelength",))
+        centres, widths = np.array([one[0] if one else (np.nan, np.nan) for one in found]).T
+        return bands_of_numbers(centres, "nm", origin, None if np.isnan(widths).all() else widths)
+    plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
+    numbers = np.array([np.nan if one is None else _to_number(one[1]) for one in plain])
+    if are_wavelengths(numbers):
+        return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
+    return _bands_of_colours(names, texts, where, colours)
+
+
+def _without_number(name: str | None, place: int) -> str:
+    """Return the text of a name without the number of its band: after such a word, or its ``place`` (from 0 or 1)."""
+
+    def shortened(found: re.Match[str]) -> str:
+        number = int(found[2])
+        of_band = number in (place, place + 1) or (found[1].strip() and number < RANGE_NM[0])
+        return " " if of_band else found[0]
+
+    text = re.sub(r"(?<!\d)(\d{1,2}),(?=\d)|(?<=\d),(?=\d{1,2}(?!\d))", r"\1.", _plain_text(name)[:MOST_NAME])
+    return _BAND_NUMBER.sub(shortened, text)
+
+
+def _lengths(text: str) -> list[tuple[float, float]]:
+    """Return centre and width [nm] (NaN: none) of each different length in a name; two if the only one is doubtful."""
+    found: list[tuple[float, float]] = []
+    for first, unit, second, last in _SPAN.findall(text):
+        low, high = _to_number(first) * (scale_nm(unit or last) or 1), _to_number(second) * (scale_nm(last) or 1)
+        plausible = RANGE_NM[0] <= low < high <= THERMAL_NM
+        found += [((low + high) / 2, high - low)] if plausible else [(low, np.nan), (high, np.nan)]
+    for number, unit in _LENGTH.findall(_SPAN.sub(" ", text)):
+        centre = _to_number(number) * (scale_nm(unit) or 1)
+        if not any(abs(centre - known) <= 1e-3 * known for known, _ in found):
+            found.append((centre, np.nan))
+    return found * 2 if len(found) == 1 and _DOUBTFUL.search(text) else found
+
+
+def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
+    """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
+    if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
+        return False
+    years = (numbers % 1 == 0) & (numbers >= 1900) & (numbers <= 2100)
+    return not years.all() and not (len(numbers) > 1 and (np.diff(numbers) == 1).all())
+
+
+def _colour(text: str) -> set[float]:
+    """Return the usual wavelengths of the colours in a text, NaN for infrared without a range."""
+    words = re.sub(r"[\W_]+", " ", text).strip()
+    if words in _LETTERS:
+        return {_LETTERS[words]}
+    values = list(_COLOURS.values())
+    return {values[(found.lastindex or 1) - 1] for found in _COLOUR.finditer(words)}
+
+
+def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
+    """Return bands by the colours in their names, else by the file's; a band without a name has that of the file."""
+    default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
+    flags = [_colour(colour) for colour in colours] or [set() for _ in names]
+    if default and tuple(colours[3:]) == ("undefined",) and not texts[3].strip():
+        flags[3] = {NEAR_INFRARED_NM}
+    named = [_colour(text) for text in texts]
+    given = named if any(named) else flags
+    nm = [one or (set() if text.strip() else flag) for one, text, flag in zip(given, texts, flags, strict=True)]
+    centres = [min(one) if len(one) == 1 else np.nan for one in nm]
+    if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
+        shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
+        doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
+        return Bands(notes=(doubt,) if any(text.strip() for text in texts) else ())
+    others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
+    if others and not default:
+        said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
+        return Bands(notes=(said,))
+    notes = ("the band names say other colours than the file's flags of red, green and blue: the names count",)
+    source = f"the colours in the band names of {where}" if any(named) else "the file's colours"
+    listed = ", ".join(f"{one:g}" for one in centres)
+    origin = f"wavelengths assumed from {source}: {listed} nm"
+    return Bands(np.array(centres), None, origin, notes if others else ())
+
+
+def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the bands (from 0) that a file's fields mark as bad, such as ``bbl``, and notes.
+
+    A field is a list in one text, or has one text or number a band, "" where a band has none.
+    """
+    bad: set[int] = set()
+    notes: list[str] = []
+    for name, value in fields.items():
+        key = letters(name)
+        if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
+            flags = [_TRUTH.get(_plain_text(word), _to_number(word)) for word in _words(value)]
+            if len(flags) == count:
+                bad |= {band for band, flag in enumerate(flags) if (flag == 0 if key in GOOD_BANDS else flag > 0)}
+            else:
+                notes.append(f"{name} is left out: {len(flags)} flags for {count} bands")
+        elif re.fullmatch("badbands?(?:list|multiplier)?s?", key):
+            notes.append(f"{name} is not read: 1 may mean good or bad there; name the good bands in a scene.toml")
+    return tuple(sorted(bad)), tuple(notes)
+
+
+def bands_text(bands: Sequence[int]) -> str:
+    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
+    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
+    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
