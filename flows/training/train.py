@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from torch import Tensor
 
 from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
@@ -255,7 +254,7 @@ class Learner:
             found[CALIBRATION] = figures.judge_calibration(weights, frames, self.request.flags.settings.seed)
         return found
 
-    def _trained(self, config: SegmenterConfig, start: Mapping[str, Tensor]) -> tuple[Segmenter, dict[str, Any]]:
+    def _trained(self, config: SegmenterConfig, start: Mapping[str, Any]) -> tuple[Segmenter, dict[str, Any]]:
         return train(
             config,
             self.scenes.train.examples,

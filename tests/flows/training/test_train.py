@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from rich.console import Console
 
@@ -23,7 +26,7 @@ from spectralzoom.flows.training import figures, train_scenes
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
 from spectralzoom.flows.training.train import run_train, train_weights
-from spectralzoom.flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
+from spectralzoom.flows.training.train_scenes import Common, Imaged, TrainRequest, network_config, suggested_patch
 from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.network.spectral import SpectralBasis
 from spectralzoom.models.policies.placement import ReadTwice
@@ -31,6 +34,7 @@ from spectralzoom.models.weights.files import TrainedOn, describe_weights, load_
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.simulator.render import USUAL
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
@@ -51,7 +55,7 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "w.safetensors"
 
 
-def _request(folder: Path, out: Path, command: str = "", **flags: Any) -> TrainRequest:
+def _request(folder: Path | str, out: Path, command: str = "", **flags: Any) -> TrainRequest:
     return TrainRequest(str(folder), out, TrainFlags(**QUICK | flags), command)
 
 
@@ -240,6 +244,55 @@ def test_continued_training_is_for_built_in_scenes(folder: Path, out: Path) -> N
     """On files a training takes seconds."""
     with pytest.raises(SettingsError, match=r"--start is for built-in scenes; .*: train anew on all of them together"):
         train_weights(_request(folder, out, start=Path("first.safetensors")))
+
+
+def test_training_continues_on_built_in_scenes(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normalisation stays; without validation scenes the mean of both networks is kept."""
+    monkeypatch.setattr("spectralzoom.flows.training.data.FARM_SHAPE", (32, 48))
+    # choosing takes seconds
+    monkeypatch.setattr("spectralzoom.models.training.examples.chosen_effects", lambda *_: USUAL)
+    train_weights(_request("farm", out, "first", scenes=1, validation=0))
+    trained = flow.train
+    ends: list[Any] = []
+    monkeypatch.setattr(flow, "train", lambda *given, **options: ends.append(trained(*given, **options)) or ends[0])
+    more: dict[str, Any] = {"scenes": 1, "validation": 0, "start": out, "seed": 1}
+    record = train_weights(_request("farm", tmp_path / "b.safetensors", **more))
+    first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
+    assert record["started_from"] == "first"
+    np.testing.assert_array_equal(second.normalisation.whitening, first.normalisation.whitening)
+    networks = (one.parameters() for one in (first.segmenter, second.segmenter, ends[0][0]))
+    for before, halfway, after in zip(*networks, strict=True):
+        torch.testing.assert_close(after, before, atol=0.01, rtol=0)
+        torch.testing.assert_close(halfway, (before + after) / 2)
+
+
+@pytest.mark.parametrize(
+    ("what", "common", "scenes", "flags"),
+    [
+        ("classes", {"names": ("a", "c")}, {}, {}),
+        ("classes", {}, {"untaught": (0,)}, {}),
+        ("training scenes", {}, {"train": Imaged(keys={"2": "other"})}, {}),
+        ("bands", {"basis": SpectralBasis.spanning(np.linspace(500, 700, 4))}, {}, {}),
+        ("sizes of the network", {}, {}, {"dim": 8}),
+        (None, {}, {"train": Imaged(keys={"1": "one", "2": "other"})}, {}),
+    ],
+)
+def test_continued_training_names_what_differs(
+    what: str | None, common: dict[str, Any], scenes: dict[str, Any], flags: dict[str, Any]
+) -> None:
+    """Classes, scenes, bands and sizes are those of the first training; more scenes are allowed."""
+    nm = np.linspace(500, 800, 4)
+    known = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), 8, nm)
+    begun: Any = SimpleNamespace(
+        class_names=known.names,
+        config=network_config(TrainFlags(dim=16), known),
+        basis=known.basis,
+        record={"split": {"train": {"1": "one"}}},
+    )
+    usual = {"common": replace(known, **common), "untaught": (), "train": Imaged(keys={"1": "one"})}
+    request = _request("farm", Path("w.safetensors"), start=Path("first"), **flags)
+    with nullcontext() if what is None else pytest.raises(SettingsError, match=f"its training had other {what}; give"):
+        flow.check_start(request, begun, SimpleNamespace(**usual | scenes))
 
 
 def test_continued_training_has_a_lower_learning_rate() -> None:

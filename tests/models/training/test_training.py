@@ -96,7 +96,7 @@ def test_training_stops_at_its_time_limit(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(training.time, "process_time", lambda: next(clock))
     seen: list[training.Progress] = []
     _, summary = train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
-    assert len(seen) == summary["steps"] == 3
+    assert len(seen) == summary["steps"] == 4
     assert seen[-1].done == pytest.approx(0.8)
 
 
