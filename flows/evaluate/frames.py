@@ -151,7 +151,7 @@ def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]
         for at, one in enumerate(weights)
         if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
     )
-    left = [judged_labels(scene, weights[at].described) for at in fit]
+    left = [np.asarray(judged_labels(scene, weights[at].described)) for at in fit]
     if other := next((at for at, labels in zip(fit, left, strict=True) if not np.array_equal(labels, left[0])), None):
         both = f"{weights[other].path} and {weights[fit[0]].path}"
         raise SettingsError(f"{both} were trained on different pixels of {scene.name}; evaluate them separately")

@@ -149,7 +149,7 @@ def test_keywords_override_a_settings_file(asked: dict[str, object], tmp_path: P
 
 
 def test_weights_are_trained_and_evaluated(tmp_path: Path) -> None:
-    """Two steps on frames of a small field give weights that are evaluated on the held-out frame."""
+    """Frames of a small field give weights that are evaluated on the held-out frame."""
     heard = Mock()
     small = {"dim": 16, "layers": 1, "heads": 2, "crop": 16, "batch": 1, "patch": 4}
     data = write_field(tmp_path / "field", (32, 32))
@@ -159,7 +159,9 @@ def test_weights_are_trained_and_evaluated(tmp_path: Path) -> None:
     assert made == tmp_path / "mine.safetensors"
     scores = spectralzoom.evaluate(data, weights=made, fractions=[0.25], progress=heard)
     assert scores["frames"] == ["003"]
-    assert {"training", "imaging scenes"} <= {stage for stage, _, _ in (call.args for call in heard.call_args_list)}
+    assert {"cross-validating", "imaging scenes"} <= {
+        stage for stage, _, _ in (call.args for call in heard.call_args_list)
+    }
 
 
 def test_every_mistake_raises_the_error_of_the_package(make_weights: WeightsMaker, tmp_path: Path) -> None:
