@@ -235,7 +235,8 @@ class LabelledPixels:
                 columns = augmentation.draw(columns, example.noise, rng)[0][..., :-PLANES]
             places = np.flatnonzero(example.labels != UNLABELLED)
             places = np.sort(rng.choice(places, min(count, math.ceil(count * fraction)), replace=False))
-            features.append(_means_around(columns.numpy())[places])
+            means = scipy.ndimage.uniform_filter(columns.numpy(), (AROUND_PX, AROUND_PX, 1), mode="nearest")
+            features.append(means.reshape(-1, means.shape[-1])[places])
             labels.append(example.labels.ravel()[places])
         return LabelledPixels(np.concatenate(features), np.concatenate(labels))
 
@@ -243,12 +244,6 @@ class LabelledPixels:
         """Vary the light of each pixel as that of crops: a classifier that relies on it would be unlearned first."""
         gain = rng.normal(1.0, BRIGHTNESS, (len(self.features), 1)).astype(np.float32)
         return LabelledPixels(self.features * gain + (gain - 1) * gain_shift, self.labels)
-
-
-def _means_around(columns: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the mean columns around each pixel, (y, x, column) -> (pixel, column)."""
-    means = scipy.ndimage.uniform_filter(columns, (AROUND_PX, AROUND_PX, 1), mode="nearest")
-    return np.asarray(means.reshape(-1, means.shape[-1]))
 
 
 def linear_classifier(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]:
