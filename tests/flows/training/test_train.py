@@ -185,6 +185,21 @@ def test_trained_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
         evaluate_weights(cube, replace(flags, labels=str(tmp_path / "some.npy")))
 
 
+def test_copies_of_a_scene_with_other_labels_are_one_scene(out: Path, tmp_path: Path) -> None:
+    """The pixels of both are trained on, so that no labelled one is left to judge."""
+    _cube(tmp_path)
+    (tmp_path / "cubes").mkdir()
+    every, some = (np.load(tmp_path / f"{name}.npy") for name in ("every", "some"))
+    for name, labels in {"a": some, "b": np.where(some > 0, 0, every)}.items():
+        shutil.copy(tmp_path / "cube.npy", tmp_path / "cubes" / f"{name}.npy")
+        np.save(tmp_path / "cubes" / f"{name}_gt.npy", labels)
+    shutil.copy(tmp_path / "scene.toml", tmp_path / "cubes")
+    train_weights(_request(tmp_path / "cubes", out))
+    flags = EvaluateFlags(weights=(out,), labels=str(tmp_path / "every.npy"))
+    with pytest.raises(SceneError, match="was trained on these labels"):
+        evaluate_weights(str(tmp_path / "cube.npy"), flags)
+
+
 @pytest.mark.parametrize(
     ("factor", "bands", "note"),
     [
