@@ -73,8 +73,7 @@ class Imaged:
 
     examples: list[Example] = field(default_factory=list)
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
-    content: list[str] = field(default_factory=list)  # hashes of the scenes' files
-    pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+    content: dict[str, NDArray[np.bool_]] = field(default_factory=dict)  # hash of a file -> its labelled pixels
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,8 @@ class Scenes:
     @property
     def split(self) -> dict[str, Any]:
         """Return the record by which an evaluation tells scenes and pixels of the training."""
-        one = self.train
-        return {"train": one.keys, "content": one.content, "validation": self.validation.keys, "pixels": one.pixels}
+        content = {name: pack_mask(mask) for name, mask in self.train.content.items()}
+        return {"train": self.train.keys, "content": content, "validation": self.validation.keys}
 
     def normalised(self, normalisation: Normalisation) -> Scenes:
         """Normalise the scenes; their basis spans their bands and reaches every column."""
@@ -142,9 +141,7 @@ def _imaged(
             notes[UNFIT].append(name)
             continue
         found.keys[name] = scene.key
-        found.content.extend(scene.content)
-        if request.flags.train_mask is not None:
-            found.pixels[scene.key] = pack_mask(mask)
+        found.content.update({one: mask | found.content.get(one, mask) for one in scene.content})  # equal in copies
         notes.add(name, scene)
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.flags.seed, stream, number])

@@ -178,6 +178,8 @@ class Segmenter(nn.Module):
     def __init__(self, config: SegmenterConfig) -> None:
         super().__init__()
         self.config = config
+        if config.corrected:
+            self._add_overview(config)
         if config.parts:
             self.mixture = Mixture(config)
         else:
@@ -185,10 +187,10 @@ class Segmenter(nn.Module):
             nn.init.zeros_(self.spectral.weight)
             nn.init.zeros_(self.spectral.bias)  # type: ignore[arg-type]
         if config.corrected:
-            self._add_networks(config)
+            self._add_full(config)
 
-    def _add_networks(self, config: SegmenterConfig) -> None:
-        """Add the overview and the full network."""
+    def _add_overview(self, config: SegmenterConfig) -> None:
+        """Add the network of every pixel."""
         inputs = config.columns + PLANES
         widths = level_widths(config.overview_width, TOKEN_PX, config.deep)
         self.overview_stem = PhotoStem(inputs, widths) if config.deep else Stem(inputs, widths)
@@ -197,6 +199,10 @@ class Segmenter(nn.Module):
         self.from_token = nn.Conv2d(config.dim, widths[-1] * BOTTOM**2, 1)
         self.overview_head = Head(widths, config.deep)
         self.overview_classes = pointwise(config.overview_width, config.classes)
+
+    def _add_full(self, config: SegmenterConfig) -> None:
+        """Add the network of chosen patches; both correct nothing before they are trained."""
+        inputs = config.columns + PLANES
         widths = level_widths(config.width, config.patch)
         self.full_stem = Stem(inputs + config.overview_width, widths)
         self.full_head = Head(widths)

@@ -92,6 +92,6 @@ def test_receipts_give_score_worst_class_and_false_classes():
 def test_labels_are_reordered_to_the_classes_of_the_weights() -> None:
     """Pixels without a label keep none."""
     labels = np.array([[0, 1, UNLABELLED]], np.uint8)
-    scene: Any = SimpleNamespace(labels=labels, class_names=("b", "a"), shape=(1, 3), clear_key="")
+    scene: Any = SimpleNamespace(labels=labels, class_names=("b", "a"), shape=(1, 3), clear_key="", content=())
     weights: Any = SimpleNamespace(class_names=("a", "b"), record={})
     np.testing.assert_array_equal(judged_labels(scene, weights), [[1, 0, UNLABELLED]])

@@ -141,7 +141,9 @@ def test_each_scene_has_a_noise_stream_of_its_own(monkeypatch: pytest.MonkeyPatc
     """No two scenes of training or validation share a random stream."""
     streams: list[int] = []
 
-    def imaged(scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: Any) -> None:
+    def imaged(
+        scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: Any, rng: Any, *, captured: bool
+    ) -> None:
         streams.append(rng.bit_generator.state["state"]["state"])
 
     monkeypatch.setattr("spectralzoom.flows.training.train_scenes.observe_scene", imaged)
