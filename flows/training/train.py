@@ -160,7 +160,7 @@ def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> T
         bands=len(nm),
         wavelength_nm=(float(nm.min()), float(nm.max())),
         exposure_ms=(min_exposure_ms, max(min_exposure_ms, data.camera.exposure_ms)),
-        scenes=len(data.train),
+        scenes=len(scenes.train.keys),
         classes=scenes.common.names,
         bands_nm=tuple(nm.tolist()),
         **farm,
