@@ -165,8 +165,7 @@ class Trainer:
     def measure_norms(self, batches: int) -> None:
         """Measure the batch norms of the averaged weights over crops, where they have some."""
         if self.averaged.config.deep:
-            rng = np.random.default_rng([self.settings.seed, 0xB2])
-            drawn = (self.sampler.draw(self.settings.batch, rng, self.gain_shift).image for _ in range(batches))
+            drawn = (self.sampler.draw(self.settings.batch, self.rng, self.gain_shift).image for _ in range(batches))
             torch.optim.swa_utils.update_bn(drawn, self.averaged.overview_stem)
 
     def keep(self, path: Path, identity: str) -> None:
@@ -339,7 +338,8 @@ def train(
             trainer.measure_norms(CHECKED[2])
             if helps is not None and not helps(trainer.averaged):
                 break
-    trainer.measure_norms(NORM_BATCHES)
+    else:
+        trainer.measure_norms(NORM_BATCHES)
     return trainer.averaged.to(PROCESSOR), trainer.summary()
 
 

@@ -71,6 +71,22 @@ def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
     assert 0 <= record["calibration"]["expected_error"] <= 1
 
 
+def test_two_of_eight_scenes_judge_a_network(out: Path, tmp_path: Path):
+    """A fraction of its correction is chosen, and classifiers learn from all scenes; fewer scenes have no network."""
+    field = write_field(tmp_path / "field", (16, 16), tuple(f"{number:03d}" for number in range(8)))
+    record = train_weights(_request(field, out))
+    assert (len(record["split"]["train"]), len(record["split"]["validation"])) == (8, 2)
+    scores = record["corrections"]
+    assert list(scores) == ["0", "0.25", "0.5", "0.75", "1"]
+    best = max(scores, key=lambda part: scores[part])
+    kept = load_weights(out).config
+    assert kept.corrected == (best != "0")
+    assert kept.parts
+    few = train_weights(_request(field, out, validation=1, hold_out=("000", "001", "002", "003", "004")))
+    assert "corrections" not in few
+    assert not load_weights(out).config.corrected
+
+
 @pytest.mark.parametrize("sizes", [{"patch": 24}, {"dim": 18}])
 def test_impossible_network_sizes_are_refused_before_imaging(
     folder: Path, out: Path, sizes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
