@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from spectralzoom.models.network.sizes import (
     AROUND,
+    CONTEXT_WINDOWS,
     MEAN_WINDOWS,
     RELATIVE,
     SPREAD_WINDOWS,
@@ -26,6 +27,7 @@ from spectralzoom.pipeline.geometry.grid import cuts
 LEAST_NORM = 1e-12
 STRIP_ROWS = 128  # whose features are computed at once
 REACH = max(MEAN_WINDOWS) // 2  # rows around a strip that its windows cover
+CONTEXT_LEAST = 1e-4  # mean probability of a class around a pixel
 LEAST = 1e-6  # probability of a class that a training had: no part alone rules it out
 
 
@@ -74,6 +76,8 @@ class Mixture(nn.Module):
         self.relative_centre = nn.Parameter(torch.zeros(columns + 1), requires_grad=False)
         self.prior = nn.Parameter(torch.zeros(config.classes), requires_grad=False)  # added to logarithms
         self.parts = nn.ModuleList(Part(widths[kind], hidden, config.classes) for kind, hidden, _ in config.parts)
+        if config.context:
+            self.context = Part(len(CONTEXT_WINDOWS) * config.classes, 0, config.classes)
 
     def relative(self, columns: Tensor) -> Tensor:
         """Return scene values (..., column) over their norm, and its logarithm, (..., column + 1)."""
@@ -113,7 +117,29 @@ class Mixture(nn.Module):
             yield self.features(image[:, :, first:last], kinds, slice(rows.start - first, rows.stop - first))
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return the logarithms of the mixed probabilities and of the prior, (B, class, y, x)."""
+        """Return the logarithms of the probabilities, mixed or in context, and of the prior, (B, class, y, x)."""
+        mixed = self.mixed(image)
+        if self.config.context:
+            mixed = self.context(self.surrounding(mixed)).softmax(dim=-1)
+        return mixed.clamp_min(LEAST).log().add(self.prior).movedim(-1, 1)
+
+    def of_pixels(self, image: Tensor, kinds: Collection[str], places: Tensor) -> dict[str, Tensor]:
+        """Return the features (pixel, feature) of each kind, of ascending ``places`` in one image (1, c, y, x)."""
+        some = places.split(torch.bincount(places // (STRIP_ROWS * image.shape[3]), minlength=1).tolist())
+        found: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
+        for strip, (own, features) in enumerate(zip(some, self.strips(image, kinds), strict=False)):
+            for kind, every in features.items():
+                found[kind].append(every.flatten(0, 2)[own - strip * STRIP_ROWS * image.shape[3]])
+        return {kind: torch.cat(parts) for kind, parts in found.items()}
+
+    def surrounding(self, mixed: Tensor) -> Tensor:
+        """Return logarithms of the mean probabilities around each pixel, (B, y, x, class) -> (B, y, x, feature)."""
+        image = mixed.movedim(-1, 1)
+        means = [window_means(image, side).to(mixed.dtype) for side in CONTEXT_WINDOWS]
+        return torch.cat(means, dim=1).clamp_min(CONTEXT_LEAST).log().movedim(1, -1)
+
+    def mixed(self, image: Tensor) -> Tensor:
+        """Return the weighted mean of the parts' probabilities, (B, y, x, class)."""
         used = [
             (kind, part, weight)
             for (kind, _, weight), part in zip(self.config.parts, self.parts, strict=True)
@@ -124,7 +150,7 @@ class Mixture(nn.Module):
             torch.stack([weight * part(found[kind]).softmax(dim=-1) for kind, part, weight in used]).sum(dim=0)
             for found in self.strips(image, kinds)
         ]
-        return torch.cat(mixed, dim=1).clamp_min(LEAST).log().add(self.prior).movedim(-1, 1)
+        return torch.cat(mixed, dim=1)
 
     def by_part(self, image: Tensor, number: int) -> Tensor:
         """Return the logits (B, class, y, x) of one part alone, such as the best plain classifier."""

@@ -1,11 +1,13 @@
 """Features of a mixture's surroundings: in strips, regions and whole images they are the same."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.ndimage
 import torch
 
-from spectralzoom.models.network.mixture import REACH, STRIP_ROWS, Mixture, window_means
+from spectralzoom.models.network.mixture import STRIP_ROWS, Mixture, window_means
 from spectralzoom.models.network.sizes import AROUND, RELATIVE, VALUES, SegmenterConfig
 
 
@@ -41,9 +43,21 @@ def test_strips_are_parts_of_the_whole_image(mixture: Mixture, rows: int) -> Non
             torch.testing.assert_close(torch.cat([one[kind] for one in strips], dim=1), whole, rtol=1e-5, atol=1e-5)
 
 
-def test_a_region_with_a_halo_is_a_part_of_the_map(mixture: Mixture) -> None:
-    image, inside = scene(150, 130), np.s_[..., 40:80, 50:90]
+@pytest.mark.parametrize("context", [False, True])
+def test_a_region_with_a_halo_is_a_part_of_the_map(mixture: Mixture, context: bool) -> None:
+    own = Mixture(replace(mixture.config, context=context)).eval()
+    own.load_state_dict(mixture.state_dict(), strict=False)
+    halo, image = own.config.halo_px, scene(200, 180)
     with torch.inference_mode():
-        region = mixture(image[..., 40 - REACH : 80 + REACH, 50 - REACH : 90 + REACH])
-        part = region[..., REACH:-REACH, REACH:-REACH]
-        torch.testing.assert_close(part, mixture(image)[inside], rtol=1e-5, atol=1e-5)
+        region = own(image[..., 70 - halo : 110 + halo, 80 - halo : 100 + halo])
+        part = region[..., halo:-halo, halo:-halo]
+        torch.testing.assert_close(part, own(image)[..., 70:110, 80:100], rtol=1e-4, atol=1e-4)
+
+
+def test_features_of_pixels_are_those_of_the_image(mixture: Mixture) -> None:
+    image = scene(2 * STRIP_ROWS + 9)
+    places = torch.tensor([0, 69, 70 * STRIP_ROWS - 1, 70 * STRIP_ROWS, 70 * (2 * STRIP_ROWS + 8)])
+    with torch.inference_mode():
+        for kind, own in mixture.of_pixels(image, {VALUES, AROUND}, places).items():
+            every = mixture.features(image, {kind})[kind].flatten(0, 2)
+            torch.testing.assert_close(own, every[places], rtol=1e-5, atol=1e-5)
