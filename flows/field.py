@@ -129,7 +129,7 @@ class Field:
     @property
     def regions(self) -> list[Region]:
         """Return the regions of the field that the network reads at a time."""
-        return plan_regions(self.grid, SHARD)
+        return plan_regions(self.grid, SHARD, halo=self.described.config.halo_px)
 
     @property
     def kept_patches(self) -> NDArray[np.intp]:

@@ -61,11 +61,13 @@ class TrainFlags(SceneFlags):
     hold_out
         Names of scenes to exclude from training, with commas (059,060) or one a flag. The weights record the split.
     validation
-        Number of validation scenes. Default: 3 built-in scenes, or one in eight of a folder, at most 4.
+        Number of scenes that judge a network. Default: 3 built-in scenes, or a quarter of a folder of 8 or more, at
+        most 4. The classifiers of pixels learn from scenes of a folder for validation, too, in the end.
     steps
         Maximum number of steps; training stops at --steps or --minutes, whichever comes first.
     minutes
-        Time limit of the steps [min]; reading scenes and validation are not included.
+        Time limit of the training [min]: of the processor, or on an accelerator that of the clock. Reading scenes and
+        the last validation are not included.
     patch
         Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
     start

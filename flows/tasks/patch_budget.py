@@ -31,7 +31,7 @@ class ReadingCosts:
 
     @cached_property
     def _regions(self) -> list[Region]:
-        return plan_regions(self.grid, SHARD)
+        return plan_regions(self.grid, SHARD, halo=self.config.halo_px)
 
     def of_map(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
         """Count the map with fine patches at these patches of the field."""

@@ -40,6 +40,7 @@ from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
 FARM_SCENES, FARM_VALIDATION = 48, 3
+VALIDATED_SCENES = 8  # of files; from so many on some are kept to judge a network
 FARM_SHAPE = (512, 640)  # of a scene [px]
 FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # examples use small seeds
 FARM_TEST_SEED = 300_000  # of `evaluate`
@@ -227,9 +228,9 @@ def open_training_data(
 ) -> TrainingData:
     """Open built-in scenes, separated by commas, or a path with the choices of `load_data_set`.
 
-    Every n-th scene that is not held out is for validation: one in eight (at most 4) by default. Scenes without labels
-    are left out, with a note, where others have some. Raises SettingsError: a choice of files for built-in scenes, or
-    the other way round.
+    Every n-th scene that is not held out is for validation: by default a quarter of eight or more scenes (at most 4).
+    Scenes without labels are left out, with a note, where others have some. Raises SettingsError: a choice of files
+    for built-in scenes, or the other way round.
     """
     if laws := built_in_laws(dataset):
         for choice, value in choices.items():
@@ -247,7 +248,7 @@ def open_training_data(
     if not names:
         raise SceneError(f"{files.path}: {'; '.join(files.notes)}; held-out scenes cannot be trained on")
     if validation is None:
-        validation = min(4, len(names) // 8)
+        validation = min(4, len(names) // 4) if len(names) >= VALIDATED_SCENES else 0
     if validation >= len(names) and validation:
         of = counted(len(names), "scene")
         raise SceneError(f"--validation {validation} leaves none of {of} to train on; take fewer")

@@ -141,6 +141,22 @@ def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, NDArray[np.ui
     return grid, example.labels[: grid.height, : grid.width]
 
 
+CORRECTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of a network's correction, to choose from
+
+
+def corrected_miou(base: Weights, network: Weights, examples: Sequence[Example]) -> dict[float, float]:
+    """Return the mIoU of all scenes together by each of `CORRECTIONS` of a base, of which a network has all."""
+    counts = dict.fromkeys(CORRECTIONS, np.zeros((base.config.classes,) * 2, np.int64))
+    for example in examples:
+        grid, labels = _parts(base, example)
+        columns = example.columns.astype(np.float32)
+        first, last = (np.maximum(map_of_columns(one, columns, grid)[1], -1e4) for one in (base, network))
+        for part in CORRECTIONS:
+            drawn = (first + np.float32(part) * (last - first)).argmax(axis=-1).astype(np.uint8)
+            counts[part] = counts[part] + metrics.confusion(labels, drawn, base.config.classes)
+    return {part: metrics.mean_iou(one) for part, one in counts.items()}
+
+
 def miou_of(weights: Weights, examples: Sequence[Example]) -> float:
     """Return the mIoU of all scenes together, by every line at the reference exposure."""
     counts = np.zeros((weights.config.classes,) * 2, np.int64)

@@ -36,7 +36,14 @@ from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
 from spectralzoom.models.training.mixture import fit_mixture
-from spectralzoom.models.training.train import LabelledPixels, halfway, linear_classifier, scaled, train
+from spectralzoom.models.training.train import (
+    LabelledPixels,
+    TrainingSettings,
+    halfway,
+    linear_classifier,
+    scaled,
+    train,
+)
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
@@ -57,7 +64,7 @@ from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 
-CORRECTIONS = (0.25, 0.5, 0.75, 1.0)  # of the network, to choose from
+CORRECTED_SCENES = 4  # labelled scenes, at least, whose classifiers a network corrects
 
 
 def train_weights(
@@ -85,7 +92,8 @@ def train_weights(
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
-    check_classes(request, scenes, tell)
+    taught = scenes if data.files is None else scenes.joined  # in the end
+    check_classes(request, taught, tell)
     if begun is None:
         normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
     else:
@@ -97,8 +105,8 @@ def train_weights(
         "command": request.command,
         "data": data.law,
         **({CLASS_VALUES: list(scenes.common.values)} if scenes.common.values else {}),
-        TRAINED_ON: asdict(_trained_on(data, scenes, settings.darkest_ms)),
-        "split": scenes.split | {"held_out": list(data.held_out)},
+        TRAINED_ON: asdict(_trained_on(data, taught, settings.darkest_ms)),
+        "split": taught.split | {"validation": scenes.validation.keys, "held_out": list(data.held_out)},
         "settings": asdict(settings),
         "camera": asdict(CAMERA),
         CAPTURED: request.captured,
@@ -109,24 +117,29 @@ def train_weights(
     if data.files is None:
         record = _written(learner, about, learner.network(begun))
     else:
+        if len(scenes.untaught) > len(scenes.common.names) - 2:  # the other classes are in scenes for validation
+            learner = replace(learner, scenes=learner.scenes.joined)
         mixed = learner.mixture()
         record = _written(learner, about, mixed)  # usable after seconds
-        if (corrected := learner.correction(mixed.weights)) is not None:
-            record = _written(learner, about, corrected)
+        if learner.scenes.validation.examples:
+            learned = learner.correction(mixed)
+            record = _written(learner, about, learned, learner.whole(learned))
     checkpoint.unlink(missing_ok=True)
     return record
 
 
-def _written(learner: Learner, about: Mapping[str, Any], learned: Learned) -> dict[str, Any]:
-    """Judge and save weights; return their record."""
+def _written(
+    learner: Learner, about: Mapping[str, Any], learned: Learned, whole: Learned | None = None
+) -> dict[str, Any]:
+    """Judge weights, save them, or others of the ``whole`` data, and return their record."""
     weights, request = learned.weights, learner.request
-    frames = learner.scenes.validation.examples
-    record = {**about, **learned.found, **learner.judged(weights)}
+    frames, kept = learner.scenes.validation.examples, whole or learned
+    record = {**about, **kept.found, **learner.judged(weights)}
     seed = request.flags.settings.seed
     scans = figures.judge_scans(with_record(weights, **record), frames, learner.augmentation, seed, learner.report)
     if scans is not None:
         record["scans"] = scans[0]
-    save_weights(with_record(weights.on(PROCESSOR), **record), request.out)
+    save_weights(with_record(kept.weights.on(PROCESSOR), **record), request.out)
     if scans is not None:
         add_map_scores(request.out, scans[1])
     return record
@@ -146,7 +159,7 @@ def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> T
         bands=len(nm),
         wavelength_nm=(float(nm.min()), float(nm.max())),
         exposure_ms=(min_exposure_ms, max(min_exposure_ms, data.camera.exposure_ms)),
-        scenes=len(data.train),
+        scenes=len(scenes.train.keys),
         classes=scenes.common.names,
         bands_nm=tuple(nm.tolist()),
         **farm,
@@ -213,39 +226,58 @@ class Learner:
         rng = np.random.default_rng([0x1DA])
         pixels = LabelledPixels.drawn(examples, rng, self.augmentation).brightened(self.normalisation.gain_shift, rng)
         start = linear_classifier(pixels, self.config.classes) | (load_encoder() if self.config.deep else {})
-        model, summary = self._trained(self.config, start if begun is None else begun.segmenter.state_dict())
+        tensors = start if begun is None else begun.segmenter.state_dict()
+        model, summary = self._trained(self.config, tensors, self.request.flags.settings)
         if begun is not None:
             model = self._better({"trained": model, "mean with --start": halfway(begun.segmenter, model)})[0]
         return Learned(self._weights(model), {"training": summary})
 
     def mixture(self) -> Learned:
         """Fit a mixture of classifiers, without a network."""
-        began = time.process_time()
+        worked, began = time.process_time(), time.monotonic()
         seed = self.request.flags.settings.seed
         mixed = fit_mixture(self.scenes.train.examples, self.normalisation, self.config, seed, self.report)
-        spent = {"steps": 0, "processor_seconds": round(time.process_time() - began, 1)}
+        seconds, processor = round(time.monotonic() - began, 1), round(time.process_time() - worked, 1)
+        spent = {"steps": 0, "seconds": seconds, "processor_seconds": processor}
         found = {"candidates": [asdict(one) for one in mixed.judged], "plain": mixed.plain, "training": spent}
         return Learned(self._weights(mixed.segmenter), found)
 
-    def correction(self, mixed: Weights) -> Learned | None:
-        """Train networks that correct a mixture; None unless a fraction of them reads the validation scenes better."""
-        if not self.scenes.validation.examples:
-            return None
-        config = replace(mixed.config, corrected=True)
-        encoder = load_encoder() if config.deep else {}
-        model, summary = self._trained(config, {**mixed.segmenter.state_dict(), **encoder})
-        tried = {f"{part:g} of the network": scaled(model, part) for part in CORRECTIONS}
-        best, scores = self._better({"mixture": mixed.segmenter, **tried})
-        if best is mixed.segmenter:
-            return None
-        return Learned(self._weights(best), {"training": summary, "corrections": scores})
+    def correction(self, mixed: Learned) -> Learned:
+        """Train networks that correct a mixture; return it itself unless they read the validation scenes better."""
+        scenes, settings = self.scenes, self.request.flags.settings
+        spent = mixed.found["training"]["processor_seconds" if self.device == PROCESSOR else "seconds"]
+        minutes = settings.minutes - 2 * spent / 60  # in the end a mixture is fitted to all scenes
+        if minutes <= 0 or len(scenes.joined.train.examples) < CORRECTED_SCENES:
+            return mixed
+        config = replace(mixed.weights.config, corrected=True)
+        start = {**mixed.weights.segmenter.state_dict(), **(load_encoder() if config.deep else {})}
+        scores: dict[float, float] = {}
+
+        def best(model: Segmenter) -> float:
+            scores.update(figures.corrected_miou(mixed.weights, self._weights(model), scenes.validation.examples))
+            return max(scores, key=lambda part: scores[part])
+
+        model, summary = self._trained(config, start, replace(settings, minutes=minutes), lambda model: best(model) > 0)
+        stopped = bool(scores) and max(scores, key=lambda part: scores[part]) == 0
+        part = 0.0 if stopped else best(model)
+        found = {"training": summary, "corrections": {f"{part:g}": miou for part, miou in scores.items()}}
+        return Learned(self._weights(scaled(model, part)) if part else mixed.weights, found)
+
+    def whole(self, learned: Learned) -> Learned:
+        """Fit the mixture to all scenes, those for validation too; networks that correct it stay as they are."""
+        anew = replace(self, scenes=self.scenes.joined).mixture()
+        own, networks = anew.weights.segmenter, learned.weights.segmenter.state_dict()
+        if learned.weights.config.corrected:
+            own = Segmenter(replace(own.config, corrected=True)).eval()
+            own.load_state_dict({**networks, **anew.weights.segmenter.state_dict()})
+        return Learned(self._weights(own), {**anew.found, **learned.found})
 
     def judged(self, weights: Weights) -> dict[str, Any]:
         """Return figures on the validation scenes, for the record."""
         frames = self.scenes.validation.examples
         twice = figures.read_twice(weights, frames)
         found: dict[str, Any] = {"validation": figures.validate(twice, weights.config.classes)}
-        if not weights.config.corrected:
+        if not weights.config.corrected or (twice and _adds_nothing(found["validation"])):
             found[CASCADE] = asdict(CascadeTable.of_overview())
         elif twice:
             found[CASCADE] = asdict(CascadeTable.judged(twice, weights.config.classes))
@@ -254,14 +286,21 @@ class Learner:
             found[CALIBRATION] = figures.judge_calibration(weights, frames, self.request.flags.settings.seed)
         return found
 
-    def _trained(self, config: SegmenterConfig, start: Mapping[str, Any]) -> tuple[Segmenter, dict[str, Any]]:
+    def _trained(
+        self,
+        config: SegmenterConfig,
+        start: Mapping[str, Any],
+        settings: TrainingSettings,
+        helps: Callable[[Segmenter], bool] | None = None,
+    ) -> tuple[Segmenter, dict[str, Any]]:
         return train(
             config,
             self.scenes.train.examples,
             self.normalisation.gain_shift,
-            self.request.flags.settings,
+            settings,
             lambda now: self.report("training", now.done, f"step {now.step}, loss {now.loss:.3f}"),
             start=start,
+            helps=helps,
             augmentation=self.augmentation,
             checkpoint=self.checkpoint,
             device=self.device,
@@ -276,6 +315,11 @@ class Learner:
     def _weights(self, model: Segmenter) -> Weights:
         common = self.scenes.common
         return Weights(model, common.basis, self.normalisation, common.names, common.colours).on(self.device)
+
+
+def _adds_nothing(validation: Mapping[str, Any]) -> bool:
+    """Return whether validation scenes are read no better in full than by the overview alone."""
+    return bool(validation["all"]["miou"] <= validation["none"]["miou"])
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
@@ -318,8 +362,8 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         console.print(table(columns, rows, title="By cross-validation"))
         show_text("cross-validation on these scenes is no forecast for other ground", console)
     if "corrections" in record:
-        shown = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in record["corrections"].items())
-        show_text(f"mIoU of the validation scenes: {shown}", console)
+        shown = ", ".join(f"{part} {100 * miou:.1f}" for part, miou in record["corrections"].items())
+        show_text(f"mIoU of the validation scenes by the fraction of the network's correction: {shown}", console)
     judged = record["validation"]
     if judged is None:
         left = built_in_laws(request.dataset) or request.flags.hold_out

@@ -90,6 +90,13 @@ class Scenes:
         return untaught_classes(self.train.examples, len(self.common.names))
 
     @property
+    def joined(self) -> Scenes:
+        """Return all scenes as those of a training."""
+        one, other = self.train, self.validation
+        every = Imaged([*one.examples, *other.examples], one.keys | other.keys, one.content | other.content)
+        return Scenes(self.common, every, Imaged())
+
+    @property
     def split(self) -> dict[str, Any]:
         """Return the record by which an evaluation tells scenes and pixels of the training."""
         content = {name: pack_mask(mask) for name, mask in self.train.content.items()}

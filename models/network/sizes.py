@@ -31,6 +31,7 @@ CELL_PX = 2  # pixels a side of the spectral features of the temporal reader
 VALUES, RELATIVE, AROUND = "values", "relative", "around"  # features of a mixture's parts
 MEAN_WINDOWS = (1, 3, 5, 9, 15, 31, 61)  # pixels a side around a pixel whose means are features
 SPREAD_WINDOWS = (5, 15, 31, 61)  # the same of standard deviations
+CONTEXT_WINDOWS = (1, 15, 31, 61)  # the same of the probabilities of a mixture in context
 AROUND_PX = 5  # pixels a side whose mean spectrum the spectral classifier reads
 TOKEN_PX = 32  # pixels a side that a token stands for
 PLANES = 3  # beside the spectral features of a pixel: exposure, line spacing, binned samples
@@ -67,7 +68,13 @@ class SegmenterConfig:
     # of a mixture: features, hidden channels (0: linear) and weight; none: a linear classifier alone
     parts: tuple[tuple[str, int, float], ...] = ()
     components: tuple[int, int] = (0, 0)  # of spectra and of relative spectra, around a pixel
+    context: bool = False  # a linear classifier reads the mixture's probabilities around a pixel
     corrected: bool = True  # an overview and a full network correct the classifiers of pixels
+
+    @property
+    def halo_px(self) -> int:
+        """Return the pixels around a region that are read with it: those of a window, or of windows of windows."""
+        return 2 * TOKEN_PX if self.context else TOKEN_PX
 
     @property
     def features(self) -> int:
@@ -164,6 +171,7 @@ def base_multiply_adds(config: SegmenterConfig) -> int:
     used = [(kind, hidden) for kind, hidden, weight in config.parts if weight]
     found = config.columns**2  # scene values
     found += sum(config.components) * config.columns if AROUND in dict(used) else 0
+    found += len(CONTEXT_WINDOWS) * config.classes**2 if config.context else 0
     for kind, hidden in used:
         found += (widths[kind] + config.classes) * hidden if hidden else widths[kind] * config.classes
     return found

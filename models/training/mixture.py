@@ -5,6 +5,7 @@ Folds are whole scenes, or blocks as large as the labelled patches: never single
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +24,7 @@ from torch import Tensor
 from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.network.mixture import Mixture, Part
 from spectralzoom.models.network.segmenter import Segmenter
-from spectralzoom.models.network.sizes import AROUND, RELATIVE, VALUES, SegmenterConfig
+from spectralzoom.models.network.sizes import AROUND, CONTEXT_WINDOWS, RELATIVE, VALUES, SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.training.examples import Example
 from spectralzoom.pipeline.errors import SceneError
@@ -71,6 +72,9 @@ CANDIDATES = (
 )
 
 
+CONTEXT = Candidate("mixture in context", "context", lambda: LogisticRegression(C=0.1, max_iter=300))
+
+
 @dataclass(frozen=True)
 class Taught:
     """Labelled pixels: their features of each kind, classes and folds."""
@@ -78,7 +82,8 @@ class Taught:
     features: Mapping[str, NDArray[np.float32]]  # (pixel, feature)
     labels: Labels  # (pixel,)
     fold: NDArray[np.int64]  # (pixel,)
-    scenes: int
+    place: NDArray[np.int64]  # (pixel, 2) number of the example, and of its pixel
+    scenes: int  # with a label
 
 
 @dataclass(frozen=True)
@@ -170,7 +175,6 @@ def fit_mixture(
         )
     apart = _apart(taught, config.classes, report)
     weights, mixed = _chosen(apart, taught, config.classes)
-    power = _prior_power(mixed, taught, config.classes)
     plain = max((one for one in CANDIDATES if one.kind == VALUES), key=lambda one: apart[one.name][1].miou)
     total = sum(weights.values())
     parts = [one for one in CANDIDATES if one.name in weights or one is plain]
@@ -180,11 +184,20 @@ def fit_mixture(
     segmenter.mixture.load_state_dict(same, strict=False)
     for part, one in zip(segmenter.mixture.parts, parts, strict=True):
         Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
+    own = _judged("mixture", mixed, taught.labels, config.classes, time.process_time() - began)
+    began = time.process_time()
+    if (context := _in_context(segmenter.mixture, parts, taught, examples)) is not None:
+        found = _judged(CONTEXT.name, context[1], taught.labels, config.classes, time.process_time() - began)
+        if _likelihood(context[1], taught.labels) > _likelihood(mixed, taught.labels):
+            mixed, tensors, own = context[1], segmenter.state_dict(), found
+            segmenter = Segmenter(replace(segmenter.config, context=True)).eval()
+            segmenter.load_state_dict(tensors, strict=False)
+            context[0].store(segmenter.mixture.context, config.classes)
+    power = _prior_power(mixed, taught, config.classes)
     fraction = np.bincount(taught.labels, minlength=config.classes) / len(taught.labels)
     prior = np.where(fraction > 0, -power * np.log(np.maximum(fraction, 1e-12)), 0)
     with torch.no_grad():
         segmenter.mixture.prior.copy_(torch.from_numpy(prior.astype(np.float32)))
-    own = _judged("mixture", mixed, taught.labels, config.classes, time.process_time() - began)
     shown = [replace(judged, weight=weights.get(name, 0) / total) for name, (_, judged) in apart.items()]
     return Mixed(segmenter, parts.index(plain), (*shown, own))
 
@@ -217,20 +230,23 @@ def taught_pixels(mixture: Mixture, examples: Sequence[Example], rng: np.random.
     counts = np.sum([np.bincount(one.labels.ravel(), minlength=256)[:UNLABELLED] for one in examples], axis=0)
     fraction = np.minimum(1.0, np.maximum(MOST_PIXELS / counts.sum(), LEAST_PIXELS / np.maximum(counts, 1)))
     features: dict[str, list[Floats]] = {kind: [] for kind in (VALUES, RELATIVE, AROUND)}
-    labels, folds = [], []
-    for example, fold in zip(examples, folds_of([one.labels for one in examples], rng), strict=True):
+    labels, folds, found = [], [], []
+    for number, (example, fold) in enumerate(
+        zip(examples, folds_of([one.labels for one in examples], rng), strict=True)
+    ):
         chance = np.append(fraction, np.zeros(256 - len(fraction)))[example.labels.ravel()]
         places = np.flatnonzero(rng.random(len(chance)) < chance)
         if not len(places):
             continue
         with torch.inference_mode():
             image = torch.from_numpy(np.asarray(example.columns, np.float32)).movedim(-1, 0)[None]
-            for kind, every in mixture.features(image, features).items():
-                features[kind].append(every.flatten(0, 2)[torch.from_numpy(places)].numpy())
+            for kind, own in mixture.of_pixels(image, features, torch.from_numpy(places)).items():
+                features[kind].append(own.numpy())
         labels.append(example.labels.ravel()[places])
         folds.append(fold.ravel()[places])
+        found.append(np.stack([np.full_like(places, number), places], axis=1))
     joined = {kind: np.concatenate(parts) for kind, parts in features.items()}
-    return Taught(joined, np.concatenate(labels), np.concatenate(folds), len(labels))
+    return Taught(joined, np.concatenate(labels), np.concatenate(folds), np.concatenate(found), len(labels))
 
 
 def folds_of(labels: Sequence[Labels], rng: np.random.Generator) -> list[NDArray[np.int64]]:
@@ -290,6 +306,44 @@ def _judged(name: str, probability: Floats, labels: Labels, classes: int, second
     return Judged(name, metrics.mean_iou(counts), metrics.overall_accuracy(counts), seconds)
 
 
+def _in_context(
+    mixture: Mixture, parts: Sequence[Candidate], taught: Taught, examples: Sequence[Example]
+) -> tuple[Fit, Floats] | None:
+    """Fit a classifier of the mixture's probabilities around a pixel; return it and its probabilities (pixel, class).
+
+    Both the probabilities that it learns from and its own are those of scenes that were not fitted to. None where folds
+    are no whole scenes, or surroundings do not count.
+    """
+    around = any(kind == AROUND and weight for kind, _, weight in mixture.config.parts)
+    folds = [taught.fold != fold for fold in range(FOLDS)]
+    if not around or len(examples) < FOLDS or any(len(np.unique(taught.labels[learn])) < 2 for learn in folds):
+        return None
+    classes = mixture.config.classes
+    features = np.zeros((len(taught.labels), len(CONTEXT_WINDOWS) * classes), np.float32)
+    own = copy.deepcopy(mixture)
+    for learn in folds:
+        for part, one in zip(own.parts, parts, strict=True):
+            Fit.of(one, taught.features[one.kind][learn], taught.labels[learn]).store(part, classes)
+        for number in np.unique(taught.place[~learn, 0]):
+            here = taught.place[:, 0] == number
+            image = torch.from_numpy(np.asarray(examples[number].columns, np.float32)).movedim(-1, 0)[None]
+            with torch.inference_mode():
+                every = own.surrounding(own.mixed(image)).flatten(0, 2)
+                features[here] = every[torch.from_numpy(taught.place[here, 1])].numpy()
+    probability = np.full((len(taught.labels), classes), 1 / classes)
+    for learn in folds:
+        if not learn.all():
+            fit = Fit.of(CONTEXT, features[learn], taught.labels[learn])
+            probability[~learn] = fit.predict(features[~learn], classes)
+    return Fit.of(CONTEXT, features, taught.labels), probability
+
+
+def _likelihood(total: Floats, labels: Labels) -> float:
+    """Return the mean logarithm of the probability of a pixel's own class, of (pixel, class) in proportion."""
+    of_labels = total[np.arange(len(total)), labels] / total.sum(axis=1)
+    return float(np.log(np.maximum(of_labels, LEAST_CHANCE)).mean())
+
+
 def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught, classes: int) -> tuple[dict[str, int], Floats]:
     """Return how often each candidate is in the mixture, and its probabilities (Caruana et al. 2004).
 
@@ -298,8 +352,7 @@ def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught, classes:
     """
 
     def score(total: Floats) -> float:
-        of_labels = total[np.arange(len(total)), taught.labels] / total.sum(axis=1)
-        return float(np.log(np.maximum(of_labels, LEAST_CHANCE)).mean())
+        return _likelihood(total, taught.labels)
 
     scores = {name: score(one) for name, (one, _) in apart.items()}
     around = {one.name for one in CANDIDATES if one.kind == AROUND}

@@ -40,6 +40,7 @@ LINEAR = (LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto"), LogisticR
 KNOWN = ("overview_stem.first.", "overview_stem.stages.")  # parameters of large frames that ImageNet trained
 KNOWN_RATE = 0.3  # of the learning rate, for these
 NORM_BATCHES = 60  # over which the batch norms of the averaged weights are measured
+CHECKED = 0.25, 200, 15  # fraction of the run or steps, whichever is earlier, and batches of norms, of the first check
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,12 @@ class Trainer:
         value = float(loss.detach())
         if math.isfinite(value):
             course.loss = value if math.isnan(course.loss) else 0.97 * course.loss + 0.03 * value
+
+    def measure_norms(self, batches: int) -> None:
+        """Measure the batch norms of the averaged weights over crops, where they have some."""
+        if self.averaged.config.deep:
+            drawn = (self.sampler.draw(self.settings.batch, self.rng, self.gain_shift).image for _ in range(batches))
+            torch.optim.swa_utils.update_bn(drawn, self.averaged.overview_stem)
 
     def keep(self, path: Path, identity: str) -> None:
         """Write a checkpoint."""
@@ -287,6 +294,7 @@ def train(
     report: Callable[[Progress], None] = lambda progress: None,
     *,
     start: Mapping[str, Tensor] | None = None,
+    helps: Callable[[Segmenter], bool] | None = None,
     augmentation: CaptureAugmentation | None = None,
     checkpoint: Path | None = None,
     keep_every_s: float = KEEP_EVERY_S,
@@ -297,7 +305,8 @@ def train(
     The same settings and examples start from the same weights and draw the same crops and patches. Results are equal
     up to rounding: the order of sums depends on memory alignment, and ``minutes`` may end the run elsewhere.
 
-    ``start`` are named initial tensors; others are random. ``checkpoint`` is a file of the state, from which a killed
+    ``start`` are named initial tensors; others are random. Where ``helps`` says no to the averaged weights at its one
+    call, after `CHECKED` of the run, this ends. ``checkpoint`` is a file of the state, from which a killed
     run of the same settings and examples continues. ``device`` is one of `models.network.machine.choose_device`.
     Classes of ``config`` without a labelled pixel are `SegmenterConfig.untaught` in the segmenter.
 
@@ -310,7 +319,7 @@ def train(
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:
         trainer.resume(checkpoint, identity)
-    kept = time.monotonic()
+    kept, checked = time.monotonic(), helps is None
     while (done := trainer.done) < 1:
         trainer.step(done if trainer.course.step else 0.0)  # the first learning rate does not depend on the clock
         if trainer.course.step % FREED_EVERY == 0:
@@ -319,9 +328,13 @@ def train(
         if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
             trainer.keep(checkpoint, identity)
             kept = time.monotonic()
-    if config.deep:
-        drawn = (trainer.sampler.draw(settings.batch, trainer.rng, gain_shift).image for _ in range(NORM_BATCHES))
-        torch.optim.swa_utils.update_bn(drawn, trainer.averaged.overview_stem)
+        if not checked and (done >= CHECKED[0] or trainer.course.step >= CHECKED[1]):
+            checked = True
+            trainer.measure_norms(CHECKED[2])
+            if helps is not None and not helps(trainer.averaged):
+                break
+    else:
+        trainer.measure_norms(NORM_BATCHES)
     return trainer.averaged.to(PROCESSOR), trainer.summary()
 
 
@@ -338,15 +351,17 @@ def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:
 def run_identity(
     config: SegmenterConfig, examples: list[Example], settings: TrainingSettings, start: Mapping[str, Tensor] | None
 ) -> str:
-    """Return the hash of everything that a run depends on, which identifies its checkpoints."""
-    digest = hashlib.sha256(json.dumps([asdict(config), asdict(settings)], sort_keys=True).encode())
+    """Return the hash that identifies the checkpoints of a run: of all that it depends on but time and a mixture."""
+    about = [asdict(config), asdict(replace(settings, minutes=math.inf))]
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
     for example in examples:
         digest.update(example.name.encode())
         digest.update(np.ascontiguousarray(example.columns).tobytes())
         digest.update(np.ascontiguousarray(example.labels).tobytes())
     for name, tensor in (start or {}).items():
-        digest.update(name.encode())
-        digest.update(tensor.numpy().tobytes())
+        if not name.startswith("mixture."):  # fitted anew it is equal up to rounding
+            digest.update(name.encode())
+            digest.update(tensor.numpy().tobytes())
     return digest.hexdigest()[:20]
 
 

@@ -60,19 +60,35 @@ def _request(folder: Path | str, out: Path, command: str = "", **flags: Any) -> 
 
 
 def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
-    """It has scenes (none of validation, none held out) and ranges of the training data, and the calibration."""
+    """It has scenes (those of validation, none held out) and ranges of the training data, and the calibration."""
     field = write_field(tmp_path / "field", (32, 32), NUMBERS)
     record = train_weights(_request(field, out, validation=1, hold_out=("003",)))
     assert "scans" not in record  # of a single exposure
     assert describe_weights(out).map_scores is None
     split = record["split"]
-    assert (len(split["train"]), len(split["validation"])) == (2, 1)
-    assert not set(split["train"]) & {*split["validation"], "003"}
+    assert (len(split["train"]), len(split["validation"])) == (3, 1)
+    assert set(split["validation"]) < set(split["train"]) == {"001", "002", "004"}  # classifiers learn from all
     assert split["held_out"] == ["003"]
     assert load_weights(out).record["split"] == split
     told = TrainedOn.read(load_weights(out).record["trained_on"])
-    assert (told.scenes, told.exposure_ms, told.day) == (2, (100.0, 100.0), None)
+    assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
+
+
+def test_two_of_eight_scenes_judge_a_network(out: Path, tmp_path: Path):
+    """A fraction of its correction is chosen, and classifiers learn from all scenes; fewer scenes have no network."""
+    field = write_field(tmp_path / "field", (16, 16), tuple(f"{number:03d}" for number in range(8)))
+    record = train_weights(_request(field, out))
+    assert (len(record["split"]["train"]), len(record["split"]["validation"])) == (8, 2)
+    scores = record["corrections"]
+    assert list(scores) == ["0", "0.25", "0.5", "0.75", "1"]
+    best = max(scores, key=lambda part: scores[part])
+    kept = load_weights(out).config
+    assert kept.corrected == (best != "0")
+    assert kept.parts
+    few = train_weights(_request(field, out, validation=1, hold_out=("000", "001", "002", "003", "004")))
+    assert "corrections" not in few
+    assert not load_weights(out).config.corrected
 
 
 @pytest.mark.parametrize("sizes", [{"patch": 24}, {"dim": 18}])

@@ -100,6 +100,14 @@ def test_training_stops_at_its_time_limit(monkeypatch: pytest.MonkeyPatch):
     assert seen[-1].done == pytest.approx(0.8)
 
 
+@pytest.mark.parametrize(("helps", "steps"), [(True, 6), (False, 3)])
+def test_training_stops_where_its_first_check_finds_no_help(helps: bool, steps: int):
+    """The one check comes after a fourth of the run."""
+    asked: list[Segmenter] = []
+    found = train(CONFIG, [block_example()], SHIFT, SETTINGS, helps=lambda model: asked.append(model) or helps)
+    assert (found[1]["steps"], len(asked)) == (steps, 1)
+
+
 def test_an_infinite_gradient_is_no_step():
     """The loss is finite, and every weight stays as it was."""
     model = Segmenter(CONFIG)
