@@ -71,12 +71,6 @@ class CascadeTable:
         return CascadeTable(*(tuple(map(float, content[name])) for name in ("least_gain", "loss", "fraction")))
 
     @staticmethod
-    def of_overview() -> CascadeTable:
-        """Return the table of weights whose overview is all: a full reading adds nothing."""
-        zeros = (0.0,) * len(LEAST_GAINS)
-        return CascadeTable(LEAST_GAINS, zeros, zeros)
-
-    @staticmethod
     def judged(scenes: Sequence[ReadTwice], classes: int) -> CascadeTable:
         """Judge the map of each scene, for each threshold of the score by ``gain``."""
         losses, fractions = np.zeros((2, len(LEAST_GAINS), len(scenes)))
