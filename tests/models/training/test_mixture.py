@@ -190,12 +190,6 @@ def test_as_few_pixels_as_classes_are_refused() -> None:
         _fitted([(values, _few(labels, 1))], 3)
 
 
-def test_the_same_seed_fits_the_same_mixture() -> None:
-    """Nothing depends on the clock."""
-    one, two = (_fitted(_scenes(2, 3), 3)[0].segmenter.state_dict() for _ in range(2))
-    assert all(torch.equal(one[name], two[name]) for name in one)
-
-
 def test_textures_are_told_by_their_surroundings() -> None:
     """Textures of equal mean spectra differ in their spread alone."""
     rng = np.random.default_rng(0)
