@@ -74,8 +74,9 @@ class SurveyPlan:
 
     @property
     def cascade(self) -> CascadeTable | None:
-        """Return the table of losses; None without an accepted loss, or where the weights have no table."""
-        content = self.field.described.record.get(CASCADE) if self.settings.expected_loss else None
+        """Return the table of losses; None without an accepted loss, or where the weights have no table or network."""
+        described = self.field.described
+        content = described.record.get(CASCADE) if self.settings.expected_loss and described.config.corrected else None
         return None if content is None else CascadeTable.read(content)
 
     @property
@@ -86,7 +87,8 @@ class SurveyPlan:
     @property
     def controls(self) -> bool:
         """Return whether the evaluation also judges the small network alone and the full one everywhere."""
-        return self.settings.controls and (self.chooses or self.field.raster is not None)
+        asked = self.settings.controls and self.field.described.config.corrected
+        return asked and (self.chooses or self.field.raster is not None)
 
     @property
     def is_judged(self) -> bool:

@@ -90,6 +90,8 @@ class Drawing:
             gain = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels)
             here = region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
+        if not weights.config.corrected:  # a patch in full is its overview
+            chosen = chosen[:0]
         patch_index, columns = seen_patches(chosen, seen, region)
         drawn = segment(weights, seen, columns, patch_index, every_class=True)
         del columns  # a prior map takes their room

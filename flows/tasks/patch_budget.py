@@ -73,10 +73,15 @@ class PatchBudget:
         """Return the budget; None where it pays for all patches.
 
         ``shown`` (patch,) are the patches that zones leave; None: all. Raises BudgetError: it does not pay for the
-        overview; names the least that does.
+        overview, and names the least that does; or the weights have no full network that could be left out.
         """
         patch_index = costs.grid.every_patch() if shown is None else np.flatnonzero(shown)
         budget = PatchBudget(costs, patch_index, policy, macs)
+        if not costs.config.corrected and budget._most < budget.everything:
+            raise BudgetError(
+                f"--macs {macs}: the weights have no full network to leave out, and any map takes "
+                f"{budget.everything:.4g} multiply-adds; leave out --macs"
+            )
         coarse = budget.operations_of(patch_index[:0])
         if budget._most < coarse:
             least = str(coarse)

@@ -277,9 +277,9 @@ class Learner:
         frames = self.scenes.validation.examples
         twice = figures.read_twice(weights, frames)
         found: dict[str, Any] = {"validation": figures.validate(twice, weights.config.classes)}
-        if not weights.config.corrected or (twice and _adds_nothing(found["validation"])):
+        if twice and weights.config.corrected and _adds_nothing(found["validation"]):
             found[CASCADE] = asdict(CascadeTable.of_overview())
-        elif twice:
+        elif twice and weights.config.corrected:
             found[CASCADE] = asdict(CascadeTable.judged(twice, weights.config.classes))
         if frames:
             self.report("validating", 0.0, f"{len(frames)} scenes")

@@ -83,7 +83,7 @@ class SegmenterConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "untaught", tuple(self.untaught))  # a list in files
-        object.__setattr__(self, "components", tuple(self.components))
+        object.__setattr__(self, "components", tuple(map(int, self.components)))
         object.__setattr__(
             self, "parts", tuple((str(kind), int(hidden), float(weight)) for kind, hidden, weight in self.parts)
         )
@@ -99,9 +99,10 @@ class SegmenterConfig:
         known = all(
             kind in (VALUES, RELATIVE, AROUND) and 0 <= hidden <= MOST["width"] for kind, hidden, _ in self.parts
         )
-        if not known or not all(0 <= weight <= 1 for _, _, weight in self.parts):
-            raise ShapeError(f"parts of a mixture have features, hidden channels and a weight, got {self.parts}")
-        if not all(0 <= size <= self.columns + 1 for size in self.components):
+        adds_up = not self.parts or abs(sum(weight for _, _, weight in self.parts) - 1) < 1e-6
+        if not known or not adds_up or not all(0 <= weight <= 1 for _, _, weight in self.parts):
+            raise ShapeError(f"parts are features, hidden channels and weights of sum 1, got {self.parts}")
+        if len(self.components) != 2 or not all(0 <= size <= self.columns + 1 for size in self.components):
             raise ShapeError(f"components {self.components} of {self.columns} columns do not exist")
         if not {*self.untaught} < {*range(self.classes)}:
             raise ShapeError(f"untaught must be some of the {self.classes} classes, got {self.untaught}")

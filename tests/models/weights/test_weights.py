@@ -114,6 +114,38 @@ def test_sizes_that_do_not_fit_are_refused(saved: Path, changes: dict[str, Any],
 
 
 @pytest.mark.parametrize(
+    "damage",
+    [
+        {"parts": [["texture", 0, 1.0]]},
+        {"parts": [["values", 0, 1.5]]},
+        {"parts": [["values", 0, float("nan")]]},
+        {"parts": [["values", 0, 0.0]]},
+        {"parts": [["values", -1, 1.0]]},
+        {"parts": [["values", 10**9, 1.0]]},
+        {"parts": [["values", 3, 1.0]]},
+        {"parts": [["values", 1.0]]},
+        {"parts": [["values", 0, "much"]]},
+        {"parts": [["relative", 0, 1.0]]},
+        {"parts": 3},
+        {"parts": []},
+        {"components": [6, 3]},
+        {"components": [2, -1]},
+        {"components": [2]},
+        {"components": None},
+        {"corrected": True},
+    ],
+)
+def test_damaged_mixtures_are_refused(tmp_path: Path, damage: dict[str, Any]):
+    """Unknown features, weights that do not add up, and sizes that do not fit the tensors."""
+    mixed = make_weights(parts=(("values", 0, 1.0),), components=(2, 3), corrected=False)
+    save_weights(mixed, tmp_path / "w.safetensors")
+    about = _about(tmp_path / "w.safetensors")
+    _rewritten(tmp_path / "w.safetensors", {**about, "config": {**about["config"], **damage}})
+    with pytest.raises(WeightsError, match=r"cannot read .*w\.safetensors: "):
+        load_weights(tmp_path / "w.safetensors")
+
+
+@pytest.mark.parametrize(
     ("name", "change", "words"),
     [
         ("normalisation.centre", None, r"w\.safetensors: .*normalisation.centre"),
