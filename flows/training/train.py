@@ -45,6 +45,7 @@ from spectralzoom.models.weights.files import (
     CAPTURED,
     CASCADE,
     CLASS_VALUES,
+    PLAIN,
     TRAINED_ON,
     TrainedOn,
     Weights,
@@ -110,7 +111,7 @@ def train_weights(
         mixed = learner.mixture()
         record = _written(learner, about, mixed)  # usable after seconds
         if (corrected := learner.correction(mixed.weights)) is not None:
-            record = _written(learner, about, corrected)
+            record = _written(learner, {**about, **mixed.found}, corrected)
     checkpoint.unlink(missing_ok=True)
     return record
 
@@ -234,7 +235,7 @@ class Learner:
         seed = self.request.flags.settings.seed
         mixed = fit_mixture(self.scenes.train.examples, self.normalisation, self.config, seed, self.report)
         spent = {"steps": 0, "processor_seconds": round(time.process_time() - began, 1)}
-        found = {"candidates": [asdict(one) for one in mixed.judged], "plain": mixed.plain, "training": spent}
+        found = {"candidates": [asdict(one) for one in mixed.judged], PLAIN: mixed.plain, "training": spent}
         return Learned(self._weights(mixed.segmenter), found)
 
     def correction(self, mixed: Weights) -> Learned | None:
