@@ -55,13 +55,15 @@ def evaluate_weights(
         raise SettingsError(f"--seed must be at least 0, got {flags.seed}")
     keep_freed_memory()
     candidates = open_candidates(flags.weights)
+    if not any(one.described.config.corrected for one in candidates):
+        fractions = ()  # every fraction is the same map
     named = split_list(flags.frames)
     data = open_frames(dataset, named, flags.scenes, candidates[0].camera, flags.choices())
     if flags.out is not None:
         with writing(flags.out):
             flags.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(data, candidates, show, named=bool(named))
-    runs = _judge_frames(flags, data, candidates, jobs.frames, show)
+    runs = _judge_frames(flags, fractions, data, candidates, jobs.frames, show)
     content = {
         "dataset": data.law,
         "weights": [
@@ -89,6 +91,7 @@ def evaluate_weights(
 
 def _judge_frames(
     flags: EvaluateFlags,
+    fractions: Sequence[float],
     data: TrainingData,
     candidates: Sequence[Candidate],
     frames: dict[str, tuple[int, ...]],
@@ -106,7 +109,7 @@ def _judge_frames(
             if index not in loaded:
                 loaded[index] = load_weights(one.path).on(device)
             frame = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
-            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], flags.parts, flags.seed)
+            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], fractions, flags.seed)
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 
@@ -131,12 +134,12 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
 
 def _sentence(brief: dict[str, Any], named: str) -> str:
     """Return what to know first: the weights, the best plain classifier, and the cost of each."""
-    costs = {
-        name: f"mIoU {format_points(one['miou'])} for {format_count(one['multiply_adds_a_pixel'])} multiply-adds a pixel"
+    found = {
+        name: f"{format_points(one['miou'])} ({format_count(one['multiply_adds_a_pixel'])} multiply-adds a pixel)"
         for name, one in brief.items()
     }
-    peer = f"; the best plain classifier of single pixels: {costs[PLAIN]}" if PLAIN in costs else ""
-    return f"{named}: {costs['weights']}{peer}"
+    peer = f", the best plain classifier of single pixels {found[PLAIN]}" if PLAIN in found else ""
+    return f"mIoU: {named} {found['weights']}{peer}"
 
 
 def _accuracy(content: dict[str, Any]) -> Table:

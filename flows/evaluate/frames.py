@@ -83,7 +83,8 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     for one in found[1:]:
         # a fold may lack a class, or have another mixture
         configs = [
-            replace(of.described.config, untaught=(), parts=(), components=(0, 0), corrected=True) for of in (one, first)
+            replace(of.described.config, untaught=(), parts=(), components=(0, 0), corrected=True)
+            for of in (one, first)
         ]
         alike = configs[0] == configs[1] and one.camera == first.camera
         if not alike or one.described.class_names != first.described.class_names:
