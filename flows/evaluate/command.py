@@ -13,7 +13,6 @@ from rich.table import Table
 
 from spectralzoom.flows.evaluate.frames import Candidate, observe_frame, open_candidates, open_frames, sort_frames
 from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, seeds_of, summarise
-from spectralzoom.flows.settings.flags import split_list
 from spectralzoom.flows.settings.model_flags import EvaluateFlags
 from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from spectralzoom.flows.terminal.processes import writing
@@ -57,12 +56,11 @@ def evaluate_weights(
     candidates = open_candidates(flags.weights)
     if not any(one.described.config.corrected for one in candidates):
         fractions = ()  # every fraction is the same map
-    named = split_list(flags.frames)
-    data = open_frames(dataset, named, flags.scenes, candidates[0].camera, flags.choices())
+    data = open_frames(dataset, flags.frames, flags.scenes, candidates[0].camera, flags.choices())
     if flags.out is not None:
         with writing(flags.out):
             flags.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
-    jobs = sort_frames(data, candidates, show, named=bool(named))
+    jobs = sort_frames(data, candidates, show, named=bool(flags.frames))
     runs = _judge_frames(flags, fractions, data, candidates, jobs.frames, show)
     content = {
         "dataset": data.law,

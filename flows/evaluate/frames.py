@@ -39,6 +39,9 @@ VALIDATED = (
     "the training chose reading, calibration and thresholds by {names}: scores of these validation frames may be too"
     " good; --frames names others"
 )
+TAUGHT = (
+    "trained pixels are left out of {names}: the other labelled ones are judged, which are no forecast for other scenes"
+)
 
 
 @dataclass(frozen=True)
@@ -152,8 +155,8 @@ def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]
         for at, one in enumerate(weights)
         if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
     )
-    masks = [weights[at].split.get("pixels", {}).get(scene.key) for at in fit]  # packed; None: all pixels
-    if other := next((at for at, mask in zip(fit, masks, strict=True) if mask != masks[0]), None):
+    left = [judged_labels(scene, weights[at].described) for at in fit]
+    if other := next((at for at, labels in zip(fit, left, strict=True) if not np.array_equal(labels, left[0])), None):
         both = f"{weights[other].path} and {weights[fit[0]].path}"
         raise SettingsError(f"{both} were trained on different pixels of {scene.name}; evaluate them separately")
     return fit
@@ -180,6 +183,8 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
         jobs.frames[name] = fit
         if any(weights[at].validated_on(scene) for at in fit):
             notes[VALIDATED].append(name)
+        if any(seen_in_training(scene, weights[at].described) for at in fit):
+            notes[TAUGHT].append(name)
         notes.add(name, scene)
         labels = judged_labels(scene, weights[fit[0]].described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
@@ -187,8 +192,8 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
     if jobs.left_out and (named or not jobs.frames):
         raise SceneError(
             f"no weights are left for {', '.join(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
-            "trained on it, and frames trained on are refused: judge by others, or train with some held out: "
-            "spectralzoom train ... --hold-out NAMES"
+            "trained on these labels, and frames trained on are refused: judge by other frames, or by other labelled "
+            "pixels of them, or train with some held out: spectralzoom train ... --hold-out NAMES"
         )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {data.law} to judge by")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
+from pydantic import BeforeValidator
 
 from spectralzoom.flows.settings.documents import about, toml_value
 from spectralzoom.flows.settings.load import FLAGS, SURVEY, TABLES
@@ -23,6 +24,18 @@ Scheduler = Annotated[
     str, Parameter(help="Worker pool: `threads`, `processes`, or the address of a dask scheduler, tcp://host:port.")
 ]
 Workers = Annotated[int | None, Parameter(help="Number of workers; default: one per core.")]
+
+
+def split_list(text: str | None) -> tuple[str, ...]:
+    """Return the parts of a list with commas."""
+    return tuple(part.strip() for part in str(text).split(",") if part.strip()) if text else ()
+
+
+Names = Annotated[  # with commas, one a flag, or both
+    tuple[str, ...],
+    Parameter(negative="", converter=lambda _, tokens: split_list(",".join(token.value for token in tokens))),
+    BeforeValidator(split_list),
+]
 IN_TABLES = {flag: setting for setting, flag in FLAGS.items()}
 _IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
 _DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_TABLES.items()}
@@ -67,11 +80,6 @@ def check_outside(out: Path, root: Path) -> Path:
     if folder.is_relative_to(root.resolve()):
         raise SettingsError(f"--out {folder} lies in the archive, where nothing else belongs; choose another folder")
     return folder
-
-
-def split_list(text: str | None) -> tuple[str, ...]:
-    """Return the parts of a list with commas."""
-    return tuple(part.strip() for part in str(text).split(",") if part.strip()) if text else ()
 
 
 def parse_numbers(text: str | None, flag: str) -> list[float] | None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from spectralzoom.flows.settings.flags import OutFolder, parse_numbers, parse_wholes, split_list
+from spectralzoom.flows.settings.flags import Names, OutFolder, parse_numbers, parse_wholes
 from spectralzoom.models.network.machine import PROCESSOR, Device
 from spectralzoom.models.training.train import TrainingSettings
 from spectralzoom.pipeline.errors import SettingsError
@@ -59,7 +59,7 @@ class TrainFlags(SceneFlags):
     Parameters
     ----------
     hold_out
-        Names of scenes to exclude from training, with commas: 059,060. The weights record the split.
+        Names of scenes to exclude from training, with commas (059,060) or one a flag. The weights record the split.
     validation
         Number of validation scenes. Default: 3 built-in scenes, or one in eight of a folder, at most 4.
     steps
@@ -69,9 +69,9 @@ class TrainFlags(SceneFlags):
     patch
         Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
     start
-        Weights from which the training starts. Bands, classes and sizes must be theirs, and DATASET must contain the
-        scenes that they know. The result is the mean of both networks, or the trained one where it reads the
-        validation scenes better.
+        For built-in scenes: weights from which the training starts. Bands, classes and sizes must be theirs, and
+        DATASET must contain the scenes that they know. The result is the mean of both networks, or the trained one
+        where it reads the validation scenes better.
     learning_rate
         Highest learning rate. Default: 0.0015, or a third of it with --start.
     train_temporal
@@ -91,13 +91,9 @@ class TrainFlags(SceneFlags):
     min_exposure_ms
         Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
         1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
-    train_mask
-        For one scene: mask image of the training pixels; 0 excludes a pixel.
-    mask_classes
-        For one scene: classes of the label file that the mask's numbers 1, 2, ... stand for, with commas.
     """
 
-    hold_out: str | None = None
+    hold_out: Names = ()
     validation: int | None = None
     steps: int = TrainingSettings.steps
     minutes: float = TrainingSettings.minutes
@@ -111,13 +107,10 @@ class TrainFlags(SceneFlags):
     crop: int = TrainingSettings.crop
     batch: int = TrainingSettings.batch
     min_exposure_ms: float = TrainingSettings.darkest_ms
-    train_mask: str | None = None
-    mask_classes: str | None = None
 
     def choices(self) -> dict[str, Any]:
-        """Return the choices of files, bands and masks of one scene. Raises SettingsError: numbers are invalid."""
-        masks = {"train_mask": self.train_mask, "mask_classes": parse_wholes(self.mask_classes, "--mask-classes")}
-        return super().choices() | masks | {"hold_out": split_list(self.hold_out)}
+        """Return the choices of files and bands, and the held-out scenes. Raises SettingsError: invalid numbers."""
+        return super().choices() | {"hold_out": self.hold_out}
 
     @property
     def settings(self) -> TrainingSettings:
@@ -142,13 +135,13 @@ class EvaluateFlags(SceneFlags):
     fractions
         Fractions of the patches to read at full resolution, with commas; none and all are always included.
     frames
-        Names of the frames, with commas. Default: all.
+        Names of the frames, with commas or one a flag. Default: all.
     """
 
     weights: Annotated[tuple[Path, ...], Parameter(negative="")] = ()
     out: OutFolder = None
     fractions: str = "0.05,0.1,0.15,0.2,0.35"
-    frames: str | None = None
+    frames: Names = ()
 
     @property
     def parts(self) -> tuple[float, ...]:

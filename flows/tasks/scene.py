@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -264,40 +265,38 @@ def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
 
     Files are identified by their content, not by name or by the bands that are read.
     """
-    split = weights.record.get("split", {})
-    if scene.clear_key in split.get("pixels", {}):
-        return "other pixels"
-    known = scene.clear_key in split.get("train", {}).values() or bool({*scene.content} & {*split.get("content", ())})
-    return "all" if known else None
+    taught = _taught_pixels(scene, weights)
+    if taught is None:
+        return "all" if scene.clear_key in weights.record.get("split", {}).get("train", {}).values() else None
+    return "all" if scene.labels is None or taught[scene.labels != UNLABELLED].all() else "other pixels"
+
+
+def _taught_pixels(scene: RasterScene, weights: Description) -> NDArray[np.bool_] | None:
+    """Return the pixels (y, x) of a file whose labels the weights were trained on; None for another file."""
+    known = weights.record.get("split", {}).get("content", {})
+    packed = next((known[one] for one in scene.content if one in known), None)
+    if packed is None:
+        return None
+    bits = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8)
+    return np.unpackbits(bits, count=math.prod(scene.shape)).reshape(scene.shape).astype(bool)
 
 
 def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
-    """Return labels in the order of the weights' classes, without pixels of their training."""
+    """Return labels in the order of the weights' classes; trained pixels are left out where there are others."""
     if scene.labels is None:
         return None
     order = np.full(256, UNLABELLED, np.uint8)
     order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
     # `order[labels]` would take eight bytes a pixel more
     labels = np.frombuffer(bytearray(scene.labels.data).translate(order.tobytes()), np.uint8).reshape(scene.shape)
-    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.clear_key)
-    if trained is not None:
-        bits = np.unpackbits(_packed_bits(trained), count=labels.size)
-        labels[bits.reshape(labels.shape).astype(bool)] = UNLABELLED
+    if seen_in_training(scene, weights) == "other pixels":
+        labels[_taught_pixels(scene, weights)] = UNLABELLED
     return labels
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:
     """Encode a mask for the record of weights: bits, deflated, base64."""
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
-
-
-def masks_contain(mask: str, other: str | None) -> bool:
-    """Return whether a mask of `pack_mask` contains all pixels of another one; None, every pixel, is in no mask."""
-    return other is not None and not (_packed_bits(other) & ~_packed_bits(mask)).any()
-
-
-def _packed_bits(text: str) -> NDArray[np.uint8]:
-    return np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
 
 
 class FieldSource:

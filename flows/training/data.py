@@ -1,11 +1,11 @@
-"""Open the data of `spectralzoom train`: the built-in farm, a folder of labelled scenes, or one scene with a mask."""
+"""Open the data of `spectralzoom train`: the built-in farm, a folder of labelled scenes, or one scene."""
 
 from __future__ import annotations
 
 import os
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from spectralzoom.storage.readers.label_files import (
     scene_entries,
     scene_number,
 )
-from spectralzoom.storage.readers.labels import load_codes
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
@@ -65,8 +64,6 @@ class DataSet:
     files: dict[str, str]  # name -> file (or FILE:ARRAY)
     held_out: tuple[str, ...] = ()
     choices: Mapping[str, Any] = field(default_factory=dict)  # of `load_scene_file`
-    train_mask: str | Path | None = None
-    mask_classes: tuple[int, ...] | None = None
     label_files: Mapping[str, Path] = field(default_factory=dict)  # by name of the scene
     alone: tuple[Path, ...] = ()  # label files without a scene
 
@@ -91,90 +88,36 @@ class DataSet:
             return {}
         return classes_of_files(tuple(self.label_files.values()), settings)
 
-    def load(self, name: str, *, training: bool = False) -> SceneFile:
-        """Read one scene by its name with all labels, or for ``training`` with those inside of the mask.
-
-        Raises SceneError, WavelengthError: as `load_scene_file`.
-        """
+    def load(self, name: str) -> SceneFile:
+        """Read one scene by its name. Raises SceneError, WavelengthError: as `load_scene_file`."""
         labels = {"labels": self.label_files.get(name), **self.choices}
-        scene = load_scene_file(self.files[name], classes=self.classes, **labels)
-        if not training or self.train_mask is None:
-            return scene
-        inside = labels_of_training(scene, self.train_mask, self.mask_classes)
-        provenance = (*scene.provenance, f"labels inside {self.train_mask}: training")
-        return replace(scene, labels=inside, provenance=provenance)
+        return load_scene_file(self.files[name], classes=self.classes, **labels)
 
 
-def load_data_set(
-    path: str | Path,
-    *,
-    hold_out: Sequence[str] = (),
-    train_mask: str | Path | None = None,
-    mask_classes: Sequence[int] | None = None,
-    **choices: Any,
-) -> DataSet:
+def load_data_set(path: str | Path, *, hold_out: Sequence[str] = (), **choices: Any) -> DataSet:
     """List the scenes of a folder (``images/`` in it, or the files themselves) or of one file, without reading them.
 
     ``choices`` are labels, bands and wavelengths of `load_scene_file`; None is no choice.
     """
     choices = {name: value for name, value in choices.items() if value is not None}
-    files, label_files, alone = _scenes(path, train_mask)
+    files, label_files, alone = _scenes(path)
     if unknown := [name for name in hold_out if name not in files]:
         raise SceneError(f"{path} has no scene {', '.join(unknown)} to hold out; it has {', '.join(files)}")
     if len(set(hold_out)) == len(files):
         raise SceneError(f"{path}: all {len(files)} scenes are held out, which leaves none to train on; hold out fewer")
-    if len(files) > 1 and (train_mask is not None or "labels" in choices):
-        raise SceneError(f"{path} has {len(files)} scenes; one file of labels or one mask fits a single scene only")
-    if mask_classes is not None and train_mask is None:
-        raise SceneError("mask classes are given without a training mask; give both or neither")
+    if len(files) > 1 and "labels" in choices:
+        raise SceneError(f"{path} has {len(files)} scenes; one file of labels fits a single scene only")
     return DataSet(
         path=Path(path),
         files=files,
         held_out=tuple(name for name in files if name in set(hold_out)),
         choices=choices,
-        train_mask=train_mask,
-        mask_classes=None if mask_classes is None else tuple(mask_classes),
         label_files={} if "labels" in choices else label_files,
         alone=alone,
     )
 
 
-def labels_of_training(
-    scene: SceneFile, train_mask: str | Path, mask_classes: Sequence[int] | None
-) -> NDArray[np.uint8]:
-    """Return the labels with the mask's class, or under a mask of one number, (y, x), 255 elsewhere."""
-    if scene.labels is None:
-        raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
-    mask = load_codes(train_mask, scene.geobox).values
-    if mask.shape != scene.labels.shape:
-        sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
-        raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x); give one of its size")
-    highest = int(mask.max(initial=0))
-    if mask_classes is None and ((mask < 1) | (mask == highest)).all():
-        return np.where(mask > 0, scene.labels, np.uint8(UNLABELLED))
-    numbers = {value: index for index, value in enumerate(scene.class_values) if isinstance(value, int)}
-    if not numbers:
-        raise SceneError(f"{scene.path} has classes by colour; a mask of classes needs numbers; give a mask of 0 and 1")
-    classes = range(1, highest + 1) if mask_classes is None else mask_classes  # a range: a stray number may be huge
-    if highest > len(classes):
-        raise SceneError(f"mask {train_mask} goes up to {highest}, but only {len(classes)} mask classes are given")
-    unknown = next((number for number in classes[:highest] if number not in numbers), None)
-    if unknown is not None:
-        raise SceneError(
-            f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
-        )
-    index = np.array([UNLABELLED, *(numbers[number] for number in classes[:highest])], np.uint8)
-    trains = scene.labels == index[np.maximum(mask, 0)]
-    named = (mask > 0) & (scene.labels != UNLABELLED)
-    if named.any() and (agree := trains[named].mean()) < 0.5:
-        known = f"mask {train_mask} has the class of the labels in {agree:.0%} of its pixels"
-        raise SceneError(f"{known}; give mask classes: the labels' number of each number of the mask, from 1 on")
-    return np.where(trains, scene.labels, np.uint8(UNLABELLED))
-
-
-def _scenes(
-    path: str | Path, train_mask: str | Path | None
-) -> tuple[dict[str, str], dict[str, Path], tuple[Path, ...]]:
+def _scenes(path: str | Path) -> tuple[dict[str, str], dict[str, Path], tuple[Path, ...]]:
     """Return the files and the label files of scenes by their names, and label files without a scene."""
     file, _ = split_variable(path)
     if not file.is_dir() or is_store(file):
@@ -183,20 +126,17 @@ def _scenes(
         return {file.stem: str(path)}, {}, ()
     folder = image_folder(file)
     settings = find_scene_settings(folder / SETTINGS_NAME)
-    masks = () if train_mask is None else (split_variable(train_mask)[0].resolve(),)
     found = match_folder(folder) if settings.labels is None else _match_by_settings(folder, settings)
-    images = [image for image in found.images if image.resolve() not in masks]
-    if not images:
+    if not found.images:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"
             f"{folders_within(folder)}"
         )
-    names = _names(images)
-    labels = {image: label for image, label in found.labels.items() if label.resolve() not in masks}
+    names = _names(found.images)
     return (
         {name: str(image) for name, image in names.items()},
-        {name: labels[image] for name, image in names.items() if image in labels},
-        tuple(one for one in found.alone if one.resolve() not in masks),
+        {name: found.labels[image] for name, image in names.items() if image in found.labels},
+        found.alone,
     )
 
 
@@ -238,7 +178,7 @@ class TrainingData:
             seed, day, hour = read_farm_name(name)
             law = SCOUTING_LAW if name.startswith(_SCOUTED) else FARM_LAW
             return built_in_scene(law, seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
-        return scene_of_file(self.files.load(name, training=True), self.camera)
+        return scene_of_file(self.files.load(name), self.camera)
 
 
 def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:

@@ -1,4 +1,4 @@
-"""Judge new weights on validation scenes: placements, cascade, uniform scans and baselines."""
+"""Judge new weights on validation scenes: placements, cascade and uniform scans."""
 
 from __future__ import annotations
 

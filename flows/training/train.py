@@ -13,10 +13,8 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from torch import Tensor
 
 from spectralzoom.flows.settings.model_flags import TrainFlags
-from spectralzoom.flows.tasks.scene import masks_contain
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
 from spectralzoom.flows.training import figures
 from spectralzoom.flows.training.data import (
@@ -38,7 +36,7 @@ from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
 from spectralzoom.models.training.mixture import fit_mixture
-from spectralzoom.models.training.train import LabelledPixels, continued, halfway, linear_classifier, scaled, train
+from spectralzoom.models.training.train import LabelledPixels, halfway, linear_classifier, scaled, train
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
@@ -77,6 +75,10 @@ def train_weights(
     check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
     flags = request.flags
+    if flags.start is not None and not built_in_laws(request.dataset):
+        raise SettingsError(
+            "--start is for built-in scenes; training on files takes seconds: train anew on all of them together"
+        )
     begun = None if flags.start is None else load_weights(flags.start)
     device = choose_device(flags.device)
     settings = flags.settings
@@ -166,22 +168,12 @@ def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], N
 def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
     """Raise SettingsError unless a training can start from these weights.
 
-    Bands, classes and sizes must be theirs, and the training must contain the pixels that they know, by the content of
-    the scenes. So none of these pixels judges the result, and the record names them all.
+    Bands, classes and sizes must be theirs, and the training must contain the scenes that they know: its record names
+    them all.
     """
-    if begun.class_names != scenes.common.names:
-        both = [", ".join(names) for names in (begun.class_names, scenes.common.names)]
-        raise SettingsError(
-            f"--start {request.flags.start}: its classes are {both[0]}, those of {request.dataset} are {both[1]};"
-            " give the same classes in the same order, in scene.toml"
-        )
-    split = begun.record.get("split", {})
-    known = set(split.get("train", {}).values())
-    masks = split.get("pixels", {})
-    now = scenes.train
     for what, kept in {
-        "training scenes": known <= set(now.keys.values()),
-        "training pixels": all(masks_contain(now.pixels[key], masks.get(key)) for key in known & now.pixels.keys()),
+        "classes": (begun.class_names, begun.config.untaught) == (scenes.common.names, scenes.untaught),
+        "training scenes": {*begun.record.get("split", {}).get("train", {}).values()} <= {*scenes.train.keys.values()},
         "bands": begun.basis == scenes.common.basis,
         "sizes of the network": replace(begun.config, untaught=()) == network_config(request.flags, scenes.common),
     }.items():
@@ -222,8 +214,6 @@ class Learner:
         rng = np.random.default_rng([0x1DA])
         pixels = LabelledPixels.drawn(examples, rng, self.augmentation).brightened(self.normalisation.gain_shift, rng)
         start = linear_classifier(pixels, self.config.classes) | (load_encoder() if self.config.deep else {})
-        if begun is not None:
-            begun = replace(begun, segmenter=continued(begun.segmenter, self.config, start))
         model, summary = self._trained(self.config, start if begun is None else begun.segmenter.state_dict())
         if begun is not None:
             model = self._better({"trained": model, "mean with --start": halfway(begun.segmenter, model)})[0]
@@ -265,7 +255,7 @@ class Learner:
             found[CALIBRATION] = figures.judge_calibration(weights, frames, self.request.flags.settings.seed)
         return found
 
-    def _trained(self, config: SegmenterConfig, start: Mapping[str, Tensor]) -> tuple[Segmenter, dict[str, Any]]:
+    def _trained(self, config: SegmenterConfig, start: Mapping[str, Any]) -> tuple[Segmenter, dict[str, Any]]:
         return train(
             config,
             self.scenes.train.examples,
@@ -333,7 +323,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
         show_text(f"mIoU of the validation scenes: {shown}", console)
     judged = record["validation"]
     if judged is None:
-        left = built_in_laws(request.dataset) or request.flags.hold_out or request.flags.train_mask is not None
+        left = built_in_laws(request.dataset) or request.flags.hold_out
         on = request.dataset if left else "OTHER_SCENES"
         command = shlex.join(["spectralzoom", "evaluate", on, "--weights", str(request.out)])
         more = "" if left or len(record["split"]["train"]) < 2 else "; or train with some held out: --hold-out NAMES"

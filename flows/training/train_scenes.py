@@ -73,8 +73,7 @@ class Imaged:
 
     examples: list[Example] = field(default_factory=list)
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
-    content: list[str] = field(default_factory=list)  # hashes of the scenes' files
-    pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+    content: dict[str, str] = field(default_factory=dict)  # hash of a scene's file -> its labelled pixels
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class Scenes:
     def split(self) -> dict[str, Any]:
         """Return the record by which an evaluation tells scenes and pixels of the training."""
         one = self.train
-        return {"train": one.keys, "content": one.content, "validation": self.validation.keys, "pixels": one.pixels}
+        return {"train": one.keys, "content": one.content, "validation": self.validation.keys}
 
     def normalised(self, normalisation: Normalisation) -> Scenes:
         """Normalise the scenes; their basis spans their bands and reaches every column."""
@@ -142,9 +141,7 @@ def _imaged(
             notes[UNFIT].append(name)
             continue
         found.keys[name] = scene.key
-        found.content.extend(scene.content)
-        if request.flags.train_mask is not None:
-            found.pixels[scene.key] = pack_mask(mask)
+        found.content.update(dict.fromkeys(scene.content, pack_mask(mask)))
         notes.add(name, scene)
         grid = SceneGrid(*scene.shape, common.patch)
         rng = np.random.default_rng([request.flags.seed, stream, number])

@@ -140,7 +140,8 @@ def multiply_adds(
     rows, columns = (-(-size // TOKEN_PX) for size in grid.padded_shape)
     tokens = rows * columns
     pixels = math.prod(grid.padded_shape)
-    base = pixels * (bands * config.columns + base_multiply_adds(config))
+    classified = tokens * TOKEN_PX**2 if config.corrected else pixels  # the networks read whole tokens
+    base = pixels * bands * config.columns + classified * base_multiply_adds(config)
     if not config.corrected:
         return MultiplyAdds(base, score, 0)
     inputs = config.columns + PLANES

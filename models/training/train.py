@@ -25,10 +25,10 @@ from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memor
 from spectralzoom.models.network.segmenter import Segmenter
 from spectralzoom.models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example, labelled_classes, untaught_classes
+from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example, untaught_classes
 from spectralzoom.models.training.objective import PHASES, batch_loss, class_weights
 from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
-from spectralzoom.pipeline.errors import PipelineError, SceneError
+from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 KEEP_EVERY_S = 120.0  # between checkpoints
@@ -222,7 +222,6 @@ class LabelledPixels:
     ) -> LabelledPixels:
         """Draw labelled pixels at random, about `PIXELS`, from each scene in proportion to its number.
 
-        A class that is too rare to be drawn has all its pixels of one scene.
         With an ``augmentation`` scenes are captured as crops are. A classifier of bright pixels has large logits, and
         a training unlearns its errors on dark pixels for thousands of steps.
         """
@@ -237,11 +236,6 @@ class LabelledPixels:
             places = np.flatnonzero(example.labels != UNLABELLED)
             places = np.sort(rng.choice(places, min(count, math.ceil(count * fraction)), replace=False))
             features.append(_means_around(columns.numpy())[places])
-            labels.append(example.labels.ravel()[places])
-        for number in sorted(labelled_classes(examples) - {*np.unique(np.concatenate(labels)).tolist()}):
-            example = next(one for one in examples if (one.labels == number).any())
-            places = np.flatnonzero(example.labels == number)
-            features.append(_means_around(example.columns.astype(np.float32))[places])
             labels.append(example.labels.ravel()[places])
         return LabelledPixels(np.concatenate(features), np.concatenate(labels))
 
@@ -262,14 +256,9 @@ def linear_classifier(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]
 
     Its logits are the means of those of linear discriminants with shrinkage and of a logistic regression. They are 0
     for a class without a pixel, which the segmenter masks (`SegmenterConfig.untaught`), and with a single class.
-    Raises SceneError: there are as few pixels as classes.
     """
     weight, bias = np.zeros((classes, pixels.features.shape[1])), np.zeros(classes)
     known = np.unique(pixels.labels)
-    if 1 < len(known) >= len(pixels.labels):
-        raise SceneError(
-            f"{len(pixels.labels)} labelled pixels of {len(known)} classes are too few; label more of each"
-        )
     if len(known) > 1:
         for classifier in LINEAR:
             with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a class of one pixel
@@ -339,17 +328,6 @@ def train(
         drawn = (trainer.sampler.draw(settings.batch, trainer.rng, gain_shift).image for _ in range(NORM_BATCHES))
         torch.optim.swa_utils.update_bn(drawn, trainer.averaged.overview_stem)
     return trainer.averaged.to(PROCESSOR), trainer.summary()
-
-
-def continued(segmenter: Segmenter, config: SegmenterConfig, start: Mapping[str, Tensor]) -> Segmenter:
-    """Return a copy with the taught classes of ``config``; new ones begin as those of a linear classifier ``start``."""
-    begun = copy.deepcopy(segmenter)
-    begun.config = config
-    new = sorted({*segmenter.config.untaught} - {*config.untaught})
-    with torch.no_grad():
-        for name, own in begun.spectral.named_parameters():
-            own[new] = start[f"spectral.{name}"][new]
-    return begun
 
 
 def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:

@@ -27,9 +27,8 @@ from spectralzoom.models.reading.prior_map import (
     in_classes,
     pooled,
 )
-from spectralzoom.models.training.examples import Example
 from spectralzoom.models.training.objective import map_loss, pixel_losses
-from spectralzoom.models.training.train import LabelledPixels, continued, halfway, linear_classifier, with_linear
+from spectralzoom.models.training.train import halfway, scaled
 from spectralzoom.models.weights.files import Weights, with_record
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.storage.arrays.class_maps import (
@@ -39,7 +38,7 @@ from spectralzoom.storage.arrays.class_maps import (
     packed_probabilities,
     write_probabilities_tile,
 )
-from tests.models.conftest import make_network, make_weights, scene_columns
+from tests.models.conftest import make_weights, scene_columns
 
 CLASSES = 4
 NEVER = st.sets(st.integers(0, CLASSES - 1), min_size=1, max_size=CLASSES - 1).map(sorted).map(tuple)
@@ -63,14 +62,9 @@ def _check(log_probability: np.ndarray, untaught: tuple[int, ...]) -> None:
     np.testing.assert_allclose(chance.sum(axis=-1), 1, atol=1e-4)
 
 
-def _linear(network: torch.nn.Module) -> dict[str, torch.Tensor]:
-    return {f"spectral.{name}": torch.randn_like(own) for name, own in network.spectral.named_parameters()}
-
-
 MIXTURES: dict[str, Callable[[Weights, Weights], Weights]] = {
     "network": lambda one, other: one,
-    "linear": lambda one, other: replace(one, segmenter=with_linear(one.segmenter, _linear(one.segmenter), 0.0)),
-    "both": lambda one, other: replace(one, segmenter=with_linear(one.segmenter, _linear(one.segmenter), 0.5)),
+    "half of it": lambda one, other: replace(one, segmenter=scaled(one.segmenter, 0.5)),
     "halfway": lambda one, other: replace(one, segmenter=halfway(other.segmenter, one.segmenter)),
     "temperature": lambda one, other: with_record(one, calibration={"temperature": 5.0}),
 }
@@ -168,27 +162,6 @@ def test_crops_without_a_label_have_no_loss_of_untaught_classes() -> None:
     loss = map_loss(masked, pixel_losses(masked, labels), labels, torch.ones(3), soft_dice=True)
     loss.backward()
     assert (loss.item(), logits.grad.abs().max().item()) == (0.0, 0.0)
-
-
-def test_a_class_that_continued_training_adds_begins_as_the_linear_classifier() -> None:
-    """The classes that both know keep their weights."""
-    before = make_network(untaught=(1,))
-    start = _linear(before)
-    begun = continued(before, replace(before.config, untaught=(2,)), start)
-    assert torch.equal(begun.spectral.weight[1], start["spectral.weight"][1])
-    assert torch.equal(begun.spectral.weight[[0, 2]], before.spectral.weight[[0, 2]])
-    assert (before.config.untaught, begun.config.untaught) == ((1,), (2,))
-
-
-def test_a_class_of_one_pixel_among_many_is_taught() -> None:
-    """Random pixels would miss it; without it the linear classifier has no logit for it."""
-    labels = np.zeros((400, 400), np.uint8)
-    labels[:200], labels[7, 7] = 1, 2
-    values = np.random.default_rng(0).normal(0, 1, (400, 400, 2)) + labels[..., None]
-    example = Example("e", values.astype(np.float16), labels, labels.shape)
-    pixels = LabelledPixels.drawn([example], np.random.default_rng(1))
-    assert {*np.unique(pixels.labels)} == {0, 1, 2}
-    assert linear_classifier(pixels, 3)["spectral.weight"][2].any()
 
 
 @pytest.mark.parametrize("untaught", [(3,), (-1,), (0, 1, 2)])

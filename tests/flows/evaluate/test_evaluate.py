@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rich.console import Console
 
 from spectralzoom.flows.cli.main import main
@@ -26,8 +27,9 @@ from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.simulator.render import USUAL
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.flows.evaluate.conftest import Judged
-from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
 
 
@@ -56,7 +58,7 @@ def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Trained weights are judged on the frames that were held out or kept for validation."""
-    quick = TrainFlags(hold_out="003", validation=1, patch=8, dim=16, steps=1, batch=1, crop=16)
+    quick = TrainFlags(hold_out=("003",), validation=1, patch=8, dim=16, steps=1, batch=1, crop=16)
     out = tmp_path / "w.safetensors"
     train_weights(TrainRequest(str(data), out, quick))
     split = load_weights(out).record["split"]
@@ -69,9 +71,14 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["left_out"] == sorted(split["train"])
     with pytest.raises(SceneError, match="frames trained on are refused"):
-        evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=",".join(split["train"])))
+        evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=tuple(split["train"])))
     with pytest.raises(SceneError, match=rf"no weights are left for {next(iter(split['train']))}: "):
-        evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=",".join(FRAMES)))
+        evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=FRAMES))
+
+
+def _content(scene: RasterScene, trained: np.ndarray) -> dict[str, str]:
+    """Return the record of a training on these pixels of a scene."""
+    return dict.fromkeys(scene.content, pack_mask(trained))
 
 
 def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
@@ -85,7 +92,7 @@ def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
     assert sum(content["support"].values()) == 3 * 24 * 40
     assert content["seeds"] == [["a.safetensors", "b.safetensors"]]
     assert content["rows"][0]["spread"] is None
-    alone = evaluate_weights(str(data), EvaluateFlags(weights=(first, second), frames="001", **QUICK))
+    alone = evaluate_weights(str(data), EvaluateFlags(weights=(first, second), frames=("001",), **QUICK))
     assert [weights["covers"] for weights in alone["weights"]] == [[], ["001"]]
 
 
@@ -105,39 +112,39 @@ def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path
 
 
 def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Path, tmp_path: Path):
-    """Their training masks differ, so they would be judged on different pixels of one frame."""
+    """They would be judged on different pixels of one frame; weights of the same pixels are judged on the others."""
     scene = scene_at(data)
     halves = [np.zeros(scene.shape, bool) for _ in range(2)]
     halves[0][:12] = True
     halves[1][12:] = True
     paths = [
-        write_weights(
-            tmp_path / f"{number}.safetensors",
-            number,
-            split={"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(half)}},
-        )
+        write_weights(tmp_path / f"{number}.safetensors", number, split={"content": _content(scene, half)})
         for number, half in enumerate((halves[0], halves[1], halves[0]))
     ]
     with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
-        evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[1]), frames="001", **QUICK))
-    content = evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[2]), frames="001", **QUICK))
+        evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[1]), frames=("001",), **QUICK))
+    content = evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[2]), frames=("001",), **QUICK))
     assert sum(content["support"].values()) == 12 * 40
+    assert any(note.startswith("trained pixels are left out of 001: ") for note in content["data_notes"])
 
 
 def test_training_frames_are_recognised_in_other_bands(data: Path, tmp_path: Path):
     """The content of the files identifies a frame, not the bands that are read."""
-    split = {"train": {"001": "of other bands"}, "content": list(scene_at(data).content)}
+    scene = scene_at(data)
+    split = {"train": {"001": "of other bands"}, "content": _content(scene, np.ones(scene.shape, bool))}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
     assert evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))["left_out"] == ["001"]
 
 
-def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
-    """The training mask took every label, so no labelled pixel is left to judge."""
-    scene = scene_at(data)
-    split = {"train": {"001": scene.key}, "pixels": {scene.key: pack_mask(np.ones(scene.shape, bool))}}
-    weights = (write_weights(tmp_path / "w.safetensors", split=split),)
+def test_frames_without_a_label_are_refused(tmp_path: Path):
+    """No labelled pixel is left to judge."""
+    data = write_field(tmp_path / "field")
+    Image.fromarray(np.full((24, 40, 3), 9, np.uint8)).save(data / "annotations" / "001_annotation.png")
+    toml = data / "scene.toml"
+    toml.write_text("unlabelled = [9, 9, 9]\n" + toml.read_text())
+    weights = (write_weights(tmp_path / "w.safetensors"),)
     with pytest.raises(SceneError, match="no labelled pixel is left on the 1 frames"):
-        evaluate_weights(str(data), EvaluateFlags(weights=weights, frames="001", **QUICK))
+        evaluate_weights(str(data), EvaluateFlags(weights=weights, frames=("001",), **QUICK))
 
 
 def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
@@ -160,7 +167,7 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     kept: list[bool] = []
     monkeypatch.setattr("spectralzoom.flows.evaluate.command.keep_freed_memory", lambda: kept.append(True))
     weights = (write_weights(tmp_path / "w.safetensors"),)
-    flags = EvaluateFlags(weights=weights, frames="001", **QUICK)
+    flags = EvaluateFlags(weights=weights, frames=("001",), **QUICK)
     row = run_evaluate(str(data), flags, Console(stderr=True))["rows"][0]
     assert kept == [True]
     loaded = load_weights(weights[0])
@@ -230,7 +237,7 @@ def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.Mo
         ({"fractions": "10"}, "--fractions are fractions of the patches from 0 to 1"),
         ({"seed": -1}, "--seed must be at least 0"),
         ({"scenes": 2}, "--scenes is for built-in scenes"),
-        ({"frames": "099"}, "has no frame 099; it has 001, 002, 003"),
+        ({"frames": ("099",)}, "has no frame 099; it has 001, 002, 003"),
     ],
 )
 def test_invalid_requests_are_refused(data: Path, tmp_path: Path, change: dict[str, Any], words: str):

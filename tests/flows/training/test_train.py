@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,23 +18,23 @@ from PIL import Image
 from rich.console import Console
 
 from spectralzoom.flows.cli.main import main
+from spectralzoom.flows.evaluate.command import evaluate_weights
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.model_flags import TrainFlags
+from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.training import figures, train_scenes
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
-from spectralzoom.flows.training.figures import judge_baselines
 from spectralzoom.flows.training.train import run_train, train_weights
-from spectralzoom.flows.training.train_scenes import Common, TrainRequest, network_config, suggested_patch
+from spectralzoom.flows.training.train_scenes import Common, Imaged, TrainRequest, network_config, suggested_patch
 from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.network.spectral import SpectralBasis
 from spectralzoom.models.policies.placement import ReadTwice
-from spectralzoom.models.training.examples import Example
 from spectralzoom.models.weights.files import TrainedOn, describe_weights, load_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.simulator.render import USUAL
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
@@ -47,33 +49,26 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), NUMBERS)
 
 
-@pytest.fixture(scope="module")
-def first(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Return weights that were trained with one scene for validation, and their record; do not change them."""
-    path = tmp_path_factory.mktemp("first") / "w.safetensors"
-    return path, train_weights(_request(folder, path, validation=1))
-
-
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     """Return the path for the weights of a test."""
     return tmp_path / "w.safetensors"
 
 
-def _request(folder: Path, out: Path, command: str = "", **flags: Any) -> TrainRequest:
+def _request(folder: Path | str, out: Path, command: str = "", **flags: Any) -> TrainRequest:
     return TrainRequest(str(folder), out, TrainFlags(**QUICK | flags), command)
 
 
 def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
     """It has scenes (none of validation, none held out) and ranges of the training data, and the calibration."""
     field = write_field(tmp_path / "field", (32, 32), NUMBERS)
-    record = train_weights(_request(field, out, validation=1, hold_out="003"))
+    record = train_weights(_request(field, out, validation=1, hold_out=("003",)))
     assert "scans" not in record  # of a single exposure
     assert describe_weights(out).map_scores is None
     split = record["split"]
     assert (len(split["train"]), len(split["validation"])) == (2, 1)
     assert not set(split["train"]) & {*split["validation"], "003"}
-    assert (split["held_out"], record["training"]["steps"]) == (["003"], 1)
+    assert split["held_out"] == ["003"]
     assert load_weights(out).record["split"] == split
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (2, (100.0, 100.0), None)
@@ -127,7 +122,7 @@ def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: boo
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
-    """The table has rows of no, some and all patches, the baselines and the readings with their mIoU."""
+    """Tables have rows of no, some and all patches, and of each classifier; the mixture is that of the weights."""
     shown = io.StringIO()
     rows = {"none", "gain", "all"}
     judged = run_train(_request(folder, out, validation=1), Console(file=shown, width=100))["validation"]
@@ -135,22 +130,10 @@ def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
     for name in rows:
         assert all(0 <= judged[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
-    record = describe_weights(out).record
-    assert set(record["baselines"]) == {"LDA", "logistic regression", "random forest"}
-    assert set(record["readings"]["miou"]) == {"network", "mean of both", "linear classifier"}
-    beside = record["baselines"] | record["readings"]["miou"]
-    assert all(f"{name} {100 * miou:.1f}" in shown.getvalue() for name, miou in beside.items())
-
-
-@pytest.mark.parametrize(("few", "validation", "kept"), [(2000, 1, "mean of both"), (0, 1, None), (0, 0, "network")])
-def test_few_labels_give_the_mean_of_network_and_linear_classifier(
-    folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch, few: int, validation: int, kept: str | None
-) -> None:
-    """With more labels the reading with the best validation score is kept; without validation scenes, the network."""
-    monkeypatch.setattr(figures, "FEW_PIXELS", few)
-    readings = train_weights(_request(folder, out, validation=validation))["readings"]
-    scores = readings["miou"]
-    assert readings["kept"] == (kept or max(scores, key=lambda name: scores[name]))
+    candidates = describe_weights(out).record["candidates"]
+    assert candidates[-1]["name"] == "mixture"
+    assert sum(one["weight"] for one in candidates) == pytest.approx(1)
+    assert all(f"{one['name']} " in shown.getvalue() for one in candidates)
 
 
 def test_counts_of_validation_scenes_add_up() -> None:
@@ -165,29 +148,9 @@ def test_counts_of_validation_scenes_add_up() -> None:
     assert found["all"]["miou"] == mean_iou(np.array([[4, 0], [2, 2]]))
 
 
-@pytest.mark.parametrize("validation", [True, False])
-def test_baselines_separate_classes_of_different_spectra(validation: bool) -> None:
-    """Distant classes score above 0.95, those of one distribution near chance; a class or few pixels give none."""
-    rng = np.random.default_rng(0)
-    labels = np.repeat(np.arange(2, dtype=np.uint8), 20)[:, None].repeat(40, 1)
-    values = rng.normal(0, 1, (40, 40, 3))
-
-    def judged(spectra: np.ndarray, truth: np.ndarray) -> dict[str, float] | None:
-        one = Example("e", np.asarray(spectra, np.float32), truth, truth.shape)
-        return judge_baselines([one], [one] * validation, 2, 0, lambda what, done, figure: None)
-
-    mixed = rng.permutation(labels.ravel()).reshape(labels.shape)
-    far, alike = judged(values + 9 * labels[..., None], labels), judged(values, mixed)
-    assert min(far.values()) > 0.95
-    assert max(alike["LDA"], alike["logistic regression"]) < 0.45
-    assert validation or alike["random forest"] < 0.45
-    assert judged(values, np.zeros_like(labels)) is None
-    assert judged(values[:1, :2], np.array([[0, 1]], np.uint8)) is None
-
-
 def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
     """A held-out scene gets no warning."""
-    train_weights(_request(folder, out, hold_out="002", validation=0))
+    train_weights(_request(folder, out, hold_out=("002",), validation=0))
     notes = {}
     for number in ("001", "002"):
         scene = folder / "images" / f"{number}_image.png"
@@ -197,28 +160,29 @@ def test_a_survey_warns_of_a_training_scene(folder: Path, out: Path) -> None:
     assert "a training scene" not in notes["002"]
 
 
-def _masked(folder: Path, rows: slice | None, out: Path, **more: Any) -> TrainRequest:
-    """Write a labelled cube of 40 x 40 px, and request a training on these rows of it."""
+def _cube(root: Path) -> dict[str, Any]:
+    """Write a cube of 40 x 40 px with labels of its upper 10 rows, and with all; return the flags of its training."""
     labels = np.random.default_rng(4).integers(1, 3, (40, 40)).astype(np.uint8)
-    np.save(folder / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
-    np.save(folder / "labels.npy", labels)
-    given = {"labels": str(folder / "labels.npy"), "wavelengths": "500,600,700,800"}
-    if rows is not None:
-        mask = np.zeros_like(labels)
-        mask[rows] = labels[rows]
-        np.save(folder / "mask.npy", mask)
-        given["train_mask"] = str(folder / "mask.npy")
-    return _request(folder / "cube.npy", out, **given, **more)
+    np.save(root / "cube.npy", (labels[..., None] * np.ones(4)).astype(np.float32))
+    np.save(root / "every.npy", labels)
+    np.save(root / "some.npy", np.where(np.arange(40)[:, None] < 10, labels, 0).astype(np.uint8))
+    (root / "scene.toml").write_text("unlabelled = 0\nwavelengths_nm = [500, 600, 700, 800]\n")
+    return {"labels": str(root / "some.npy")}
 
 
-def test_training_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
-    """After training with a mask, the survey of the same file keeps the labels outside of the mask only."""
-    train_weights(_masked(tmp_path, slice(10), out))
-    flags = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800], "source": "sim", "budget": 1}
-    flags |= {"scene": str(tmp_path / "cube.npy"), "weights": str(out)}
-    labels = open_field(load_settings(None, flags | {"out": str(tmp_path / "a")})).labels.read()
+def test_trained_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
+    """Evaluations and surveys by a file of more labels keep the others only; the same labels are refused."""
+    train_weights(_request(tmp_path / "cube.npy", out, **_cube(tmp_path)))
+    asked = {"labels": str(tmp_path / "every.npy"), "scene": str(tmp_path / "cube.npy"), "weights": str(out)}
+    labels = open_field(load_settings(None, asked | {"out": str(tmp_path / "a")})).labels.read()
     assert (labels[:10] == 255).all()
     assert (labels[10:] != 255).all()
+    cube, flags = str(tmp_path / "cube.npy"), EvaluateFlags(weights=(out,), fractions="")
+    content = evaluate_weights(cube, replace(flags, labels=asked["labels"], bands="0-2"))
+    assert sum(content["support"].values()) == 30 * 40
+    assert "trained pixels are left out of cube" in " ".join(content["data_notes"])
+    with pytest.raises(SceneError, match=r"w.safetensors was trained on these labels.*or by other labelled pixels"):
+        evaluate_weights(cube, replace(flags, labels=str(tmp_path / "some.npy")))
 
 
 @pytest.mark.parametrize(
@@ -260,12 +224,11 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
 
 @pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
 def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
-    """Weights have none without validation scenes; after short exposures training reports that, and its baselines."""
+    """Weights have none without validation scenes; after short exposures training reports that."""
     shown = io.StringIO()
     request = _request(folder, out, validation=0, min_exposure_ms=darkest_ms)
     assert "scans" not in run_train(request, Console(file=shown, width=100))
     assert ("the file has no scan performance" in shown.getvalue()) == said
-    assert "of a random half of the training pixels, on the other half: LDA " in shown.getvalue()
 
 
 def test_whitening_uses_the_noise_of_short_exposures(folder: Path, out: Path):
@@ -277,14 +240,23 @@ def test_whitening_uses_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
-def test_training_resumes_from_a_file(folder: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Normalisation stays and the first step starts at the old network; without validation the mean of both is kept."""
-    train_weights(_request(folder, out, validation=0, command="first"))
+def test_continued_training_is_for_built_in_scenes(folder: Path, out: Path) -> None:
+    """On files a training takes seconds."""
+    with pytest.raises(SettingsError, match=r"--start is for built-in scenes; .*: train anew on all of them together"):
+        train_weights(_request(folder, out, start=Path("first.safetensors")))
+
+
+def test_training_continues_on_built_in_scenes(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normalisation stays; without validation scenes the mean of both networks is kept."""
+    monkeypatch.setattr("spectralzoom.flows.training.data.FARM_SHAPE", (32, 48))
+    # choosing takes seconds
+    monkeypatch.setattr("spectralzoom.models.training.examples.chosen_effects", lambda *_: USUAL)
+    train_weights(_request("farm", out, "first", scenes=1, validation=0))
     trained = flow.train
     ends: list[Any] = []
     monkeypatch.setattr(flow, "train", lambda *given, **options: ends.append(trained(*given, **options)) or ends[0])
-    request = _request(folder, tmp_path / "b.safetensors", validation=0, start=out, seed=1)
-    record = train_weights(request)
+    more: dict[str, Any] = {"scenes": 1, "validation": 0, "start": out, "seed": 1}
+    record = train_weights(_request("farm", tmp_path / "b.safetensors", **more))
     first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
     assert record["started_from"] == "first"
     np.testing.assert_array_equal(second.normalisation.whitening, first.normalisation.whitening)
@@ -292,24 +264,35 @@ def test_training_resumes_from_a_file(folder: Path, out: Path, tmp_path: Path, m
     for before, halfway, after in zip(*networks, strict=True):
         torch.testing.assert_close(after, before, atol=0.01, rtol=0)
         torch.testing.assert_close(halfway, (before + after) / 2)
-    assert not torch.equal(after, before)
 
 
-@pytest.mark.parametrize(("better", "kept"), [(0, "network"), (3, "mean with --start")])
-def test_continued_training_keeps_the_best_by_validation(
-    folder: Path, out: Path, first: tuple[Path, Any], monkeypatch: pytest.MonkeyPatch, better: int, kept: str
+@pytest.mark.parametrize(
+    ("what", "common", "scenes", "flags"),
+    [
+        ("classes", {"names": ("a", "c")}, {}, {}),
+        ("classes", {}, {"untaught": (0,)}, {}),
+        ("training scenes", {}, {"train": Imaged(keys={"2": "other"})}, {}),
+        ("bands", {"basis": SpectralBasis.spanning(np.linspace(500, 700, 4))}, {}, {}),
+        ("sizes of the network", {}, {}, {"dim": 8}),
+        (None, {}, {"train": Imaged(keys={"1": "one", "2": "other"})}, {}),
+    ],
+)
+def test_continued_training_names_what_differs(
+    what: str | None, common: dict[str, Any], scenes: dict[str, Any], flags: dict[str, Any]
 ) -> None:
-    """The candidates are the trained network and the mean of its weights and the old ones."""
-    scores = iter(np.eye(4)[better])
-    monkeypatch.setattr(figures, "_miou", lambda *judged: float(next(scores)))
-    record = train_weights(_request(folder, out, validation=1, start=first[0]))
-    assert record["readings"]["kept"] == kept
-
-
-def test_continued_training_may_have_more_scenes(folder: Path, out: Path, first: tuple[Path, Any]) -> None:
-    """Its record names the scenes of both trainings."""
-    second = train_weights(_request(folder, out, validation=0, start=first[0]))["split"]
-    assert second["train"].items() > first[1]["split"]["train"].items()
+    """Classes, scenes, bands and sizes are those of the first training; more scenes are allowed."""
+    nm = np.linspace(500, 800, 4)
+    known = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), 8, nm)
+    begun: Any = SimpleNamespace(
+        class_names=known.names,
+        config=network_config(TrainFlags(dim=16), known),
+        basis=known.basis,
+        record={"split": {"train": {"1": "one"}}},
+    )
+    usual = {"common": replace(known, **common), "untaught": (), "train": Imaged(keys={"1": "one"})}
+    request = _request("farm", Path("w.safetensors"), start=Path("first"), **flags)
+    with nullcontext() if what is None else pytest.raises(SettingsError, match=f"its training had other {what}; give"):
+        flow.check_start(request, begun, SimpleNamespace(**usual | scenes))
 
 
 def test_continued_training_has_a_lower_learning_rate() -> None:
@@ -317,37 +300,6 @@ def test_continued_training_has_a_lower_learning_rate() -> None:
     anew, on = (TrainFlags(start=start).settings for start in (None, Path("first.safetensors")))
     assert 3 * on.learning_rate == pytest.approx(anew.learning_rate)
     assert TrainFlags(learning_rate=2e-3).settings.learning_rate == 2e-3
-
-
-@pytest.mark.parametrize(
-    ("changed", "what"),
-    [
-        ({}, "training scenes"),  # others of the same names
-        ({"hold_out": "003"}, "training scenes"),
-        ({"validation": 2}, "training scenes"),
-        ({"dim": 8}, "sizes of the network"),
-    ],
-)
-def test_continued_training_refuses_changed_input(
-    tmp_path: Path, out: Path, first: tuple[Path, Any], changed: dict[str, Any], what: str
-) -> None:
-    """One message names the difference: training scenes, of which the content counts, bands or network sizes."""
-    field = write_field(tmp_path / "field", (16, 16), NUMBERS, seed=0 if changed else 9)
-    with pytest.raises(SettingsError, match=f"its training had other {what}; give its data set and options"):
-        train_weights(_request(field, out, **{"validation": 1, "start": first[0], **changed}))
-
-
-@pytest.mark.parametrize(("rows", "held"), [(8, False), (12, True), (None, True)])
-def test_continued_training_needs_all_first_pixels(out: Path, tmp_path: Path, rows: int | None, held: bool) -> None:
-    """A new mask must contain the first one; without a mask every pixel is trained on."""
-    train_weights(_masked(tmp_path, slice(2, 10), out, validation=0))
-    part = None if rows is None else slice(rows)
-    again = _masked(tmp_path, part, tmp_path / "b.safetensors", validation=0, start=out)
-    if held:
-        train_weights(again)
-    else:
-        with pytest.raises(SettingsError, match="other training pixels"):
-            train_weights(again)
 
 
 @pytest.mark.parametrize("unfit", ["copy", "unlabelled"])

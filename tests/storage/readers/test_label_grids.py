@@ -11,7 +11,6 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from spectralzoom.flows.training.data import load_data_set
 from spectralzoom.flows.training.init_command import draft_scene
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.scene_files import load_scene_file, open_scene_file
@@ -108,16 +107,6 @@ def test_labels_outside_of_the_image_are_refused(tmp_path: Path) -> None:
         open_scene_file(path)
     (tmp_path / "scene.toml").write_text('labels = ""\n')
     assert open_scene_file(path, wavelengths=[800]).labels is None
-
-
-def test_a_training_mask_on_another_grid_is_aligned(tmp_path: Path) -> None:
-    """The mask of training pixels is resampled to the scene's pixels as well."""
-    path = image(tmp_path)
-    labels = write(tmp_path / "truth.tif", np.ascontiguousarray(CLASSES[::-1]), SOUTH_UP)
-    mask = write(tmp_path / "mask.tif", np.where(CLASSES == 1, 1, 0).astype(np.uint8)[::-1].copy(), SOUTH_UP)
-    train = load_data_set(path, labels=labels, train_mask=mask).load("field", training=True).labels
-    assert train is not None
-    np.testing.assert_array_equal(train != 255, CLASSES == 1)
 
 
 @pytest.mark.parametrize("turned", [False, True])
