@@ -6,7 +6,7 @@ the logarithm of the norm; ``around`` are components of both with their means an
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
@@ -21,18 +21,28 @@ from spectralzoom.models.network.sizes import (
     SegmenterConfig,
     feature_widths,
 )
+from spectralzoom.pipeline.geometry.grid import cuts
 
 LEAST_NORM = 1e-12
+STRIP_ROWS = 128  # whose features are computed at once
+REACH = max(MEAN_WINDOWS) // 2  # rows around a strip that its windows cover
 LEAST = 1e-6  # probability of a class that a training had: no part alone rules it out
 
 
 def window_means(image: Tensor, side: int) -> Tensor:
-    """Return means of ``side`` x ``side`` px of an image (B, c, y, x), whose borders are repeated."""
+    """Return means of ``side`` x ``side`` px of an image (B, c, y, x), whose borders are repeated.
+
+    Sums are float64, where the device has it: their cost does not depend on the side of the window.
+    """
     half = side // 2
     if not half:
         return image
-    rows = F.avg_pool2d(F.pad(image, (0, 0, half, half), mode="replicate"), (side, 1), stride=1)
-    return F.avg_pool2d(F.pad(rows, (half, half, 0, 0), mode="replicate"), (1, side), stride=1)
+    sums = F.pad(image, (half + 1, half, half + 1, half), mode="replicate")
+    sums = sums.to(torch.float32 if image.device.type == "mps" else torch.float64)
+    for axis in (2, 3):
+        sums, count = sums.cumsum(axis), sums.shape[axis] - side
+        sums = sums.narrow(axis, side, count) - sums.narrow(axis, 0, count)
+    return sums / side**2
 
 
 class Part(nn.Module):
@@ -71,26 +81,36 @@ class Mixture(nn.Module):
         norm = values.norm(dim=-1, keepdim=True).clamp_min(LEAST_NORM)
         return torch.cat([values / norm, norm.log()], dim=-1)
 
-    def around(self, columns: Tensor) -> Tensor:
-        """Return the features of surroundings, (B, y, x, column) -> (B, y, x, feature)."""
+    def around(self, columns: Tensor, rows: slice = slice(None)) -> Tensor:
+        """Return the features of surroundings of some rows, (B, y, x, column) -> (B, row, x, feature)."""
         relative = (self.relative(columns) - self.relative_centre) @ self.relative_axes
         base = torch.cat([columns @ self.own_axes, relative], dim=-1).movedim(-1, 1)
-        means = {side: window_means(base, side) for side in MEAN_WINDOWS}
-        squares = base.square()  # of components around 0: their difference is exact enough
-        spreads = [(window_means(squares, side) - means[side].square()).clamp_min(0).sqrt() for side in SPREAD_WINDOWS]
-        return torch.cat([*means.values(), *spreads], dim=1).movedim(1, -1)
+        means = {side: window_means(base, side)[:, :, rows] for side in MEAN_WINDOWS}
+        squares = base.square()
+        spreads = [
+            (window_means(squares, side)[:, :, rows] - means[side].square()).clamp_min(0).sqrt()
+            for side in SPREAD_WINDOWS
+        ]
+        return torch.cat([one.to(base.dtype) for one in (*means.values(), *spreads)], dim=1).movedim(1, -1)
 
-    def features(self, image: Tensor, kinds: Collection[str]) -> dict[str, Tensor]:
-        """Return the features of every pixel, (B, y, x, feature) of each kind."""
+    def features(self, image: Tensor, kinds: Collection[str], rows: slice = slice(None)) -> dict[str, Tensor]:
+        """Return the features of every pixel of some rows, (B, row, x, feature) of each kind."""
         columns = image.movedim(1, -1)
         found: dict[str, Tensor] = {}
         if VALUES in kinds:
-            found[VALUES] = columns @ self.to_values
+            found[VALUES] = columns[:, rows] @ self.to_values
         if RELATIVE in kinds:
-            found[RELATIVE] = self.relative(columns)
+            found[RELATIVE] = self.relative(columns[:, rows])
         if AROUND in kinds:
-            found[AROUND] = self.around(columns)
+            found[AROUND] = self.around(columns, rows)
         return found
+
+    def strips(self, image: Tensor, kinds: Collection[str]) -> Iterator[dict[str, Tensor]]:
+        """Yield the features of every pixel, `STRIP_ROWS` rows at a time: those of a whole frame take gigabytes."""
+        height = image.shape[2]
+        for rows in cuts(height, STRIP_ROWS):
+            first, last = max(rows.start - REACH, 0), min(rows.stop + REACH, height)
+            yield self.features(image[:, :, first:last], kinds, slice(rows.start - first, rows.stop - first))
 
     def forward(self, image: Tensor) -> Tensor:
         """Return the logarithms of the mixed probabilities and of the prior, (B, class, y, x)."""
@@ -99,14 +119,15 @@ class Mixture(nn.Module):
             for (kind, _, weight), part in zip(self.config.parts, self.parts, strict=True)
             if weight
         ]
-        found = self.features(image, {kind for kind, _, _ in used})
-        mixed = torch.zeros((), device=image.device)
-        for kind, part, weight in used:
-            mixed = mixed + weight * part(found[kind]).softmax(dim=-1)
-        return mixed.clamp_min(LEAST).log().add(self.prior).movedim(-1, 1)
+        kinds = {kind for kind, _, _ in used}
+        mixed = [
+            torch.stack([weight * part(found[kind]).softmax(dim=-1) for kind, part, weight in used]).sum(dim=0)
+            for found in self.strips(image, kinds)
+        ]
+        return torch.cat(mixed, dim=1).clamp_min(LEAST).log().add(self.prior).movedim(-1, 1)
 
     def by_part(self, image: Tensor, number: int) -> Tensor:
         """Return the logits (B, class, y, x) of one part alone, such as the best plain classifier."""
         kind = self.config.parts[number][0]
-        logits: Tensor = self.parts[number](self.features(image, {kind})[kind])
-        return logits.movedim(-1, 1)
+        logits = [self.parts[number](found[kind]) for found in self.strips(image, {kind})]
+        return torch.cat(logits, dim=1).movedim(-1, 1)
