@@ -58,6 +58,7 @@ from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 
+MIXTURE = "mixture"  # name in the tables
 CORRECTIONS = (0.25, 0.5, 0.75, 1.0)  # of the network, to choose from
 
 
@@ -236,7 +237,7 @@ class Learner:
         encoder = load_encoder() if config.deep else {}
         model, summary = self._trained(config, {**mixed.segmenter.state_dict(), **encoder})
         tried = {f"{part:g} of the network": scaled(model, part) for part in CORRECTIONS}
-        best, scores = self._better({"mixture": mixed.segmenter, **tried})
+        best, scores = self._better({MIXTURE: mixed.segmenter, **tried})
         if best is mixed.segmenter:
             return None
         return Learned(self._weights(best), {"training": summary, "corrections": scores})
@@ -303,20 +304,24 @@ def check_counts(flags: TrainFlags) -> None:
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
     size_mb = request.out.stat().st_size / 1e6
-    show_text(f"weights: {request.out} ({size_mb:.1f} MB), {record['training']['steps']} steps", console)
+    steps = record["training"]["steps"]
+    show_text(f"weights: {request.out} ({size_mb:.1f} MB){f', {steps} steps' if steps else ''}", console)
     if "candidates" in record:
         rows = [
             [
                 one["name"],
                 f"{one['miou']:.1%}",
                 f"{one['accuracy']:.1%}",
-                f"{one['weight']:.2f}",
+                "" if one["name"] == MIXTURE else f"{one['weight']:.2f}",
                 f"{one['seconds']:.1f}",
             ]
             for one in record["candidates"]
         ]
         columns = ("classifier", "mIoU", "overall", "weight", "seconds")
         console.print(table(columns, rows, title="By cross-validation"))
+        show_text(
+            "values: bands; relative: bands over their norm; around: means in windows; weight: in the mixture", console
+        )
         show_text("cross-validation on these scenes is no forecast for other ground", console)
     if "corrections" in record:
         shown = ", ".join(f"{name} {100 * miou:.1f}" for name, miou in record["corrections"].items())
