@@ -9,6 +9,7 @@ Whichever of them the test labels favour is the one compared. The splits were na
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 import warnings
@@ -143,7 +144,9 @@ def _of_pines() -> list[Row]:
 
 def judged(split: Split) -> Result:
     """Return the result of a split, with the peers."""
-    return replace(ours(split), peers=_peers(split))
+    found = replace(ours(split), peers=_peers(split))
+    print(f"{split.name}: {found.gain:+.1f}", file=sys.stderr, flush=True)
+    return found
 
 
 def ours(split: Split) -> Result:
