@@ -19,7 +19,7 @@ from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
-from spectralzoom.models.weights.files import Weights, load_weights
+from spectralzoom.models.weights.files import PLAIN, Weights, load_weights
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.whole_files import to_json, write_whole
 
@@ -54,12 +54,14 @@ def evaluate_weights(
         raise SettingsError(f"--seed must be at least 0, got {flags.seed}")
     keep_freed_memory()
     candidates = open_candidates(flags.weights)
+    if not any(one.described.config.corrected for one in candidates):
+        fractions = ()  # every fraction is the same map
     data = open_frames(dataset, flags.frames, flags.scenes, candidates[0].camera, flags.choices())
     if flags.out is not None:
         with writing(flags.out):
             flags.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(data, candidates, show, named=bool(flags.frames))
-    runs = _judge_frames(flags, data, candidates, jobs.frames, show)
+    runs = _judge_frames(flags, fractions, data, candidates, jobs.frames, show)
     content = {
         "dataset": data.law,
         "weights": [
@@ -76,7 +78,7 @@ def evaluate_weights(
         "left_out": jobs.left_out,
         "settings": {"fractions": fractions, "seed": flags.seed, "camera": asdict(candidates[0].camera)},
         "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
-        **summarise(runs, candidates[0].described.class_names, fractions),
+        **summarise(runs, candidates[0].described.class_names, fractions, candidates[0].described.config.patch),
         "data_notes": [*data.notes, *jobs.notes, *(note for one in candidates for note in one.notes)],
         "files": [] if flags.out is None else [str(flags.out / "evaluation.json")],
     }
@@ -87,6 +89,7 @@ def evaluate_weights(
 
 def _judge_frames(
     flags: EvaluateFlags,
+    fractions: Sequence[float],
     data: TrainingData,
     candidates: Sequence[Candidate],
     frames: dict[str, tuple[int, ...]],
@@ -104,7 +107,7 @@ def _judge_frames(
             if index not in loaded:
                 loaded[index] = load_weights(one.path).on(device)
             frame = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
-            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], flags.parts, flags.seed)
+            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], fractions, flags.seed)
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 
@@ -114,7 +117,8 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
     weights = content["weights"]
     named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
     left = f"; left out (training frames): {len(content['left_out'])}" if content["left_out"] else ""
-    lines = [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
+    lines = [_sentence(content["brief"], named)]
+    lines += [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
     if len(weights) > 1:
         lines += [f"  {one['file']}: {one['frames']} frames: {', '.join(one['covers']) or 'none'}" for one in weights]
         together = "; ".join(" + ".join(names) for names in content["seeds"])
@@ -124,6 +128,16 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
     console.print(_accuracy(content))
     console.print(_classes(content))
     console.print(escape(CAPTION), soft_wrap=True, style="dim")
+
+
+def _sentence(brief: dict[str, Any], named: str) -> str:
+    """Return what to know first: the weights, the best plain classifier, and the cost of each."""
+    found = {
+        name: f"{format_points(one['miou'])} ({format_count(one['multiply_adds_a_pixel'])} multiply-adds a pixel)"
+        for name, one in brief.items()
+    }
+    peer = f", the best plain classifier of single pixels {found[PLAIN]}" if PLAIN in found else ""
+    return f"mIoU: {named} {found['weights']}{peer}"
 
 
 def _accuracy(content: dict[str, Any]) -> Table:

@@ -84,7 +84,11 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
-        configs = [replace(of.described.config, untaught=()) for of in (one, first)]  # a fold may lack a class
+        # a fold may lack a class, or have another mixture
+        configs = [
+            replace(of.described.config, untaught=(), parts=(), components=(0, 0), corrected=True)
+            for of in (one, first)
+        ]
         alike = configs[0] == configs[1] and one.camera == first.camera
         if not alike or one.described.class_names != first.described.class_names:
             raise SettingsError(

@@ -7,7 +7,7 @@ seeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,14 @@ from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.network.sizes import multiply_adds
 from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.policies.policies import score_multiply_adds, score_patches
-from spectralzoom.models.reading.inference import CoarsePrediction
-from spectralzoom.models.weights.files import Weights
+from spectralzoom.models.reading.inference import CoarsePrediction, plain_classes
+from spectralzoom.models.weights.files import PLAIN, Weights
 from spectralzoom.pipeline.planning.coverage import frame_patches
 
 POLICIES = {"gain": 1, "random": 5}  # policy: draws
 NONE, ALL = ("none", 0.0), ("all", 1.0)  # no patch, every patch
 ENDS = (NONE[0], ALL[0])
+ALONE = (PLAIN, 0.0)  # the best classifier of single spectra
 Choice = tuple[str, float]  # policy, and fraction of the patches
 Counts = NDArray[np.int64]
 
@@ -62,6 +63,10 @@ def judge_frame(
         scored = 0 if policy in ENDS else score_multiply_adds(policy, config, grid)
         spent = multiply_adds(config, grid, len(drawn[0]), bands, score=scored).total
         rows[policy, fraction] = Row(counts, len(drawn[0]), spent)
+    if (part := weights.record.get(PLAIN)) is not None:
+        drawn_alone = metrics.confusion(labels, plain_classes(weights, seen, part), config.classes)
+        alone = replace(config, parts=((*config.parts[part][:2], 1.0),), corrected=False)
+        rows[ALONE] = Row(drawn_alone[None], 0, multiply_adds(alone, grid, 0, bands).total)
     return rows
 
 
@@ -97,11 +102,25 @@ def counts_of(seeds: Sequence[Run], choice: Choice) -> Counts:
     return counts
 
 
-def summarise(runs: Sequence[Run], class_names: Sequence[str], fractions: Sequence[float]) -> dict[str, Any]:
-    """Return the figures of every row. ``runs`` are the rows of `judge_frame` by each of the weights."""
+def summarise(
+    runs: Sequence[Run], class_names: Sequence[str], fractions: Sequence[float], patch: int
+) -> dict[str, Any]:
+    """Return the figures of every row, and in ``brief`` those of the weights and of the best plain classifier.
+
+    ``runs`` are the rows of `judge_frame` by each of the weights, whose patches have ``patch`` px a side.
+    """
     seeds = [{name: rows for number in members for name, rows in runs[number].items()} for members in seeds_of(runs)]
     shared = [(policy, fraction) for policy in POLICIES for fraction in fractions]
     whole = counts_of(seeds, ALL)
+    known = all(ALONE in rows for run in seeds for rows in run.values())
+    pixels = patch**2 * _cost(seeds, ALL)["patches"]
+    brief = {
+        name: {
+            "miou": _accuracy(counts_of(seeds, choice), class_names)["miou"],
+            "multiply_adds_a_pixel": _cost(seeds, choice)["multiply_adds"] / pixels,
+        }
+        for name, choice in (("weights", ALL), *([(PLAIN, ALONE)] if known else []))
+    }
     support = whole.sum(axis=4).max(axis=(0, 1)).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
     for choice in (NONE, *shared, ALL):
@@ -109,7 +128,7 @@ def summarise(runs: Sequence[Run], class_names: Sequence[str], fractions: Sequen
         cost = {name: {"done": done[name], "ratio": done[name] / full[name] if full[name] else None} for name in done}
         figures = _accuracy(counts_of(seeds, choice), class_names)
         table.append({"policy": choice[0], "fraction": choice[1], **figures, "cost": cost})
-    return {"rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
+    return {"brief": brief, "rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
 
 
 def _cost(seeds: Sequence[Run], choice: Choice) -> dict[str, float]:

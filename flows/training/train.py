@@ -50,6 +50,7 @@ from spectralzoom.models.weights.files import (
     CAPTURED,
     CASCADE,
     CLASS_VALUES,
+    PLAIN,
     TRAINED_ON,
     TrainedOn,
     Weights,
@@ -65,6 +66,7 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 
 CORRECTED_SCENES = 4  # labelled scenes, at least, whose classifiers a network corrects
+MIXTURE = "mixture"  # name in the tables
 
 
 def train_weights(
@@ -239,7 +241,7 @@ class Learner:
         mixed = fit_mixture(self.scenes.train.examples, self.normalisation, self.config, seed, self.report)
         seconds, processor = round(time.monotonic() - began, 1), round(time.process_time() - worked, 1)
         spent = {"steps": 0, "seconds": seconds, "processor_seconds": processor}
-        found = {"candidates": [asdict(one) for one in mixed.judged], "plain": mixed.plain, "training": spent}
+        found = {"candidates": [asdict(one) for one in mixed.judged], PLAIN: mixed.plain, "training": spent}
         return Learned(self._weights(mixed.segmenter), found)
 
     def correction(self, mixed: Learned) -> Learned:
@@ -346,20 +348,24 @@ def check_counts(flags: TrainFlags) -> None:
 
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
     size_mb = request.out.stat().st_size / 1e6
-    show_text(f"weights: {request.out} ({size_mb:.1f} MB), {record['training']['steps']} steps", console)
+    steps = record["training"]["steps"]
+    show_text(f"weights: {request.out} ({size_mb:.1f} MB){f', {steps} steps' if steps else ''}", console)
     if "candidates" in record:
         rows = [
             [
                 one["name"],
                 f"{one['miou']:.1%}",
                 f"{one['accuracy']:.1%}",
-                f"{one['weight']:.2f}",
+                "" if one["name"] == MIXTURE else f"{one['weight']:.2f}",
                 f"{one['seconds']:.1f}",
             ]
             for one in record["candidates"]
         ]
         columns = ("classifier", "mIoU", "overall", "weight", "seconds")
         console.print(table(columns, rows, title="By cross-validation"))
+        show_text(
+            "values: bands; relative: bands over their norm; around: means in windows; weight: in the mixture", console
+        )
         show_text("cross-validation on these scenes is no forecast for other ground", console)
     if "corrections" in record:
         shown = ", ".join(f"{part} {100 * miou:.1f}" for part, miou in record["corrections"].items())

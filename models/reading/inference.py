@@ -231,6 +231,16 @@ def segment(
         return draw(logits, every_class=every_class).of_scene(seen.grid)
 
 
+def plain_classes(weights: Weights, seen: CoarsePass, part: int) -> NDArray[np.uint8]:
+    """Return the class map (y, x) of a scene by one part of a mixture alone, numbered ``part``."""
+    import torch
+
+    network = weights.segmenter
+    image = torch.from_numpy(seen.columns)[None].movedim(-1, 1).to(network.device)
+    with torch.inference_mode():
+        return draw(network.mixture.by_part(image, part)[0].cpu()).of_scene(seen.grid).classes
+
+
 def patch_logits(
     weights: Weights,
     overview: Overview,

@@ -33,6 +33,7 @@ FORMAT = "spectralzoom-weights/7"
 ENCODER = "spectralzoom-encoder/1"
 COLOURS = "class_colours"
 CAPTURED = "captured"  # of a record: scenes were captured by the simulated camera, not taken as they are
+PLAIN = "plain"  # of a record: number of the mixture's part that is the best classifier of single spectra
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
 CALIBRATION = "calibration"  # of a record: calibration error and temperature
 READER = "memory"  # entry in the description, prefix of tensor names

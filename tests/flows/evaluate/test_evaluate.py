@@ -63,6 +63,10 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     train_weights(TrainRequest(str(data), out, quick))
     split = load_weights(out).record["split"]
     content = evaluate_weights(str(data), EvaluateFlags(weights=(out,), **QUICK))
+    brief = content["brief"]
+    assert brief["weights"]["miou"] == _row(content, "all", 1.0)["miou"]
+    assert 0 < brief["plain"]["miou"] <= 1
+    assert 0 < brief["plain"]["multiply_adds_a_pixel"] < brief["weights"]["multiply_adds_a_pixel"]
     assert content["weights"][0]["left_out"] == sorted(split["train"])
     assert content["frames"] == sorted({"003", *split["validation"]})
     assert content["left_out"] == sorted(split["train"])
@@ -173,13 +177,13 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("overall", "average", "kappa", "MACs"))
+    assert all(word in shown for word in ("mIoU: w.safetensors ", "overall", "average", "kappa", "MACs"))
 
 
 def test_miou_of_frames_comes_from_their_summed_counts():
     """The order of the frames has no effect."""
     run = _judged("abcd", np.random.default_rng(0))
-    there, back = (summarise([dict(order)], ("a", "b"), (0.5,)) for order in (run.items(), [*run.items()][::-1]))
+    there, back = (summarise([dict(order)], ("a", "b"), (0.5,), 8) for order in (run.items(), [*run.items()][::-1]))
     assert json.dumps(there["rows"][0], sort_keys=True) == json.dumps(back["rows"][0], sort_keys=True)
     assert there["rows"][0]["miou"] == mean_iou(counts_of([run], NONE).sum(axis=(0, 1, 2)))
 
@@ -188,7 +192,7 @@ def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, caps
     """The mean is taken over the classes of all frames' labels."""
     counts = [[[8, 0, 2], [1, 9, 0], [0, 0, 0]], [[7, 3, 0], [0, 10, 0], [0, 0, 0]]]
     run = {str(number): dict.fromkeys(CHOICES, Row(np.array([one]), 2, 3)) for number, one in enumerate(counts)}
-    found = summarise([run], ("soil", "crop", "weed"), (0.5,))
+    found = summarise([run], ("soil", "crop", "weed"), (0.5,), 8)
     row = found["rows"][0]
     assert row["miou"] == pytest.approx(np.mean([15 / 21, 19 / 23]))
     assert row["false_classes"] == {"weed": 2}
