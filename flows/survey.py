@@ -122,6 +122,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         reader=field.reader,
         part=plan.part,
         least_gain=plan.least_gain,
+        spectra=field.described.spectra,
     )
     return Products(
         mosaic=mosaic,

@@ -1,4 +1,4 @@
-"""Compute the findings of a run: areas, changes, zones, plots, likeness to the training data, expected score."""
+"""Compute the findings of a run: areas, changes, zones, plots, likeness to the training, expected score."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Products
-from spectralzoom.flows.publish.receipt_table import FOREIGN
 from spectralzoom.flows.stages.condense import SIGNAL_RECORD
 from spectralzoom.flows.stages.ground import STORE
 from spectralzoom.flows.stages.register import load_registration
@@ -21,6 +20,7 @@ from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
 from spectralzoom.flows.tasks.scores import MOST_ERROR
 from spectralzoom.flows.terminal.figures import format_points
 from spectralzoom.models.evaluation.expected_scores import expected_counts
+from spectralzoom.models.evaluation.unlike_scenes import UNLIKE
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts, patch_pixels
 from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
 from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
@@ -230,7 +230,8 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
 def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
     """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``."""
     spectra = read_table(ref.path / SPECTRA)
-    unlike = spectra["unlike_patches"] / max(spectra["captured_patches"], 1)
+    mean, distance = spectra["distances"] or (0.0, 0.0)
+    unlike = max(mean, distance) > UNLIKE
     unclassed = drawn.classes == UNLABELLED
     if plan.field.zones.left_out is not None:
         unclassed &= ~plan.field.zones.left_out
@@ -240,9 +241,9 @@ def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     return {
-        "unlike": {"fraction": unlike} if unlike else None,
+        "unlike": {"mean": mean, "spectra": distance} if unlike else None,
         "pixels": pixels if any(pixels.values()) else None,
-        "expected": None if unlike > FOREIGN else _expected(plan, ref),
+        "expected": None if unlike else _expected(plan, ref),
     }
 
 

@@ -146,7 +146,7 @@ class ReceiptFields(_Part):
     ground: Facts | None = None  # with a pose or a placed scene: grid, what changed, what is old
     zones: Facts | None = None  # where zones leave something out: what is kept
     plots: list[Facts] | None = None  # where plots are given: ground, classes, confidence of each
-    unlike: Facts | None = None  # fraction of the captured patches that are unlike the training data
+    unlike: Facts | None = None  # distances of mean and spectra from the training, where it is unlike that
     expected: Facts | None = None  # what the map is likely to score, by its own probabilities; mIoU and error
     pixels: dict[str, int] | None = None  # where some have no value, no reading or no class: how many
     products: dict[str, str]

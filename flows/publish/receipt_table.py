@@ -40,8 +40,6 @@ COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
 LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
 MOST_NAMED = 4  # changes of class in a row
 SATURATED = "of the spectra have saturated bands; a shorter exposure avoids them"
-FOREIGN = 0.2  # fraction of patches unlike the training data above which the weights do not fit the field
-FOREIGN_WORDS = "These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET)"
 
 
 def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -79,9 +77,6 @@ def format_score(receipt: Mapping[str, Any]) -> str:
             none, every = (format_points(accuracy[which]["miou"]) for which in ("none", "all"))
             score += f"; the small network alone gives {none}, the full network on every patch {every}"
         return f"{score}. {format_worst_class(accuracy)}".rstrip()
-    if is_foreign(receipt):
-        unlike = format_percent(receipt["unlike"]["fraction"])
-        return f"{unlike} of the field is unlike the training data. {FOREIGN_WORDS}."
     expected = receipt.get("expected") or {}
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
         return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities."
@@ -110,7 +105,7 @@ def headline(receipt: Receipt) -> str:
 
 
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
-    """Print the score, the leading savings and their reference, saturation, lost lines, and the state of a prior map.
+    """Print score, leading savings, their reference, unlike spectra, saturation, lost lines, and a prior map's state.
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
@@ -120,7 +115,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     columns = ("", "this survey", "reference", "fraction")
     console.print(table(columns, cells, whole=columns[1:]))
     console.print(escape(format_reference(receipt)))
-    shown = {part: receipt[part] for part in ("signal", "lines", "prior_map") if receipt.get(part)}
+    shown = {part: receipt[part] for part in ("unlike", "signal", "lines", "prior_map") if receipt.get(part)}
     for name, words in finding_rows(shown):
         console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
@@ -157,18 +152,13 @@ def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any]
     )
 
 
-def is_foreign(found: Mapping[str, Any]) -> bool:
-    """Return whether so much of the field is unlike the training data that the weights do not fit it."""
-    return ((found.get("unlike") or {}).get("fraction") or 0.0) > FOREIGN
-
-
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the findings of a receipt as rows of a table: label, and figures with their names.
 
-    Zeros, what is empty, and costs, which the savings have, are left out. With weights that do not fit the field, no
+    Zeros, what is empty, and costs, which the savings have, are left out. For a scene unlike the training, no
     score is predicted.
     """
-    if is_foreign(found) and "scans" in found:
+    if found.get("unlike") and "scans" in found:
         found = {**found, "scans": {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}}
     words: dict[str, list[str]] = {}
     for label, part, name, show in _SHOWN:
@@ -182,8 +172,8 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     for name, facts in found.get("lines", {}).items():
         counts = ", ".join(f"{count} {what}" for what, count in facts.items() if count)
         rows.append((f"sweep {name}", f"lines left out: {counts}"))
-    if is_foreign(found):
-        rows.append(("weights", FOREIGN_WORDS))
+    if unlike := found.get("unlike"):
+        rows.insert(0, ("note", _unlike(**unlike)))
     return [(label, words) for label, words in rows if words]
 
 
@@ -192,6 +182,13 @@ def format_days(days: float) -> str:
     if days < 1:
         return f"{24 * days:.1f} hours earlier"
     return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
+
+
+def _unlike(mean: float, spectra: float) -> str:
+    """Return the sentence on a scene whose mean or spectra are farther from the training than any of its scenes."""
+    what = f"its mean spectrum lies {mean:.1f}" if mean >= spectra else f"its spectra lie {spectra:.1f}"
+    far = f"{what} times as far from it as any part of it from the rest"
+    return f"the scene is unlike the training ({far}): the map may be wrong with confidence"
 
 
 def _scan(scan: Mapping[str, Any]) -> str:
@@ -234,7 +231,6 @@ _SHOWN: Sequence[tuple[str, str, str, Callable[[Any], str]]] = (
     ("prior map", "prior_map", "days", format_days),
     ("prior map", "prior_map", "changed_px", _counts("px changed")),
     ("prior map", "prior_map", "changes", lambda changes: _changes(changes, _counts("px"))),
-    ("training", "unlike", "fraction", _fractions("of the field is unlike the training data of the weights")),
     ("uniform scans", "scans", "taken", lambda scan: f"this one: {_scan(scan)}"),
     ("uniform scans", "scans", "best_in_time", lambda scan: f"best in the same time: {_scan(scan)}"),
     ("uniform scans", "scans", "reference", lambda scan: f"cheapest near the best: {_scan(scan)}"),

@@ -12,6 +12,7 @@ from spectralzoom.flows.stage import Output, stage
 from spectralzoom.flows.stages.score import READING, PatchGains
 from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, draw_field
 from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES, Prior
+from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.reading.prior_map import TemporalAgreement
 from spectralzoom.models.weights.files import ReaderPart
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
@@ -26,8 +27,14 @@ from spectralzoom.storage.arrays.layout import NO_CLASS, blank_pixels
 from spectralzoom.storage.arrays.mosaics import Attention, write_attention
 from spectralzoom.storage.store import Ref, write_table
 
-SPECTRA = "spectra.json"  # beside a map: pixels out of range, and patches unlike the training data
-MADE_BY = ("models/network", "models/reading", "models/weights", "storage/arrays/class_maps.py")
+SPECTRA = "spectra.json"  # beside a map: pixels out of range, and distances from the training spectra
+MADE_BY = (
+    "models/network",
+    "models/reading",
+    "models/weights",
+    "storage/arrays/class_maps.py",
+    "models/evaluation/unlike_scenes.py",
+)
 
 
 @stage("class map", version=28, made_by=MADE_BY)
@@ -41,6 +48,7 @@ def segment(
     reader: ReaderPart | None,
     part: bool,
     least_gain: float | None,
+    spectra: TrainingSpectra | None,
 ) -> None:
     """Segment the mosaic region by region, at full resolution where patches were chosen; nodata pixels have no class.
 
@@ -49,14 +57,14 @@ def segment(
     """
     work = gains.work
     names = create_maps(out.path, gains, goes_on=prior is not None)
-    drawing = Drawing(work.weights, mosaic, attention, gains.capture, prior, gains.zones.left_out, part)
+    drawing = Drawing(work.weights, mosaic, attention, gains.capture, prior, gains.zones.left_out, part, spectra)
     drawn = draw_field(work, drawing, out.path, least_gain, out.report)
     if prior is not None and drawn.comparison is not None:
         write_table(out.path / PRIOR_FIGURES, _prior_map_figures(prior, reader, names, drawn.comparison))
     if drawn.reading is not None:
         write_attention(out.path / READING, attention_of(drawn.reading, gains.policy))
-    counts = {"out_of_range_px": drawn.unread_px, "unlike_patches": drawn.unlike, "captured_patches": drawn.captured}
-    write_table(out.path / SPECTRA, counts)
+    far = None if spectra is None or drawn.spectra is None else spectra.distances(drawn.spectra)
+    write_table(out.path / SPECTRA, {"out_of_range_px": drawn.unread_px, "distances": far})
     finish_maps(out.path, gains, compared=drawn.comparison is not None)
 
 

@@ -25,7 +25,8 @@ from spectralzoom.flows.tasks.field_work import (
     seen_patches,
 )
 from spectralzoom.flows.tasks.prior_maps import Prior
-from spectralzoom.models.network.spectral import LineSpec, unlike_training
+from spectralzoom.models.evaluation.unlike_scenes import STRIDE, SceneSpectra, TrainingSpectra
+from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.policies import class_errors, gain_of
 from spectralzoom.models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
 from spectralzoom.models.reading.prior_map import (
@@ -70,6 +71,7 @@ class Drawing:
     prior: Prior | None = None  # prior map of the field
     left_out: NDArray[np.bool_] | None = None  # (y, x) pixels of which zones have no map drawn
     part: bool = False  # whether the scan covers a part of the field; the rest is that of the prior map
+    spectra: TrainingSpectra | None = None  # what those of the region are compared with
     choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
 
     @property
@@ -126,16 +128,19 @@ class Drawing:
             region.crop(after.age_days),
             region.crop(after.light),
             None if old is None else region.crop(old),
-            Drawn(unread, *self._unlike(region, shown, seen), comparison, reading),
+            Drawn(unread, self._spectra(region, shown, seen), comparison, reading),
         )
 
-    def _unlike(self, region: Region, shown: NDArray[np.bool_], seen: CoarsePass) -> tuple[int, int]:
-        """Return the kept patches that were captured and are unlike the training data, and all captured ones."""
+    def _spectra(self, region: Region, shown: NDArray[np.bool_], seen: CoarsePass) -> SceneSpectra | None:
+        """Return the statistics of the spectra in the kept part that were captured."""
+        if self.spectra is None:
+            return None
         if self.left_out is not None:
             shown = shown & ~self.left_out[region.read.rows, region.read.columns]
-        captured = np.asarray(patch_pixels(region.grid, shown).any(axis=(1, 2)), np.bool_)
-        unlike = captured & unlike_training(seen.columns, region.grid.patch).ravel()
-        return int(region.crop_patches(unlike).sum()), int(region.crop_patches(captured).sum())
+        seen_here = region.crop(shown)
+        if seen.filled is not None:
+            seen_here = seen_here & ~region.crop(seen.filled)
+        return self.spectra.of(region.crop(seen.columns)[::STRIDE, ::STRIDE], seen_here[::STRIDE, ::STRIDE])
 
     def _observation(
         self, region: Region, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarsePass
@@ -207,8 +212,7 @@ class Drawn:
     """Result of segmenting a region, or a field."""
 
     unread_px: int  # captured pixels with values out of range
-    unlike: int  # captured patches that are unlike the training data
-    captured: int  # patches
+    spectra: SceneSpectra | None  # of captured pixels; None where nothing is known of the training's
     comparison: TemporalAgreement | None  # with the prior map; None without one
     reading: FullReading | None = None  # None where patches were chosen before
 
@@ -260,7 +264,10 @@ def draw_field(
     reading = None
     if read := [part.reading for part in parts if part.reading is not None]:
         reading = FullReading(field.joined([one.gain for one in read]), field.joined([one.read for one in read]))
-    unread, unlike, captured = (
-        sum(getattr(part, name) for part in parts) for name in ("unread_px", "unlike", "captured")
+    spectra = [part.spectra for part in parts if part.spectra is not None]
+    return Drawn(
+        sum(part.unread_px for part in parts),
+        reduce(add, spectra) if spectra else None,
+        reduce(add, compared) if compared else None,
+        reading,
     )
-    return Drawn(unread, unlike, captured, reduce(add, compared) if compared else None, reading)

@@ -28,6 +28,7 @@ from spectralzoom.flows.training.data import (
     untaught_note,
 )
 from spectralzoom.flows.training.train_scenes import CAMERA, Scenes, TrainRequest, network_config, observe_all
+from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.segmenter import Segmenter
 from spectralzoom.models.network.sizes import SegmenterConfig
@@ -55,6 +56,7 @@ from spectralzoom.models.weights.files import (
     TrainedOn,
     Weights,
     add_map_scores,
+    add_spectra,
     load_encoder,
     load_weights,
     save_weights,
@@ -142,6 +144,8 @@ def _written(
     if scans is not None:
         record["scans"] = scans[0]
     save_weights(with_record(kept.weights.on(PROCESSOR), **record), request.out)
+    if learner.spectra is not None:
+        add_spectra(request.out, learner.spectra)
     if scans is not None:
         add_map_scores(request.out, scans[1])
     return record
@@ -221,6 +225,12 @@ class Learner:
     def config(self) -> SegmenterConfig:
         """Return the sizes of the networks."""
         return replace(network_config(self.request.flags, self.scenes.common), untaught=self.scenes.untaught)
+
+    @cached_property
+    def spectra(self) -> TrainingSpectra | None:
+        """Return the statistics by which a survey tells unlike scenes."""
+        scenes = [one.columns[: one.shape[0], : one.shape[1]] for one in self.scenes.train.examples]
+        return TrainingSpectra.measured(scenes, self.normalisation.whitening)
 
     def network(self, begun: Weights | None) -> Learned:
         """Train networks from a linear classifier of mean spectra, or from weights."""

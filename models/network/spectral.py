@@ -20,7 +20,6 @@ SPREAD_FLOOR = 1e-3  # least spread of a column, as a fraction of the median spr
 VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a fraction of the largest
 Kind = TypeVar("Kind", bound=np.generic)
 PLANE_SCALES = np.array([4.0, 2.0, 2.0])  # of the logarithms of exposure, line spacing, binned samples
-UNLIKE = 4.0  # mean square of a patch's mean columns: farms reach 2.6 at any exposure, other fields 4 to 1200
 MOST_INVALID = 0.5  # largest fraction of invalid pixels in a token or patch
 MOST_COLUMN = 1e12  # of valid normalised columns; squares of larger values would overflow float32
 
@@ -176,17 +175,6 @@ class Normalisation:
     def gain_shift(self) -> NDArray[np.float32]:
         """Return the shift of normalised columns, beyond doubling, by twice the light, (column,)."""
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
-
-
-def unlike_training(columns: NDArray[np.floating], patch: int) -> NDArray[np.bool_]:
-    """Return which patches are unlike the training data, from normalised columns (y, x, column) of whole patches.
-
-    The mean spectrum of such a patch lies far from the centre of the training spectra, whatever the exposure: the mean
-    square of its columns is above `UNLIKE`. Result (patch_y, patch_x).
-    """
-    y, x, count = columns.shape
-    means = columns.reshape(y // patch, patch, x // patch, patch, count).mean(axis=(1, 3))
-    return np.asarray((means**2).mean(axis=-1) > UNLIKE, np.bool_)
 
 
 class LineSpec(NamedTuple):

@@ -1,6 +1,7 @@
 """Read and write weights: one checksummed file with tensors, spectral basis, classes and the record of the training.
 
-The file may also hold a temporal reader and the calibration of expected scores, which do not change its key.
+The file may also hold a temporal reader, the calibration of expected scores and statistics of the training spectra,
+which do not change its key.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.models.evaluation.expected_scores import MapScores
+from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.network.sizes import SegmenterConfig, TemporalSizes
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from spectralzoom.models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
@@ -40,6 +42,7 @@ READER = "memory"  # entry in the description, prefix of tensor names
 CLASS_VALUES = "class_values"  # of a record
 TRAINED_ON = "trained_on"  # entry in a record
 MAP_SCORES = "map_scores"  # entry in the description: corrections of expected scores
+SPECTRA = "spectra"  # entry in the description: statistics of the training spectra
 MOST_WIDTH = 1024
 
 Range = tuple[float, float]
@@ -96,6 +99,7 @@ class Description:
     key: str = ""  # hash of the weights
     map_scores: MapScores | None = None  # None without validation scenes, and for a single exposure
     reader: ReaderPart | None = None
+    spectra: TrainingSpectra | None = None  # None for a training on few pixels
     about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # complete, with hashes
 
     @property
@@ -192,6 +196,11 @@ def add_map_scores(weights: Path, map_scores: MapScores) -> None:
     _add_part(weights, weights, MAP_SCORES, map_scores.as_dict(), {})
 
 
+def add_spectra(weights: Path, spectra: TrainingSpectra) -> None:
+    """Add the statistics of the training spectra to a file of weights. Raises as `add_map_scores`."""
+    _add_part(weights, weights, SPECTRA, spectra.as_dict(), {})
+
+
 def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
     """Write the weights of a file with a temporal reader to ``out``. Raises as `add_map_scores`."""
     _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
@@ -286,9 +295,10 @@ def describe_weights(path: Path) -> Description:
         keys = about["keys"]
         map_scores = MapScores.read(about[MAP_SCORES]) if MAP_SCORES in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None
+        spectra = TrainingSpectra.read(about[SPECTRA], config.columns) if SPECTRA in about else None
         if len(names) != config.classes:
             raise ValueError(f"it names {len(names)} classes, its segmenter has {config.classes}")
-        return Description(config, basis, names, record, str(keys["weights"]), map_scores, reader, about)
+        return Description(config, basis, names, record, str(keys["weights"]), map_scores, reader, spectra, about)
 
 
 def with_record(weights: Weights, **entries: Any) -> Weights:

@@ -14,12 +14,20 @@ import xarray as xr
 from spectralzoom.flows.publish.findings import changed_hectares
 from spectralzoom.flows.publish.receipt_table import finding_rows, format_score
 from spectralzoom.models.evaluation.expected_scores import MapScores, expected_counts, expected_score
-from spectralzoom.models.weights.files import MAP_SCORES, TRAINED_ON, _add_part, load_weights, save_weights, with_record
+from spectralzoom.models.weights.files import (
+    MAP_SCORES,
+    TRAINED_ON,
+    _add_part,
+    add_spectra,
+    load_weights,
+    save_weights,
+    with_record,
+)
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.field_places import NoPlace
 from spectralzoom.storage.arrays.class_maps import ClassMap, ClassNames
 from tests.conftest import CLASSES, Survey
-from tests.flows.tasks.test_unlike_training import SEEN, of_other_scenes
+from tests.flows.tasks.test_unlike_training import FAR, SEEN
 
 PLACE = NoPlace((2, 4), pixel_m=10.0)  # a pixel is a hundredth of a hectare
 GROUND: dict[str, Any] = {"crs": "EPSG:32632", "resolution_m": 0.12}
@@ -52,7 +60,9 @@ def _judged(weights: Path, folder: Path, content: dict[str, Any], *, unlike: boo
     """Write a copy of the tiny weights with the calibration of their expected scores, and return its path."""
     path = folder / "judged.safetensors"
     known = with_record(load_weights(weights), **{TRAINED_ON: asdict(SEEN)})
-    save_weights(of_other_scenes(known) if unlike else known, path)
+    save_weights(known, path)
+    if unlike:
+        add_spectra(path, FAR)
     _add_part(path, path, MAP_SCORES, content, {})
     return path
 
@@ -85,16 +95,16 @@ def test_an_uncertain_expected_score_is_left_out(survey_png: Survey, weights: Pa
 @pytest.mark.parametrize(
     ("spread", "unlike", "words"),
     [
-        (0.038, 0.0, "every line, 25 ms, 9.0 s, expected mIoU 92.7 ± 3.8"),
-        (0.371, 0.0, "every line, 25 ms, 9.0 s$"),
-        (0.038, 1.0, "every line, 25 ms, 9.0 s$"),
+        (0.038, None, "every line, 25 ms, 9.0 s, expected mIoU 92.7 ± 3.8"),
+        (0.371, None, "every line, 25 ms, 9.0 s$"),
+        (0.038, {"mean": 3.0, "spectra": 1.0}, "every line, 25 ms, 9.0 s$"),
     ],
     ids=["known", "spread too wide", "all of it unlike"],
 )
-def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unlike: float, words: str) -> None:
+def test_scans_show_expected_miou_if_it_is_reliable(spread: float, unlike: dict[str, float] | None, words: str) -> None:
     """It is left out if scenes differ too much, or if the weights do not know the field."""
     scan = {"step": 1, "exposure_ms": 25.0, "seconds": 9.0, "expected_miou": 0.927, "expected_spread": spread}
-    found = {"scans": {"taken": scan, "reference": scan}, "unlike": {"fraction": unlike}}
+    found = {"scans": {"taken": scan, "reference": scan}, "unlike": unlike}
     assert re.search(f"cheapest near the best: {words}", dict(finding_rows(found))["uniform scans"])
 
 
@@ -125,6 +135,6 @@ def test_maps_outside_of_the_calibration_have_no_expected_score(
     path = _judged(weights, tmp_path, SCORES.as_dict(), unlike=unlike)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, **flags).receipt
     assert "expected" not in receipt
-    assert not unlike or receipt["unlike"]["fraction"] == 1
+    assert unlike == ("unlike" in receipt)
     beyond = any("outside of the training data" in note for note in receipt["settings"]["notes"])
     assert beyond == ("wavelengths" in flags)

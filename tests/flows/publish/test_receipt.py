@@ -167,11 +167,10 @@ def test_the_details_have_stages_effects_and_lost_lines():
         ({"settings": {"accuracy": False}}, "The accuracy was left out; the same survey with --accuracy adds it"),
         ({"expected": {"miou": 0.94, "error": 0.02}}, "Expected mIoU 94.0 ± 2.0 of 100, estimated from the map's own"),
         ({"expected": {"miou": 0.94, "error": 0.4}}, "The score is not known: there are no labels."),
-        ({"unlike": {"fraction": 0.5}, "expected": {"miou": 0.9, "error": 0.0}}, "50 % of the field is unlike the tr"),
     ],
 )
 def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):
-    """There is none if the error is too large, or if the weights do not fit the field."""
+    """There is none if the error is too large."""
     text = format_score({**make_receipt(labels=False), **found})
     assert words in text
     assert ("mIoU" in text) == ("Expected" in words)

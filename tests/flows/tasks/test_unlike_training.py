@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,48 +14,54 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.model_flags import TrainFlags
+from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.survey_model import beyond_training, training_note
-from spectralzoom.models.network.spectral import UNLIKE, unlike_training
-from spectralzoom.models.weights.files import TrainedOn, Weights, describe_weights, load_weights, save_weights
+from spectralzoom.flows.training.train import train_weights
+from spectralzoom.flows.training.train_scenes import TrainRequest
+from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
+from spectralzoom.models.weights.files import TrainedOn, add_spectra, describe_weights
 from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
 
 
-def of_other_scenes(weights: Weights) -> Weights:
-    """Return weights whose training was a thousand times as bright."""
-    known = weights.normalisation
-    return replace(weights, normalisation=replace(known, centre=1000 * known.centre, spread=known.spread))
+FAR = TrainingSpectra(np.eye(len(RGB_NM)), np.full(len(RGB_NM), 1e3), np.ones(len(RGB_NM)))
 
 
-@given(st.integers(0, 100), st.floats(0, 3))
-def test_patches_far_from_the_training_are_unlike_it(seed: int, far: float) -> None:
-    """Noise of single pixels does not count: the mean spectrum of a patch does."""
-    columns = np.random.default_rng(seed).normal(0, 1, (32, 48, 24)).astype(np.float32)
-    columns[:16, :16] += np.float32(far)
-    found = unlike_training(columns, 16)
-    assert found.shape == (2, 3)
-    assert not found.ravel()[1:].any()
-    assert found[0, 0] == (far**2 > UNLIKE) or abs(far**2 - UNLIKE) < 0.5
+def with_spectra(weights: Path, out: Path, spectra: TrainingSpectra = FAR) -> str:
+    """Write weights of training spectra far from those of any scene to ``out``, and return that."""
+    shutil.copy(weights, out)
+    add_spectra(out, spectra)
+    return str(out)
 
 
 @pytest.mark.parametrize("flags", [{"source": "raster"}, {"scan_step": 1, "effects": "none"}, {"budget": "0.8"}])
 def test_spectra_unlike_the_training_are_noted_for_every_source(
     survey_png: Survey, weights: Path, tmp_path: Path, flags: dict[str, Any]
 ) -> None:
-    """Receipt and page have the fraction of the field, the advice to train, and no expected score."""
-    save_weights(of_other_scenes(load_weights(weights)), tmp_path / "w.safetensors")
-    published = survey_png(tmp_path / "a", **{"weights": str(tmp_path / "w.safetensors"), "budget": None, **flags})
+    """Terminal, receipt and page have one sentence with the figure, and there is no expected score."""
+    console = Console(file=io.StringIO(), width=300)
+    unlike = {"weights": with_spectra(weights, tmp_path / "w.safetensors"), "budget": None, **flags}
+    published = survey_png(tmp_path / "a", console, **unlike)
     receipt: Any = published.receipt
-    assert receipt["unlike"] == {"fraction": 1.0}
+    assert receipt["unlike"]["mean"] > 100
     assert "expected" not in receipt
-    words = dict(finding_rows(receipt))
-    assert words["training"] == "100 % of the field is unlike the training data of the weights"
-    assert "These weights do not know this field: train" in words["weights"]
-    assert "do not know this field" in (published.folder / "report.html").read_text(encoding="utf-8")
+    words = r"the scene is unlike the training \(its .* lies? \d+\.\d times as far from it as any part .* rest\): "
+    (note,) = [row for label, row in finding_rows(receipt) if label == "note"]
+    for text in (note, console.file.getvalue(), (published.folder / "report.html").read_text(encoding="utf-8")):
+        assert len(re.findall(words + "the map may be wrong with confidence", text)) == 1
+
+
+def test_spectra_like_the_training_have_no_note(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """The training's statistics are those of the scene itself."""
+    like = TrainingSpectra(FAR.axes, np.zeros(len(RGB_NM)), np.full(len(RGB_NM), 1e6), (1.0, 1e6))
+    path = with_spectra(weights, tmp_path / "w.safetensors", like)
+    assert "unlike" not in survey_png(tmp_path / "a", weights=path, budget=None, source="raster").receipt
 
 
 def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, seen: TrainedOn = SEEN, **flags: Any) -> tuple[str, ...]:
@@ -84,3 +92,19 @@ def test_conditions_beyond_the_training_get_one_note(weights: Path, flags: dict[
     (note,) = _notes(weights, **flags)
     assert re.search(words, note), note
     assert "spectralzoom train DATASET -o" in note
+
+
+def test_trained_weights_know_their_spectra(scene_files: Path, tmp_path: Path) -> None:
+    """A survey of the trained scene has no note; one of a scene with other spectra has."""
+    out, other = tmp_path / "w.safetensors", tmp_path / "other.npy"
+    values = np.load(scene_files / "cube.npy")
+    np.save(tmp_path / "labels.npy", np.indices(values.shape[:2])[1].astype(np.uint8) // 8 % 2)
+    np.save(other, values[..., ::-1] + 2 * values.mean())
+    nm = tuple(range(450, 750, 50))
+    given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": ",".join(map(str, nm)), "steps": 1}
+    train_weights(TrainRequest(str(scene_files / "cube.npy"), out, TrainFlags(**given)))
+    for scene, unlike in ((scene_files / "cube.npy", False), (other, True)):
+        flags = {"scene": str(scene), "source": "raster", "weights": str(out), "wavelengths": list(nm)}
+        flags |= {"engine": "plain", "out": str(tmp_path / scene.stem)}
+        published = run_survey(load_settings(None, flags), Console(file=io.StringIO()))
+        assert ("unlike" in published.receipt) == unlike

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from spectralzoom.models.evaluation.expected_scores import MapScores
+from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.network.sizes import TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.weights import files
@@ -35,18 +36,20 @@ def with_reader(path: Path, **changed: int) -> None:
 
 
 def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
-    """Both parts are read in any order; each has a key of its own, which adding it again does not change."""
+    """All parts are read in any order; each has a key of its own, which adding it again does not change."""
     bare = files.describe_weights(path)
     weights = files.load_weights(path)
-    assert (bare.map_scores, bare.reader) == (None, None)
+    assert (bare.map_scores, bare.reader, bare.spectra) == (None, None, None)
     scores = MapScores((1,), (100.0,), np.zeros((1, 1, 3)), np.zeros((1, 1)), 4)
     files.add_map_scores(path, scores)
     with_reader(path)
     files.add_map_scores(path, scores)
+    files.add_spectra(path, TrainingSpectra(np.ones((bare.config.columns, 2)), np.zeros(2), np.ones(2), (3.0, 1.5)))
     told = files.describe_weights(path)
     assert told.key == bare.key
     assert told.map_scores.as_dict() == scores.as_dict()
     assert told.reader.record == {"seed": 1}
+    assert told.spectra.limits == (3.0, 1.5)
     files.add_reader(path, path, files.load_reader(path), {"seed": 1})
     again = files.describe_weights(path)
     assert again.reader.key == told.reader.key
