@@ -35,6 +35,7 @@ FOLDS = 4
 MOST_PIXELS = 40_000  # to fit to, of all scenes together
 LEAST_PIXELS = 200  # of a class, where it has them: classes are drawn in proportion to their pixels above that
 FIRST, ADDED = 3, 12  # candidates that the mixture begins with, and that it may add
+LEAST_VARIANCE = 1e-5  # of a component over that of the largest: equal bands differ by rounding alone
 LEAST_CHANCE = 1e-3  # of a pixel's own class, in scores: a few wrong labels do not decide
 POWERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the prior
 PRIOR_SCENES = 6  # fewer labelled scenes do not tell how frequent a class is
@@ -217,11 +218,12 @@ def _measure(mixture: Mixture, examples: Sequence[Example], normalisation: Norma
 
 
 def _whitened(sample: Floats, count: int) -> tuple[Tensor, Tensor]:
-    """Return axes (feature, component) of variance 1, the largest first, and the mean."""
+    """Return axes (feature, component) of variance 1, the largest first, and the mean; 0 for directions of rounding."""
     exact = sample.astype(np.float64)
     power, axes = np.linalg.eigh(np.atleast_2d(np.cov(exact.T)))
     power, axes = power[::-1][:count], axes[:, ::-1][:, :count]
-    scaled = axes / np.sqrt(np.maximum(power, 1e-9 * max(float(power[0]), 1e-12)))
+    there = power > LEAST_VARIANCE * max(float(power[0]), 1e-12)
+    scaled = np.where(there, axes / np.sqrt(np.where(there, power, 1)), 0)
     return torch.from_numpy(scaled.astype(np.float32)), torch.from_numpy(exact.mean(axis=0).astype(np.float32))
 
 
