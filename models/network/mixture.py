@@ -79,6 +79,11 @@ class Mixture(nn.Module):
         if config.context:
             self.context = Part(len(CONTEXT_WINDOWS) * config.classes, 0, config.classes)
 
+    @property
+    def each_part(self) -> list[Part]:
+        """Return the parts in their order."""
+        return [part for part in self.parts if isinstance(part, Part)]
+
     def relative(self, columns: Tensor) -> Tensor:
         """Return scene values (..., column) over their norm, and its logarithm, (..., column + 1)."""
         values = columns @ self.to_values + self.centre
@@ -125,7 +130,7 @@ class Mixture(nn.Module):
 
     def of_pixels(self, image: Tensor, kinds: Collection[str], places: Tensor) -> dict[str, Tensor]:
         """Return the features (pixel, feature) of each kind, of ascending ``places`` in one image (1, c, y, x)."""
-        some = places.split(torch.bincount(places // (STRIP_ROWS * image.shape[3]), minlength=1).tolist())
+        some = places.split(torch.bincount(places // (STRIP_ROWS * image.shape[3]), minlength=1).tolist())  # type: ignore[no-untyped-call]
         found: dict[str, list[Tensor]] = {kind: [] for kind in kinds}
         for strip, (own, features) in enumerate(zip(some, self.strips(image, kinds), strict=False)):
             for kind, every in features.items():

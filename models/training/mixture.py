@@ -10,6 +10,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from spectralzoom.models.training.examples import Example
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
+HIDDEN = 48  # channels of the network of one layer
 COMPONENTS = 20, 10  # of spectra and of relative spectra, at most
 FOLDS = 4
 MOST_PIXELS = 40_000  # to fit to, of all scenes together
@@ -63,12 +65,15 @@ def _discriminants() -> Any:
 CANDIDATES = (
     *(Candidate(f"{kind}, LDA", kind, _discriminants) for kind in (VALUES, RELATIVE, AROUND)),
     *(
-        Candidate(f"{kind}, LR {weight:g}", kind, lambda weight=weight: LogisticRegression(C=weight, max_iter=300))
+        Candidate(f"{kind}, LR {weight:g}", kind, partial(LogisticRegression, C=weight, max_iter=300))
         for kind, weights in {VALUES: (0.3, 10.0), RELATIVE: (0.3, 10.0), AROUND: (0.1,)}.items()
         for weight in weights
     ),
     Candidate(
-        f"{AROUND}, MLP", AROUND, lambda: MLPClassifier(48, alpha=0.03, batch_size=128, max_iter=40, random_state=0), 48
+        f"{AROUND}, MLP",
+        AROUND,
+        partial(MLPClassifier, HIDDEN, alpha=0.03, batch_size=128, max_iter=40, random_state=0),
+        HIDDEN,
     ),
 )
 
@@ -183,7 +188,7 @@ def fit_mixture(
     segmenter = Segmenter(replace(config, parts=sizes, components=components, corrected=False)).eval()
     same = {name: one for name, one in measured.state_dict().items() if not name.startswith("parts")}
     segmenter.mixture.load_state_dict(same, strict=False)
-    for part, one in zip(segmenter.mixture.parts, parts, strict=True):
+    for part, one in zip(segmenter.mixture.each_part, parts, strict=True):
         Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
     own = _judged("mixture", mixed, taught.labels, config.classes, time.process_time() - began)
     began = time.process_time()
@@ -324,7 +329,7 @@ def _in_context(
     features = np.zeros((len(taught.labels), len(CONTEXT_WINDOWS) * classes), np.float32)
     own = copy.deepcopy(mixture)
     for learn in folds:
-        for part, one in zip(own.parts, parts, strict=True):
+        for part, one in zip(own.each_part, parts, strict=True):
             Fit.of(one, taught.features[one.kind][learn], taught.labels[learn]).store(part, classes)
         for number in np.unique(taught.place[~learn, 0]):
             here = taught.place[:, 0] == number
