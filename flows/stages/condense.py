@@ -34,6 +34,7 @@ from spectralzoom.pipeline.signal.subspace import (
     SignalStatistics,
     bands_alone,
     components_of_field,
+    components_of_raster,
     with_shared,
 )
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
@@ -220,10 +221,9 @@ def condense_raster(
         found.add(values, valid)
         whole = whole and not np.nanmax(np.abs(values - np.rint(values)), initial=0)
         out.report(0.5 * first / frame.grid.height)
-    if raster.bands <= FEW_BANDS and found.count:
-        components = bands_alone(found, 1.0 if whole else None)
-    else:
-        components = components_of_field(found, frame.wavelength_nm, false_alarm=signal.false_alarm, least=signal.least)
+    components = components_of_raster(
+        found, frame.wavelength_nm, whole=whole, false_alarm=signal.false_alarm, least=signal.least
+    )
     origin = np.zeros(raster.bands) if found.origin is None else found.origin
     writer = MosaicWriter(
         out.path / "mosaic.zarr",

@@ -36,7 +36,8 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_re
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
 from spectralzoom.pipeline.planning.coverage import cheapest_full
 from spectralzoom.pipeline.rectify.region import mosaic_rows
-from spectralzoom.pipeline.signal.subspace import FEW_BANDS
+from spectralzoom.pipeline.signal.condense import UNUSABLE, score_lines, whole_steps
+from spectralzoom.pipeline.signal.subspace import FEW_BANDS, SignalStatistics, components_of_raster
 from spectralzoom.pipeline.simulator.effects.effect import Chosen
 from spectralzoom.pipeline.simulator.render import EFFECTS
 from spectralzoom.pipeline.simulator.rig_model import Rig
@@ -96,14 +97,19 @@ def observe_scene(
 
 
 def as_it_is(scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis) -> Example:
-    """Project the pixels of a file onto the basis, as a survey of a raster does."""
+    """Project the pixels of a file onto the basis, by the components in which a survey of the raster keeps them."""
     matrix, _ = basis.matrix(scene.wavelength_nm)
-    scale = (scene.white_reference / scene.white_reference_electrons).astype(np.float32)
-    per_exposure = np.float32(DEFAULT_EXPOSURE_MS / camera.exposure_ms)
-    columns = np.empty((*scene.shape, basis.columns), np.float32)
-    for top in range(0, scene.shape[0], STRIP_ROWS):
-        values = electrons_of(scene, scene.planes[top : top + STRIP_ROWS], camera) * (scale * per_exposure)
-        columns[top : top + STRIP_ROWS] = project(values, matrix)
+    values = electrons_of(scene, scene.planes, camera) * value_of_electron(scene).astype(np.float32)
+    values *= np.float32(DEFAULT_EXPOSURE_MS / camera.exposure_ms)
+    valid = np.isfinite(values)
+    found = SignalStatistics(values.shape[-1], valid[..., 0].size)
+    found.add(values, np.asarray(valid.all(axis=2) if valid.all() else valid))
+    whole = np.allclose(values, np.rint(values), rtol=1e-6, atol=0, equal_nan=True)
+    components = components_of_raster(found, scene.wavelength_nm, whole=whole)
+    scored = score_lines(values, valid, components)
+    weights, offset = components.onto(np.where(np.isfinite(components.mean)[:, None], matrix, 0))
+    columns = whole_steps(scored.scores, 1.0) @ weights + offset
+    columns[scored.quality == UNUSABLE] = np.nan
     noise = ColumnNoise.of_bands(matrix, value_of_electron(scene), camera.read_noise_e)
     return _example(scene, grid, np.asarray(pad_by_reflection(columns, grid.padded_shape), np.float32), noise)
 

@@ -248,6 +248,15 @@ def components_of_field(
     return with_spread(replace(components, axes=np.concatenate([components.axes, axes])), found)
 
 
+def components_of_raster(
+    found: SignalStatistics, wavelength_nm: Floats, *, whole: bool, false_alarm: float = 0.01, least: int = 4
+) -> Components:
+    """Return the components in which a survey keeps a raster; few bands stay as they are, ``whole`` numbers exact."""
+    if found.bands <= FEW_BANDS and found.count:
+        return bands_alone(found, 1.0 if whole else None)
+    return components_of_field(found, wavelength_nm, false_alarm=false_alarm, least=least)
+
+
 def bands_alone(found: SignalStatistics, unit: Floats | float | None = None) -> Components:
     """Return components that are the bands themselves, in steps of ``unit`` (band,), for few bands.
 
