@@ -21,7 +21,7 @@ from spectralzoom.storage.whole_files import to_json
 
 Receipt = dict[str, Any]
 Facts = dict[str, Any]
-COSTS = ("lines", "samples", "capture_s", "patches", "multiply_adds")
+CAPTURE_COSTS = ("lines", "samples", "capture_s")
 
 
 class _Part(BaseModel):
@@ -62,7 +62,7 @@ class Savings(_Part):
     lines: Saving | None = None
     samples: Saving | None = None
     capture_s: CaptureSaving | None = None
-    patches: Saving
+    patches: Saving | None = None  # absent for weights without a network that reads patches in full
     multiply_adds: MultiplyAddsSaving
 
 
@@ -153,7 +153,7 @@ class ReceiptFields(_Part):
 
     @model_validator(mode="after")
     def _is_complete(self) -> ReceiptFields:
-        missing = [name for name in COSTS if self.source != RASTER and getattr(self.savings, name) is None]
+        missing = [name for name in CAPTURE_COSTS if self.source != RASTER and getattr(self.savings, name) is None]
         if missing:
             raise ValueError(f"savings.{missing[0]} is missing")
         return self

@@ -60,7 +60,7 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
     """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record."""
     capture = receipt["savings"].get("capture_s", {})
     lines = f"line at {receipt['settings']['camera']['exposure_ms']:g} ms, stored as captured" if capture else "pixel"
-    words = f"Reference: every {lines}, every patch read in full."
+    words = f"Reference: every {lines}{', every patch read in full' if 'patches' in receipt['savings'] else ''}."
     if capture.get("uniform") is None:
         return words
     scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"

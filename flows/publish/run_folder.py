@@ -137,7 +137,9 @@ def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[s
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
     did, patches = plan.work_done(read), plan.field.kept_patches
     work = SavingEntry(did.total, plan.costs.of_map(patches).total).as_dict()
-    of_model = {"patches": SavingEntry(len(read), len(patches)).as_dict(), "multiply_adds": {**work, **asdict(did)}}
+    of_model: dict[str, Any] = {"multiply_adds": {**work, **asdict(did)}}
+    if plan.field.described.config.corrected:  # there is a network that can read patches in full
+        of_model = {"patches": SavingEntry(len(read), len(patches)).as_dict(), **of_model}
     if plan.field.raster is not None:
         return of_model
     entries = capture_savings([*plan.passes.coarse, *fine.sweeps], plan.passes.full, plan.field.camera, plan.field.grid)

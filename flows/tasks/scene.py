@@ -273,11 +273,12 @@ def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
 
 def _taught_pixels(scene: RasterScene, weights: Description) -> NDArray[np.bool_] | None:
     """Return the pixels (y, x) of a file whose labels the weights were trained on; None for another file."""
-    known = weights.record.get("split", {}).get("content", {})
+    known = weights.record.get("split", {}).get("taught", {})
     packed = next((known[one] for one in scene.content if one in known), None)
     if packed is None:
         return None
-    bits = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8)
+    most = -(-math.prod(scene.shape) // 8)
+    bits = np.frombuffer(zlib.decompressobj().decompress(base64.b64decode(packed), most), np.uint8)
     return np.unpackbits(bits, count=math.prod(scene.shape)).reshape(scene.shape).astype(bool)
 
 

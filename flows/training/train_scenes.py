@@ -99,8 +99,8 @@ class Scenes:
     @property
     def split(self) -> dict[str, Any]:
         """Return the record by which an evaluation tells scenes and pixels of the training."""
-        content = {name: pack_mask(mask) for name, mask in self.train.content.items()}
-        return {"train": self.train.keys, "content": content, "validation": self.validation.keys}
+        taught = {name: pack_mask(mask) for name, mask in self.train.content.items()}
+        return {"train": self.train.keys, "taught": taught, "validation": self.validation.keys}
 
     def normalised(self, normalisation: Normalisation) -> Scenes:
         """Normalise the scenes; their basis spans their bands and reaches every column."""

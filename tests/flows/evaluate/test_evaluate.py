@@ -119,7 +119,7 @@ def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Pat
     halves[0][:12] = True
     halves[1][12:] = True
     paths = [
-        write_weights(tmp_path / f"{number}.safetensors", number, split={"content": _content(scene, half)})
+        write_weights(tmp_path / f"{number}.safetensors", number, split={"taught": _content(scene, half)})
         for number, half in enumerate((halves[0], halves[1], halves[0]))
     ]
     with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
@@ -132,7 +132,7 @@ def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Pat
 def test_training_frames_are_recognised_in_other_bands(data: Path, tmp_path: Path):
     """The content of the files identifies a frame, not the bands that are read."""
     scene = scene_at(data)
-    split = {"train": {"001": "of other bands"}, "content": _content(scene, np.ones(scene.shape, bool))}
+    split = {"train": {"001": "of other bands"}, "taught": _content(scene, np.ones(scene.shape, bool))}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
     assert evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))["left_out"] == ["001"]
 

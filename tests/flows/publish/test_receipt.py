@@ -15,7 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 from spectralzoom.flows.publish.field_map import RIGHT_RGB, WRONG_RGB, FieldMap, error_address
-from spectralzoom.flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt
+from spectralzoom.flows.publish.receipt import CAPTURE_COSTS, Receipt, build_receipt, check_receipt
 from spectralzoom.flows.publish.receipt_table import format_score, headline, print_summary
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.survey_settings import Settings
@@ -35,7 +35,7 @@ def scored(miou: float, overall: float, **per_class: float | None) -> dict[str, 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
     """Return a receipt with made-up figures that has every field of the design."""
     saving = {"done": 50, "full": 100, "ratio": 0.5, "full_is": "predicted"}
-    savings: dict[str, object] = {name: dict(saving) for name in reversed(COSTS)}
+    savings: dict[str, object] = {name: dict(saving) for name in ("multiply_adds", "patches", *reversed(CAPTURE_COSTS))}
     savings["multiply_adds"] = {**saving, "overview": 20, "score": 1, "detail": 29}
     savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
     accuracy = {  # the map shows wheat, but the labels have none
@@ -89,7 +89,7 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
     receipt = make_receipt()
     before = "survey source scene seed started finished versions settings stages savings data_bytes accuracy effects"
     assert " ".join(receipt) == f"{before} effects_total products"
-    assert set(receipt["savings"]) == {*COSTS}
+    assert set(receipt["savings"]) == {*CAPTURE_COSTS, "patches", "multiply_adds"}
     assert "accuracy" not in make_receipt(labels=False)
     assert check_receipt(json.loads(to_json(receipt))) == receipt
     text = to_json({"nan": float("nan"), "list": [np.float64("inf"), np.int64(3)], "tuple": (1.5, None, True)})
@@ -102,7 +102,7 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
     [
         (("versions",), None),
         (("stages", 0, "key"), None),
-        (("savings", "patches"), None),
+        (("savings", "multiply_adds"), None),
         (("data_bytes", "kept"), None),
         (("savings", "lines", "full_is"), None),
         (("savings", "multiply_adds", "score"), None),
