@@ -67,7 +67,12 @@ class Taken:
     @property
     def gains_text(self) -> str:
         """Return the gains as the end of `text`."""
-        return "".join(f", {key} = {gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items())
+        return "".join(f", {key} = {self.settings[key]}" for key in self.gains)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Return gains and other settings as texts, by key."""
+        return {key: f"{gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items()} | dict(self.frame)
 
 
 def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
@@ -154,8 +159,8 @@ def _exposure_at_gain(frame: Taken, cube: Taken, usual_ms: float, *, stated: boo
     were taken with another binning, area or mode, gains or times differ without a unit, or detectors have different
     ratios.
     """
-    for key in sorted(frame.frame.keys() & cube.frame.keys()):
-        _check_same(frame, cube, key, frame.frame[key], cube.frame[key])
+    for key in sorted(frame.settings.keys() & cube.settings.keys() - (frame.gains.keys() & cube.gains.keys())):
+        _check_same(frame, cube, key, frame.settings[key], cube.settings[key])
     gain = 1.0
     for key in sorted(frame.gains.keys() & cube.gains.keys()):
         (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
@@ -201,9 +206,8 @@ def check_parts(one: Taken, first: Taken) -> None:
 
 def _alone(one: Taken, other: Taken) -> list[str]:
     """Return a note on the gains, modes and binning that one header states and the other does not."""
-    told = {key: f"{gain:g} {unit}".strip() for key, (gain, unit) in one.gains.items()} | dict(one.frame)
-    keys = [key for key in told if key not in {**other.gains, **other.frame} and not _TIME.fullmatch(key)]
-    texts = ", ".join(f"{key} = {told[key]}" for key in keys)
+    keys = (key for key in one.settings if key not in other.settings and not _TIME.fullmatch(key))
+    texts = ", ".join(f"{key} = {one.settings[key]}" for key in keys)
     return [f"{one.where} states {texts}, {other.where} does not: the same is assumed"] if texts and other.where else []
 
 

@@ -210,7 +210,8 @@ REFUSED: dict[str, tuple[Header, Header, str]] = {
         {},
         "scan.hdr states gain of (1.0, 'x') and of (2.0, 'x'); correct",
     ),
-    "gain mode": ({"gain mode": "mode 1"}, {"Gain_Mode": "low"}, "with gain mode = low, scan.hdr"),
+    "gain mode": ({"gain mode": "mode 1"}, {"gain_mode": "mode 2"}, "with gain mode = mode 2, scan.hdr with mode 1"),
+    "gain in words and numbers": ({"gain": "low"}, {"gain": "2 x"}, "with gain = 2 x, scan.hdr with low; give"),
     "ISO": ({"ISO": 100}, {"iso": 200}, "was taken with iso = 200, scan.hdr with 100; give a frame"),
     "binning of several words": (
         {"binning factor spectral": 2},
