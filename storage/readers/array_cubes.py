@@ -73,7 +73,8 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         near = _in_scope(arrays, name)
         bands, bad, doubts = _bands_of(name, array, dims[order[2]] if len(order) == 3 else "", near, count)
         geobox, of_place = _place_of(name, dims, order, near, {**about, **array.attrs})
-        acquired = acquired_of({**about, **array.attrs, **_time_of(near)})
+        time, of_time = _time_of(near)
+        acquired = acquired_of({**about, **array.attrs, **time})
         packing = _packing_of(array.attrs)
         native = array.dtype.newbyteorder("=")
         unpack, nodata = _unpacking(packing, native)
@@ -90,7 +91,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
             return block if unpack is None else unpack(block)
 
     unit = str(array.attrs.get("units", "")).strip()
-    said = [*acquired.notes, *array.notes, *notes]
+    said = [*of_time, *acquired.notes, *array.notes, *notes]
     said += [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
     said += [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
     exposure_ms = None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)
@@ -113,16 +114,21 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
     )
 
 
-def _time_of(near: Arrays) -> dict[str, Any]:
-    """Return the value of a coordinate ``time`` with one element, by its units; empty where there is none."""
+def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
+    """Return the value of a coordinate ``time`` with one element, by its units, if there is one; and notes."""
     found = near.get("time")
     if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
-        return {}
+        return {}, []
     about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
     import xarray as xr  # takes a second
 
     time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
-    return {"time": xr.decode_cf(time)["time"].values}
+    try:
+        coder = xr.coders.CFDatetimeCoder(use_cftime=False)
+        return {"time": xr.decode_cf(time, decode_times=coder)["time"].values}, []
+    except Exception as error:  # of many kinds, by units and calendar
+        words = " ".join(f"{one}" for one in about.values())[:80]
+        return {}, [f"time in {words!r} is not used as the day of acquisition ({type(error).__name__}); use --visit"]
 
 
 _CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
