@@ -30,11 +30,14 @@ _OWN_UNIT = {"tint": "ms", "shutter": "ms"}  # of Specim and of Resonon, whose h
 _UNIT = rf"(?:\s*(?:in )?[(\[]\s*(?P<unit>\w+)\s*[)\]]| (?:in )?(?P<word>{'|'.join(_UNITS)})|(?P<end>ms|us|db))?"
 _TIME = re.compile(
     r"(?:(?:camera|sensor|frame|line) )?(?P<name>exposure|integration|shutter|tint|t int|(?:exp|int)(?= ?time))"
-    rf" ?(?:time|period|duration)? ?(?P<detector>\d?){_UNIT}"
+    rf"s? ?(?:times?|period|duration|(?P<speed>speed))? ?(?P<detector>\d?){_UNIT}"
 )
 _GAIN = re.compile(r"(?:(?:camera|sensor|detector|analog|analogue|digital|em) )?gain ?(?P<detector>\d?)" + _UNIT)
-_FRAME = re.compile(r"(?:.* )?binning(?: ?\w+)?|aoi (?:left|top)")
-_VALUE = re.compile(r"(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)")
+_FRAME = re.compile(r"(?:.* )?binning.*|aoi (?:left|top)")
+_MODE = re.compile(r"(?:.* )?gain ?(?:mode|setting|state|level|stage|index)|(?:preamp|conversion) ?gain|iso(?: .*)?")
+_VALUE = re.compile(
+    r"(?:(?P<over>1) ?/ ?)?(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)"
+)
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Taken:
     exposures: Mapping[str, float] = field(default_factory=dict)  # [ms], by the number of the detector
     times: Mapping[str, float] = field(default_factory=dict)  # exposures without a unit, by their key
     gains: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # number and unit (dB, x or none), by key
-    frame: Mapping[str, str] = field(default_factory=dict)  # binning, first elements and gain in words, by key
+    frame: Mapping[str, str] = field(default_factory=dict)  # settings that are compared as texts, by key
     notes: tuple[str, ...] = ()
     conflicts: tuple[str, ...] = ()  # keys that contradict each other
 
@@ -64,14 +67,19 @@ class Taken:
     @property
     def gains_text(self) -> str:
         """Return the gains as the end of `text`."""
-        return "".join(f", {key} = {gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items())
+        return "".join(f", {key} = {self.settings[key]}" for key in self.gains)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Return gains and other settings as texts, by key."""
+        return {key: f"{gain:g} {unit}".rstrip() for key, (gain, unit) in self.gains.items()} | dict(self.frame)
 
 
 def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     """Return what headers (fields, comments, attributes) of one file state; messages call it ``where``.
 
-    Keys are those of several makes, with the unit in key or value; lines of ``description`` may be keys. Numbers that
-    are no exposure are left out with a note.
+    Keys are those of several makes, with the unit in key or value; ``description`` may hold keys, too. An exposure that
+    cannot be read is kept as a text, with a note.
     """
     exposures: dict[str, tuple[str, float]] = {}
     times: dict[str, float] = {}
@@ -81,10 +89,13 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     conflicts: list[str] = []
     every = [(key, str(value)) for header in headers for key, value in header.items()]
     about = "\n".join(value for key, value in every if key == "description")
-    for key, value in (*every, *re.findall(r"^\s*([^=:\n]+)[=:](.*)$", about, re.MULTILINE)):
+    pairs = re.split(r"[\n;]|,(?=\s*[^\W\d][^,;=:\n]*[=:])", about)
+    for key, value in (*every, *(re.split("[=:]", pair, maxsplit=1) for pair in pairs if re.search("[=:]", pair))):
         name = re.sub(r"[\s_.,/]+", " ", key.lower()).strip()
         if _FRAME.fullmatch(name):
             conflicts += _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)) or value.strip().lower())
+        elif _MODE.fullmatch(name):
+            conflicts += _put(frame, name, value.strip().lower())
         elif (match := _GAIN.fullmatch(name)) is not None:
             number, unit = _number(value, match)
             if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
@@ -93,10 +104,11 @@ def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
                 conflicts += _put(gains, name[: match.end("detector")].strip(), (number, unit))
         elif (match := _TIME.fullmatch(name)) is not None:
             number, unit = _number(value, match)
-            unit = unit or _OWN_UNIT.get(match["name"], "")
+            unit = unit or _OWN_UNIT.get(match["name"] if match["speed"] is None else "", "")
             if number is None and not re.search(r"\d|nan|inf", value.lower()):
                 continue  # the state of a shutter
-            if number is None or number <= 0 or (unit and unit not in TO_MS):
+            if number is None or number <= 0 or unit not in ("" if match["speed"] is None else "s", *TO_MS):
+                conflicts += _put(frame, name, value.strip().lower())
                 notes.append(f"{where}: {name} = {value.strip()[:40]} is no exposure that can be read, and is left out")
             elif not unit:
                 conflicts += _put(times, name, number)
@@ -121,7 +133,11 @@ def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
         return None, ""
     of_key = key["unit"] or key["word"] or key["end"]
     units = {_UNITS.get(word, word) for word in (match["unit"], of_key) if word}
-    return finite_number(match["number"].replace(",", ".")), " and ".join(sorted(units))
+    number = finite_number(match["number"].replace(",", "."))
+    if match["over"] is not None:  # 1/100, of seconds if no unit is stated
+        number = 1 / number if number else None
+        units = units or {"s"}
+    return number, " and ".join(sorted(units))
 
 
 def all_alike(values: Iterable[float]) -> bool:
@@ -140,10 +156,11 @@ def _exposure_at_gain(frame: Taken, cube: Taken, usual_ms: float, *, stated: boo
     """Return the exposure [ms] of a frame at the gain of the cube; None if it is not known.
 
     Times without a unit count if both headers have the same key: the cube's is ``usual_ms``. Raises SceneError: they
-    were taken with another binning or area, gains differ without a unit, or detectors have different ratios.
+    were taken with another binning, area or mode, gains or times differ without a unit, or detectors have different
+    ratios.
     """
-    for key in sorted(frame.frame.keys() & cube.frame.keys()):
-        _check_same(frame, cube, key, frame.frame[key], cube.frame[key])
+    for key in sorted(frame.settings.keys() & cube.settings.keys() - (frame.gains.keys() & cube.gains.keys())):
+        _check_same(frame, cube, key, frame.settings[key], cube.settings[key])
     gain = 1.0
     for key in sorted(frame.gains.keys() & cube.gains.keys()):
         (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
@@ -160,13 +177,20 @@ def _exposure_at_gain(frame: Taken, cube: Taken, usual_ms: float, *, stated: boo
         return frame.exposure_ms * gain
     for key in sorted(frame.times.keys() & cube.times.keys()):
         return frame.times[key] / cube.times[key] * usual_ms * gain
+    of_frame, of_cube = ([*taken.exposures.values(), *taken.times.values()] for taken in (frame, cube))
+    of_cube = of_cube or [usual_ms] * stated
+    if of_frame and of_cube and not all_alike([*of_frame, *of_cube]):
+        key = next(iter({**frame.times, **cube.times}), "exposure")
+        units = ("(no unit)" if taken.times else "ms" for taken in (frame, cube))
+        texts = (f"{of[0]:g} {unit}" for of, unit in zip((of_frame, of_cube), units, strict=True))
+        _check_same(frame, cube, key, *texts)
     return None if gain == 1 else usual_ms * gain
 
 
 def _check_same(frame: Taken, cube: Taken, key: str, one: str, other: str) -> None:
     """Refuse a frame with another setting than the cube's (SceneError)."""
     if one != other:
-        unit = ", or state the unit of both (dB or x)" if "(no unit)" in one + other else ""
+        unit = ", or state the unit of both (ms, dB or x)" if "(no unit)" in one + other else ""
         both = f"{frame.where} was taken with {key} = {one}, {cube.where} with {other}"
         raise SceneError(f"{both}; give a frame taken with the cube's own settings{unit}")
 
@@ -180,6 +204,13 @@ def check_parts(one: Taken, first: Taken) -> None:
             raise SceneError(f"{both}; name these parts one by one")
 
 
+def _alone(one: Taken, other: Taken) -> list[str]:
+    """Return a note on the gains, modes and binning that one header states and the other does not."""
+    keys = (key for key in one.settings if key not in other.settings and not _TIME.fullmatch(key))
+    texts = ", ".join(f"{key} = {one.settings[key]}" for key in keys)
+    return [f"{one.where} states {texts}, {other.where} does not: the same is assumed"] if texts and other.where else []
+
+
 Frames = Mapping[str, tuple[NDArray[np.float32], Taken]]  # (sample, band) DN, by dark and white
 
 
@@ -190,8 +221,9 @@ def match_exposures(
 
     ``lines_ms`` (line,) are exposures of the lines, and ``stated`` is whether a file has them. A white frame that
     states no exposure is assumed to have ``usual_ms``, by default the median of the lines. A dark frame of another
-    exposure is used as it is. Raises SceneError: a header contradicts itself, a frame has another binning, another gain
-    without a unit, or a dark frame may change values by more than 5 %.
+    exposure is used as it is. Raises SceneError: a header contradicts itself, a frame has another binning or mode,
+    another gain or exposure without a unit, or a dark frame of another exposure than the lines may change values by
+    more than 5 %.
     """
     for taken in (cube, *(taken for _, taken in frames.values())):
         if taken.conflicts:
@@ -202,7 +234,7 @@ def match_exposures(
     found: dict[str, float] = {}
     for kind in sorted(frames.keys() & {"dark", "white"}):
         frame = frames[kind][1]
-        notes += frame.notes
+        notes += [*frame.notes, *_alone(frame, cube), *_alone(cube, frame)]
         ms = _exposure_at_gain(frame, cube, usual, stated=stated)
         both = f"{frame.where} was taken with {frame.text}, the lines with {lines}"
         if ms is not None:
@@ -236,6 +268,6 @@ def _dark_note(frames: Frames, dark_ms: float, white_ms: float, lines_ms: NDArra
     most = level * max(float(of_lines.max()), abs(white_ms / dark_ms - 1))
     what = f"{what}, and {of_white.where} with {of_white.text}"
     effect = f"values may be off by up to {most:.2g} of white, if all of it is dark current"
-    if most > MOST_DARK_ERROR:
+    if most > MOST_DARK_ERROR and not all_alike([dark_ms, *lines_ms]):
         raise SceneError(f"{what}: {effect}; give one of the exposure of the lines, or correct the header")
     return f"{what}: {kept}; {effect}"

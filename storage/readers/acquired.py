@@ -16,6 +16,7 @@ NAMES = (
     *("datetimeoriginal", "datetimedigitized", "timecoveragestart", "startdatetime", "datatakesensingstart"),
     *("sensingstart", "sensingtime", "sensingdate", "capturetime", "capturedate", "observationtime", "observationdate"),
     *("flightdate", "productstarttime", "starttime", "scenecentertime", "time", "datetime"),
+    *("timestamp", "imagedate", "date"),
     *("tifftagdatetime", "exifdatetime"),  # of the image, or of its last change
 )
 _PREFIX = re.compile(r"^(ncglobal|exif(?=datetime[od])|emit|datatake1|spacecraft)")

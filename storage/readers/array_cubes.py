@@ -72,11 +72,11 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
         dims = [dim or f"axis {at}" for at, dim in enumerate((array.dims or DIMS)[: array.ndim])]
         near = _in_scope(arrays, name)
-        bands, bad, doubts = _bands_of(
-            name, {**about, **array.attrs}, dims[order[2]] if len(order) == 3 else "", near, count
-        )
-        geobox, of_place = _place_of(name, dims, order, near, {**about, **array.attrs})
-        acquired = acquired_of({**about, **array.attrs, **_time_of(near)})
+        stated = {**about, **array.attrs}
+        bands, bad, doubts = _bands_of(name, stated, dims[order[2]] if len(order) == 3 else "", near, count)
+        geobox, of_place = _place_of(name, dims, order, near, stated)
+        time, of_time = _time_of(near)
+        acquired = acquired_of({**stated, **time})
         packing = _packing_of(array.attrs, array.where, count)
         native = array.dtype.newbyteorder("=")
         unpack, nodata = _unpacking_bands(packing, native, count)
@@ -93,7 +93,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
             return block if unpack is None else unpack(block)
 
     unit = str(array.attrs.get("units", "")).strip()
-    said = [*acquired.notes, *array.notes, *notes]
+    said = [*of_time, *acquired.notes, *array.notes, *notes]
     said += [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
     said += [
         f"its {key} = {_shown(value)} is not applied: only scale_factor and add_offset are"
@@ -121,16 +121,21 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
     )
 
 
-def _time_of(near: Arrays) -> dict[str, Any]:
-    """Return the value of a coordinate ``time`` with one element, by its units; empty where there is none."""
+def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
+    """Return the value of a coordinate ``time`` with one element, by its units, if there is one; and notes."""
     found = near.get("time")
     if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
-        return {}
+        return {}, []
     about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
     import xarray as xr  # takes a second
 
     time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
-    return {"time": xr.decode_cf(time)["time"].values}
+    try:
+        coder = xr.coders.CFDatetimeCoder(use_cftime=False)
+        return {"time": xr.decode_cf(time, decode_times=coder)["time"].values}, []
+    except Exception as error:  # of many kinds, by units and calendar
+        words = " ".join(f"{one}" for one in about.values())[:80]
+        return {}, [f"time in {words!r} is not used as the day of acquisition ({type(error).__name__}); use --visit"]
 
 
 _CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
@@ -76,6 +76,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
         at_a_time = math.prod(block) * file.count * item + claimed // file.height * BLOCK_LINES
         check_memory(path, at_a_time if driver in _CALLED else claimed * 3)
+        orientation, exif = _exif_of(path)
         kinds = [kind.name for kind in file.colorinterp]
         if scaled and kinds == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
@@ -93,7 +94,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
         tags, (names, colours) = _tags_of(file, keep), ([one[at] for at in keep] for one in (file.descriptions, kinds))
         known = bands_of_fields(tags, names, str(path), colours)
         bad, doubts = bad_bands(tags, len(keep))
-        acquired = acquired_of({**file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
+        acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
         notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
         at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
@@ -122,7 +123,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             notes=tuple(notes),
         )
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return _upright(source if plain else rescaled(source, scale, offset), _orientation_of(path))
+    return _upright(source if plain else rescaled(source, scale, offset), orientation)
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
@@ -200,9 +201,10 @@ _TURNS: Mapping[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
 }
 
 
-def _orientation_of(path: Path) -> int:
-    """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP; 1 (upright) without a valid one."""
+def _exif_of(path: Path) -> tuple[int, dict[str, Any]]:
+    """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP, else 1 (upright); and tags of Exif."""
     try:
+        more: dict[int, Any] = {}  # GDAL reads those of a JPEG, but not of a PNG
         if path.suffix.lower() in (".tif", ".tiff"):  # of any number of bands, which Pillow does not open
             with tifffile.TiffFile(path) as file:
                 tag = file.pages.first.tags.get(_ORIENTATION)
@@ -211,9 +213,10 @@ def _orientation_of(path: Path) -> int:
             with warnings.catch_warnings(), Image.open(path) as image:
                 warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
                 found = image.getexif().get(_ORIENTATION, 1)
+                more = image.getexif().get_ifd(ExifTags.IFD.Exif)
     except Exception:  # of a kind without such tags; a damaged file is refused where it is read
-        return 1
-    return int(found) if found in _TURNS else 1
+        return 1, {}
+    return int(found) if found in _TURNS else 1, {f"EXIF_{ExifTags.TAGS.get(tag, tag)}": more[tag] for tag in more}
 
 
 def _upright(source: CubeSource, tag: int) -> CubeSource:

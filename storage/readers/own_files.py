@@ -13,6 +13,8 @@ from typing import Any
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.cube_sources import reading
 
+# endings of metadata that GDAL finds by other names than the image's (Landsat, Pleiades, SPOT, ALOS, RapidEye)
+_METADATA = (".txt", ".xml", ".imd", ".rpb", ".rpc", ".pvl", ".dim", ".eph", ".pass")
 _OF_TIFF = (".ovr", ".msk")  # endings of files beside an image, which GDAL opens by their content
 
 
@@ -48,14 +50,15 @@ def stated_file(folder: Path, name: str, where: str) -> Path:
 
 
 def check_sidecars(image: Path) -> None:
-    """Check the files beside an image whose names begin as its own, before GDAL opens them.
+    """Check the files beside an image that GDAL may open: metadata, and those whose names begin as its own.
 
     Raises SceneError: one is a link out of the folder or no file; or an overview or mask is no TIFF or names a file.
     """
     rasterio = importlib.import_module("rasterio")
     stem = image.stem.casefold()
     with os.scandir(image.parent) as entries:
-        beside = [image.parent / one.name for one in entries if one.name.casefold().startswith(stem)]
+        names = [one.name for one in entries]
+    beside = [image.parent / one for one in names if one.casefold().startswith(stem) or one.lower().endswith(_METADATA)]
     for path in beside:
         if path == image or within(image, path).is_dir():
             continue

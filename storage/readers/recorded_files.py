@@ -147,13 +147,13 @@ def with_bits(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera
 
 
 def references_of(
-    cube: FileCube, camera: LineCamera, exposure_ms: Floats, white_reference: ArrayLike
+    cube: FileCube, camera: LineCamera, exposure_ms: Floats, white_reference: ArrayLike, *, stated: bool
 ) -> tuple[References, list[str]]:
     """Return the references of a cube by its frames, and notes.
 
-    ``exposure_ms`` (line,) are those of its lines, ``white_reference`` is the default value of the white reference, one
-    or (band,). Without a white frame, values are those of the exposure of the camera. Raises SceneError: a frame does
-    not fit the cube, or white is not brighter than dark.
+    ``exposure_ms`` (line,) are those of its lines, by a file if ``stated``; ``white_reference`` is the default value of
+    the white reference, one or (band,). Without a white frame, values are those of the exposure of the camera. Raises
+    SceneError: a frame does not fit the cube, or white is not brighter than dark.
     """
     name, source, frames = cube.name, cube.source, cube.frames
     frame = source.shape[1:]
@@ -163,7 +163,7 @@ def references_of(
         taken_of(frames),
         source.taken,
         exposure_ms,
-        stated=cube.exposure_ms is not None,
+        stated=stated,
         usual_ms=None if "white" in frames and cube.owns(frames["white"]) else camera.exposure_ms,
     )
     notes += more

@@ -186,9 +186,10 @@ def _recording_of(
         notes += more
     camera, more = _timed(camera, cubes)
     notes += more
+    stated = any(cube.exposure_ms is not None for cube in cubes)
     sweeps: list[RecordedSweep] = []
     for cube in cubes:
-        found, more = _sweeps_of(cube, camera, white_reference)
+        found, more = _sweeps_of(cube, camera, white_reference, stated=stated)
         sweeps += found
         notes += more
     light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
@@ -260,8 +261,13 @@ def _timed(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera, l
     return camera, [f"lines follow each other every {period:.6g} ms, by their times"]
 
 
-def _sweeps_of(cube: FileCube, camera: LineCamera, white_reference: ArrayLike) -> tuple[list[RecordedSweep], list[str]]:
-    """Return the sweep of one cube, or the sweeps that its pointing table cuts it into, and notes."""
+def _sweeps_of(
+    cube: FileCube, camera: LineCamera, white_reference: ArrayLike, *, stated: bool
+) -> tuple[list[RecordedSweep], list[str]]:
+    """Return the sweep of one cube, or the sweeps that its pointing table cuts it into, and notes.
+
+    ``stated`` is whether a file of any cube says the exposure of the camera.
+    """
     source, pointing = cube.source, cube.pointing
     assert pointing is not None
     valid = source.valid & pointing.valid
@@ -270,7 +276,7 @@ def _sweeps_of(cube: FileCube, camera: LineCamera, white_reference: ArrayLike) -
     if exposure_ms is None:
         notes.append(f"{cube.name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
         exposure_ms = np.full(source.shape[0], camera.exposure_ms)
-    references, more = references_of(cube, camera, exposure_ms, white_reference)
+    references, more = references_of(cube, camera, exposure_ms, white_reference, stated=stated)
     notes += more
     names = (cube.name,) if pointing.part is None else tuple(name for name in dict.fromkeys(pointing.part) if name)
     sweeps: list[RecordedSweep] = []

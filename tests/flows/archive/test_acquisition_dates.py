@@ -86,6 +86,20 @@ def picture(folder: Path) -> Path:
     return folder / "a.jpg"
 
 
+def dated(folder: Path) -> Path:
+    told = {"wavelength_units": "nm", "wavelength": "{640, 550, 460}", "date": "2022-07-01", "time": "10:11:12"}
+    write_envi(folder / "a.img", PIXELS, "bil", **told)
+    return folder / "a.hdr"
+
+
+def png(folder: Path) -> Path:
+    exif = Image.Exif()
+    exif[0x0132] = "2024:01:01 00:00:00"
+    exif.get_ifd(0x8769)[0x9003] = "2022:07:01 10:11:12"
+    Image.fromarray(PIXELS).save(folder / "a.png", exif=exif)
+    return folder / "a.png"
+
+
 def netcdf(folder: Path) -> Path:
     about = {"time_coverage_start": "2022-07-01T10:11:12Z", "date_created": "2024-01-01"}
     bands = ("band", np.array([640.0, 550.0, 460.0]), {"units": "nm"})
@@ -101,10 +115,24 @@ def netcdf_with_time(folder: Path) -> Path:
     return folder / "b.nc"
 
 
-@pytest.mark.parametrize("write", [envi, picture, netcdf, netcdf_with_time])
+@pytest.mark.parametrize("write", [envi, dated, picture, png, netcdf, netcdf_with_time])
 def test_readers_find_the_date(tmp_path: Path, write: Any) -> None:
     """The kinds of files give the same moment, and none the day on which the file was made."""
     assert open_cube(write(tmp_path)).attrs["acquired"] == "2022-07-01T10:11:12Z"
+
+
+@pytest.mark.parametrize(
+    ("units", "calendar"),
+    [("days since 2019-02-25", "noleap"), ("seconds since sensor start", "standard"), ("months since 2019-01-01", "")],
+)
+def test_a_time_that_cannot_be_read_is_no_date(tmp_path: Path, units: str, calendar: str) -> None:
+    """The cube is read; a note names units and calendar."""
+    with xarray.open_dataset(netcdf(tmp_path)) as opened:
+        cube = opened.drop_attrs().assign_coords(time=((), 5.0, {"units": units, "calendar": calendar}))
+        cube.to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    found = open_cube(tmp_path / "b.nc")
+    assert found.attrs.get("acquired") is None
+    assert any(f"time in '{units} {calendar}" in note for note in found.attrs["notes"])
 
 
 @pytest.mark.parametrize(

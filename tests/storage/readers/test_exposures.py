@@ -65,11 +65,13 @@ def assert_true(recording: Recording, truth: Sequence[NDArray[np.floating]] = (T
         ({"tint": "10.000000"}, {"tint": "5.000000"}),
         ({"tint1": 10, "tint2": 4}, {"tint1": 5, "tint2": 2}),
         ({"shutter": 10}, {"shutter": 5}),
-        ({"integration time": "10 ms"}, {"integration time": "5000 us"}),
+        ({"integration times": "10 ms"}, {"integration time": "5000 us"}),
         ({"exposure time, us": 10_000}, {"exposure_time": "0.005 s"}),
         ({"IntegrationTime": 10_000}, {"IntegrationTime": 5000}),
         ({"description": "{\n Exposure time [µs] = 10000\n}"}, {"camera_exposure_ms": "5,0"}),
         ({"exposure ms": 10, "integration time (s)": 0.01}, {"t_int (milliseconds)": 5}),
+        ({"description": "{Camera, Integration time = 10 ms}"}, {"description": "{Exposure: 5,0 ms, Gain: high}"}),
+        ({"shutter speed": "1/100 s"}, {"shutter speed": "1/200"}),
     ],
 )
 def test_values_are_scaled_by_the_stated_exposures(tmp_path: Path, cube: Header, white: Header) -> None:
@@ -167,7 +169,11 @@ def test_numbers_without_frames_are_not_scaled(tmp_path: Path) -> None:
         ({"exposure (frames)": 3}, "exposure (frames) = 3 is no exposure that can be read"),
         ({"exposure (ms)": "5 us"}, "exposure (ms) = 5 us is no exposure that can be read"),
         ({"tint": "{5, 8}"}, "tint = 5, 8 is no exposure that can be read"),
-        ({"integration time": 5}, "with integration time = 5 (no unit), the lines with 10 ms: the same exposure is"),
+        ({"integration time": 10}, "with integration time = 10 (no unit), the lines with 10 ms: the same exposure is"),
+        (
+            {"gain": "2 x", "binning": 2},
+            "scan.white.hdr states gain = 2 x, binning = 2, scan.hdr does not: the same is",
+        ),
         ({"shutter": "open"}, "an exposure that is not stated"),
     ],
 )
@@ -204,6 +210,17 @@ REFUSED: dict[str, tuple[Header, Header, str]] = {
         {},
         "scan.hdr states gain of (1.0, 'x') and of (2.0, 'x'); correct",
     ),
+    "gain mode": ({"gain mode": "mode 1"}, {"gain_mode": "mode 2"}, "with gain mode = mode 2, scan.hdr with mode 1"),
+    "gain in words and numbers": ({"gain": "low"}, {"gain": "2 x"}, "with gain = 2 x, scan.hdr with low; give"),
+    "ISO": ({"ISO": 100}, {"iso": 200}, "was taken with iso = 200, scan.hdr with 100; give a frame"),
+    "binning of several words": (
+        {"binning factor spectral": 2},
+        {"binning factor spectral": 1},
+        "binning factor spectral = 1, scan.hdr with 2",
+    ),
+    "exposures in a list": ({MS: "{10, 20}"}, {MS: "{5, 10}"}, "with exposure (ms) = 5, 10, scan.hdr with 10, 20"),
+    "speed without a unit": ({"shutter speed": 100}, {"shutter speed": 200}, "shutter speed = 200, scan.hdr with 100"),
+    "one unit": ({"exposure": 10}, {"exposure": "5 ms"}, "with exposure = 5 ms, scan.hdr with 10 (no unit); give a"),
     "area": ({";AOI left": 0}, {";AOI left": 480}, "with aoi left = 480, scan.hdr with 0; give a frame taken"),
     "detectors": (
         {"tint1": 10, "tint2": 4},
@@ -220,6 +237,19 @@ def test_contradictions_are_refused_by_name(tmp_path: Path, case: str) -> None:
     with pytest.raises(SceneError) as caught:
         open_recording(write_taken(tmp_path / "a", (10, cube), (10, white)))
     assert message in str(caught.value)
+
+
+def test_a_cube_without_an_exposure_has_that_of_the_others(tmp_path: Path) -> None:
+    """They are of one camera; a note says so."""
+    for name, header in (("a", {MS: 10}), ("b", {})):
+        write(tmp_path / f"{name}.img", numbers(TRUTH, 10), **NM, **header)
+        rows = [f"0,{line / 100}" for line in range(LINES)]
+        (tmp_path / f"{name}.pointing.csv").write_text("\n".join(["angle_x_deg,angle_y_deg", *rows]))
+    write(tmp_path / "white.img", numbers(np.ones((1, SAMPLES, BANDS)), 5), **{MS: 5})
+    write(tmp_path / "dark.img", numbers(np.ones((1, SAMPLES, BANDS)), 0))
+    recording = open_recording(tmp_path)
+    assert_true(recording, [TRUTH] * 2)
+    assert "b: nothing says the exposure: 10 ms is assumed" in recording.notes
 
 
 def test_a_scene_without_frames_may_contradict_itself(tmp_path: Path) -> None:
@@ -257,6 +287,8 @@ def test_a_dark_frame_of_another_exposure_is_used_or_refused(tmp_path: Path) -> 
     assert any(expected in note for note in recording.notes), recording.notes
     with pytest.raises(SceneError, match=r"dark frame scan\.dark\.hdr was taken with 1 ms, .* up to 0\.36 of white"):
         open_recording(write_taken(tmp_path / "a", (10, {MS: 10}), (10, {MS: 10}), {MS: 1}))
+    recording = open_recording(write_taken(tmp_path / "a", (10, {MS: 10}), (4, {MS: 4}), {MS: 10}))
+    assert any("and the white frame scan.white.hdr with 4 ms: it is used as it is" in note for note in recording.notes)
 
 
 def test_an_overexposed_white_frame_is_still_named(tmp_path: Path) -> None:
