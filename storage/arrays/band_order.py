@@ -46,11 +46,13 @@ def sort_bands(wavelength_nm: ArrayLike) -> SortedBands:
 def by_wavelength(opened: Labelled) -> Labelled:
     """Sort bands by wavelength, for ``.sel(wavelength=660, method="nearest")``, and index them by it and by ``band``.
 
-    ``detector`` is the number of each band's detector, as `sort_bands` finds it: overlapping ones alternate.
+    ``detector`` is the number of each band's detector, as `sort_bands` finds it: overlapping ones alternate. Cubes in
+    which a band has no wavelength are returned as they are.
     """
-    if "wavelength" not in opened.coords or opened["wavelength"].dims != ("band",):
+    found = opened.coords.get("wavelength")
+    if found is None or found.dims != ("band",) or np.isnan(found.values).any():
         return opened
-    bands = sort_bands(opened["wavelength"].values)
+    bands = sort_bands(found.values)
     names = [name for name in OF_WAVELENGTHS if name in opened.coords]
     opened = opened.drop_indexes(names, errors="ignore")
     if (np.diff(bands.order) < 0).any():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -71,13 +72,14 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         array.check([BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
         dims = [dim or f"axis {at}" for at, dim in enumerate((array.dims or DIMS)[: array.ndim])]
         near = _in_scope(arrays, name)
-        bands, bad, doubts = _bands_of(name, array, dims[order[2]] if len(order) == 3 else "", near, count)
-        geobox, of_place = _place_of(name, dims, order, near, {**about, **array.attrs})
+        stated = {**about, **array.attrs}
+        bands, bad, doubts = _bands_of(name, stated, dims[order[2]] if len(order) == 3 else "", near, count)
+        geobox, of_place = _place_of(name, dims, order, near, stated)
         time, of_time = _time_of(near)
-        acquired = acquired_of({**about, **array.attrs, **time})
-        packing = _packing_of(array.attrs)
+        acquired = acquired_of({**stated, **time})
+        packing = _packing_of(array.attrs, array.where, count)
         native = array.dtype.newbyteorder("=")
-        unpack, nodata = _unpacking(packing, native)
+        unpack, nodata = _unpacking_bands(packing, native, count)
         taken = taken_with(path.name, about, array.attrs)
         files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
 
@@ -93,6 +95,11 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
     unit = str(array.attrs.get("units", "")).strip()
     said = [*of_time, *acquired.notes, *array.notes, *notes]
     said += [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
+    said += [
+        f"its {key} = {_shown(value)} is not applied: only scale_factor and add_offset are"
+        for key, value in array.attrs.items()
+        if key not in _CODED and re.search("scale|offset", key.lower())
+    ]
     said += [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
     exposure_ms = None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)
     packed = {key: np.ravel(one).tolist() for key, one in sorted(packing.items())}
@@ -134,23 +141,58 @@ def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
 _CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
 _FILLS = ("_FillValue", "missing_value")
 _ENDS = ("valid_range", "valid_min", "valid_max")
+_SIGNS = {"true": "true", "1": "true", "false": "false", "0": "false"}
 
 
-def _packing_of(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes of packing that can be used: numbers, and _Unsigned."""
-    known = {name: attributes[name] for name in (*_FILLS, *_ENDS) if name in attributes}
-    known = {name: value for name, value in known.items() if np.asarray(value).dtype.kind in "iuf"}
-    factors = {name: np.ravel(attributes[name]) for name in _CODED[:2] if name in attributes}
-    known |= {name: np.float64(one[0]) for name, one in factors.items() if one.size == 1 and one.dtype.kind in "iuf"}
-    if "_Unsigned" in attributes:
-        known["_Unsigned"] = str(attributes["_Unsigned"]).lower()
+def _packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) -> dict[str, Any]:
+    """Return the attributes of packing: numbers, of scale and offset one or ``count``, and _Unsigned.
+
+    Raises SceneError: scale, offset or _Unsigned is something else.
+    """
+    stated = {name: _number(attributes[name]) for name in (*_CODED, *_FILLS, *_ENDS) if name in attributes}
+    known = {name: value for name, value in stated.items() if np.asarray(value).dtype.kind in "iuf"}
+    if "_Unsigned" in stated:
+        known["_Unsigned"] = _SIGNS.get(str(np.ravel(stated["_Unsigned"])[0]).lower())
+    for name in set(_CODED) & set(stated):
+        if known.get(name) is None or np.size(known[name]) not in (1, count):
+            allowed = (
+                "true or false" if name == "_Unsigned" else "one number" + (", or one a band" if count > 1 else "")
+            )
+            raise SceneError(f"{where} has {name} = {_shown(attributes[name])}, expected {allowed}; correct it")
+        if name != "_Unsigned":
+            numbers = np.ravel(known[name]).astype(np.float64)
+            known[name] = numbers if numbers.size > 1 else numbers[0]
     return known
 
 
-def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
+def _shown(value: object) -> str:
+    return " ".join(str(value).split())[:80]
+
+
+def _number(value: Any) -> Any:
+    """Return the number in a text; other values as they are."""
+    try:
+        return json.loads(value) if isinstance(value, str | bytes) else value
+    except ValueError:
+        return value
+
+
+def _unpacking_bands(about: Mapping[str, Any], stored: np.dtype[Any], count: int) -> tuple[Turn | None, float | None]:
+    """Return the function and the no-data value as `_unpacking`, for scales that may be one a band."""
+    listed = {name: about[name] for name in _CODED[:2] if np.size(about.get(name, 1)) > 1}
+    if not listed:
+        return _unpacking(about, stored)
+    each = [{name: one[band] for name, one in listed.items()} for band in range(count)]
+    turns = [_unpacking({**about, **own}, stored, always=True)[0] for own in each]
+    return lambda block: np.stack([turn(block[..., band]) for band, turn in enumerate(turns) if turn], -1), None
+
+
+def _unpacking(
+    about: Mapping[str, Any], stored: np.dtype[Any], *, always: bool = False
+) -> tuple[Turn | None, float | None]:
     """Return the function from numbers of a file to values, NaN where there is none, and the no-data value.
 
-    The function is None where the numbers are the values, with one no-data value at most.
+    The function is None, unless ``always``, where the numbers are the values, with one no-data value at most.
     """
     coded = {name: about[name] for name in _CODED if name in about}
     if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
@@ -166,7 +208,7 @@ def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | 
         None if end is None else float(end) if is_value else _as_value(end, coded, stored)
         for end, is_value in zip(pair, are_values, strict=True)
     ]
-    if not coded and len(fills) < 2 and ends == [None, None]:
+    if not always and not coded and len(fills) < 2 and ends == [None, None]:
         return None, fills[0] if fills else None
     low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
 
@@ -186,6 +228,12 @@ def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
 
     packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
     return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
+
+
+def _values(one: FileArray) -> NDArray[Any]:
+    """Return an array whole, with its scale and offset (SceneError: as `_packing_of`)."""
+    packing = _packing_of(one.attrs, one.where)
+    return _decoded(one[...], {name: packing[name] for name in _CODED if name in packing})
 
 
 def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
@@ -218,7 +266,7 @@ def _place_of(
         fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
         if one.ndim < 2 and fits and one.dtype.kind in "iuf":
             plain = {text: value for text, value in one.attrs.items() if text not in (*_CODED, *_FILLS, *_ENDS)}
-            read[key] = xr.Variable(own, one[...], plain | _packing_of(one.attrs))
+            read[key] = xr.Variable(own, one[...], plain | _packing_of(one.attrs, one.where))
         else:
             own = tuple(dims) if key == name else tuple(f"{key} {axis}" for axis in range(one.ndim))
             named[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
@@ -227,11 +275,11 @@ def _place_of(
 
 
 def _bands_of(
-    cube: str, array: FileArray, axis: str, arrays: Arrays, count: int
+    cube: str, attributes: Mapping[str, Any], axis: str, arrays: Arrays, count: int
 ) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
-    """Return facts of the bands by the arrays beside a cube and its attributes; bad bands (from 0), and notes on them.
+    """Return facts of the bands by the arrays beside a cube and by attributes; bad bands (from 0), and notes on them.
 
-    Arrays have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``.
+    Both have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``.
     """
     fields: dict[str, Any] = {}
     notes: list[str] = []
@@ -240,15 +288,18 @@ def _bands_of(
         is_centre, is_width = (kind.fullmatch(letters(word)) is not None for kind in (CENTRES, WIDTHS))
         if name == axis and not is_centre and is_spectral(one.attrs):
             word, is_centre = "wavelength", True
-        if is_centre and not _is_line(arrays, name, count):
+        texts = _names_of(arrays, (name,), count) if is_centre else []
+        if any(texts):
+            fields |= {word: texts, f"{word} units": _unit(one.attrs)} if word not in fields else {}
+        elif is_centre and not _is_line(arrays, name, count):
             notes.append(f"the array {name} is left out: it has shape {one.shape} for {count} bands")
         elif (is_centre or is_width or letters(word) in GOOD_BANDS) and _is_line(arrays, name, count):
-            fields |= {word: one[...], f"{word} units": _unit(one.attrs)} if word not in fields else {}
+            fields |= {word: _values(one), f"{word} units": _unit(one.attrs)} if word not in fields else {}
     if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
-        values = arrays[axis][...].astype(np.float64).ravel()
+        values = _values(arrays[axis]).astype(np.float64).ravel()
         if are_wavelengths(values):
             fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
-    usable = {key: value for key, value in array.attrs.items() if np.asarray(value).dtype.kind in "iufU"}
+    usable = {key: value for key, value in attributes.items() if _is_list(value)}
     names = _names_of(arrays, (axis, "band_names", "band_name"), count)
     found = bands_of_fields(usable | fields, names, cube or "the file")
     return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
@@ -259,7 +310,13 @@ def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | No
     listed = [arrays[name] for name in names if name in arrays]
     texts = next((one for one in listed if one.shape == (count,) and one.dtype.kind in "SOUT"), None)
     each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
-    return [None if one is None else np.asarray(one).astype(str).item() for one in each]
+    plain = [one.item() if isinstance(one, np.ndarray) else one for one in each]
+    return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in plain]
+
+
+def _is_list(value: object) -> bool:
+    """Return whether an attribute is a text or a number, or a list of them."""
+    return all(isinstance(one, str | float | int | np.number) for one in np.asarray(value, object).ravel().tolist())
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:

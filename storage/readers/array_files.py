@@ -42,7 +42,10 @@ _CLASSIC = b"CDF"  # with which NetCDF 3 begins
 _MATLAB = {"double": "f8", "single": "f4", "logical": "?"} | {
     f"{u}int{8 * n}": f"{u or 'i'}{n}" for n in (1, 2, 4, 8) for u in ("", "u")
 }
-_SIZES = (("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("lines", "samples"), ("height", "width"))
+_SIZES = (
+    *(("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("lines", "samples"), ("height", "width")),
+    *(("row", "col"), ("nr", "nc"), ("h", "w")),
+)
 _MAT_MATRIX, _MAT_PACKED = 14, 15  # kinds of elements
 _MAT_HEAD = 4096  # bytes for sizes and name of an array
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
@@ -282,7 +285,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
 
 def _plain(attributes: Any) -> dict[str, Any]:
-    """Return the attributes that can be read, texts as str and single numbers without an axis."""
+    """Return the attributes that can be read, texts as str, lists of texts as lists, single numbers without an axis."""
     found = {}
     for name in attributes:
         try:
@@ -291,7 +294,9 @@ def _plain(attributes: Any) -> dict[str, Any]:
             continue
         if isinstance(value, np.ndarray) and value.size == 1:
             value = value.reshape(-1)[0]
-        found[str(name)] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+        texts = value.ravel().tolist() if isinstance(value, np.ndarray) and value.dtype.kind in "SO" else [value]
+        texts = [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in texts]
+        found[str(name)] = texts if len(texts) > 1 else texts[0]
     return found
 
 

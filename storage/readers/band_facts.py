@@ -21,6 +21,7 @@ THERMAL_NM = 20_000.0  # end of the longest wavelengths in cameras' files
 LEAST_WIDTH_NM = 0.02
 RGB_NM = (640.0, 550.0, 460.0)
 NEAR_INFRARED_NM = 800.0
+YEARS = (1900, 2100)
 GREY_NM = 550.0
 # spelling of a unit: its length [nm]; the first ones may stand behind a number in the name of a band
 _LENGTHS: Mapping[str, float] = {
@@ -60,8 +61,9 @@ _LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})")
 # a number beside the length that may be another length, a width or the number of a band
 _DOUBTFUL = re.compile(
     rf"(?<![a-z\d.])[\d.]+\s*(?:[,/;&+*|@±]|at)\s*{_NUMBER}\s*{_UNIT}|fwhm|width"
-    rf"|{_COUNTED}\d+{_DASH}{_NUMBER}\s*{_UNIT}|(?<!\d)(?:[2-9]\d\d|[12]\d{{3}})[\s_]+{_NUMBER}\s*{_UNIT}"
+    rf"|{_COUNTED}\d+{_DASH}{_NUMBER}\s*{_UNIT}"
 )
+_BARE = re.compile(r"(?<![a-z\d.])(\d{3,4}(?:\.\d*)?|\d?\.\d+)(?![\d.]*\d)")  # may be a length in nm or um
 # words of a colour: its usual wavelength [nm]; the first that fits counts
 _COLOURS: Mapping[str, float] = {
     "coastal(?: aerosol| blue)?|aerosol": 443.0,
@@ -245,13 +247,15 @@ def bands_of_fields(
 
 def _gathered(fields: Mapping[str, object], count: int) -> dict[str, object]:
     """Return fields with those such as ``Band_1``, ``Band_2``, one a band, as one list."""
-    groups: dict[str, dict[int, str]] = defaultdict(dict)
+    groups: dict[str, dict[int, object]] = defaultdict(dict)
     for key, value in fields.items():
-        if isinstance(value, str) and (found := re.fullmatch(r"(.*?\D)[ _]*(\d{1,5})", key)):
+        if isinstance(value, str | float | int | np.number) and (found := re.fullmatch(r"(.*?\D)[ _]*(\d{1,5})", key)):
             groups[found[1]][int(found[2])] = value
     whole = {base: one for base, one in groups.items() if len(one) == count and min(one) in (0, 1)}
     counted = {base: one for base, one in whole.items() if max(one) - min(one) + 1 == count}
-    return {**fields, **{base: [one[at] for at in sorted(one)] for base, one in counted.items()}}
+    parts = {f"{base}{at}" for base, one in counted.items() for at in one}
+    others = {key: value for key, value in fields.items() if re.sub(r"[ _]*(?=\d+$)", "", key) not in parts}
+    return others | {base: [one[at] for at in sorted(one)] for base, one in counted.items()}
 
 
 def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
@@ -312,11 +316,17 @@ def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[st
             if lengths and not RANGE_NM[0] <= lengths[0][0] <= THERMAL_NM:
                 return Bands(notes=(f"the band name {name!r} gives {lengths[0][0]:g} nm, which is no wavelength",))
         centres, widths = np.array([one[0] if one else (np.nan, np.nan) for one in found]).T
+        for centre in centres[np.isfinite(centres)]:
+            if (centres == centre).sum() > 1:
+                return Bands(notes=(f"the band names give several bands the same length, {centre:g} nm",))
         return bands_of_numbers(centres, "nm", origin, None if np.isnan(widths).all() else widths)
     plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
     numbers = np.array([np.nan if one is None else _to_number(one[1]) for one in plain])
     if are_wavelengths(numbers):
         return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
+    for name, text in zip(names, texts, strict=True):
+        if any(not YEARS[0] <= one <= YEARS[1] for one in _bare_lengths(text)):
+            return Bands(notes=(f"the band name {name!r} may give a length without its unit",))
     return _bands_of_colours(names, texts, where, colours)
 
 
@@ -332,6 +342,12 @@ def _without_number(name: str | None, place: int) -> str:
     return _BAND_NUMBER.sub(shortened, text)
 
 
+def is_named(name: str | None, place: int) -> bool:
+    """Return whether a band has a name that says more than its ``place`` (from 0 or 1)."""
+    numbers = set(re.findall(r"\d+", _plain_text(name)[:MOST_NAME]))
+    return bool(_without_number(name, place).strip()) or not {int(one) for one in numbers} <= {place, place + 1}
+
+
 def _lengths(text: str) -> list[tuple[float, float]]:
     """Return centre and width [nm] (NaN: none) of each different length in a name; two if the only one is doubtful."""
     found: list[tuple[float, float]] = []
@@ -339,18 +355,27 @@ def _lengths(text: str) -> list[tuple[float, float]]:
         low, high = _to_number(first) * (scale_nm(unit or last) or 1), _to_number(second) * (scale_nm(last) or 1)
         plausible = RANGE_NM[0] <= low < high <= THERMAL_NM
         found += [((low + high) / 2, high - low)] if plausible else [(low, np.nan), (high, np.nan)]
-    for number, unit in _LENGTH.findall(_SPAN.sub(" ", text)):
-        centre = _to_number(number) * (scale_nm(unit) or 1)
+    rest = _SPAN.sub(" ", text)
+    beside = [_to_number(number) * (scale_nm(unit) or 1) for number, unit in _LENGTH.findall(rest)]
+    if found or beside:
+        beside += _bare_lengths(re.sub(rf"{_COUNTED}\d+", " ", _LENGTH.sub(" ", rest)))
+    for centre in beside:
         if not any(abs(centre - known) <= 1e-3 * known for known, _ in found):
             found.append((centre, np.nan))
     return found * 2 if len(found) == 1 and _DOUBTFUL.search(text) else found
+
+
+def _bare_lengths(text: str) -> list[float]:
+    """Return the numbers without a unit that may be lengths, in nm."""
+    found = [_to_number(number) for number in _BARE.findall(text)]
+    return [nm for one in found if RANGE_NM[0] <= (nm := one if one >= 100 else one * 1000) <= RANGE_NM[1]]
 
 
 def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
     """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
     if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
         return False
-    years = (numbers % 1 == 0) & (numbers >= 1900) & (numbers <= 2100)
+    years = (numbers % 1 == 0) & (numbers >= YEARS[0]) & (numbers <= YEARS[1])
     return not years.all() and not (len(numbers) > 1 and (np.diff(numbers) == 1).all())
 
 
@@ -364,19 +389,23 @@ def _colour(text: str) -> set[float]:
 
 
 def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
-    """Return bands by the colours in their names, else by the file's; a band without a name has that of the file."""
+    """Return bands by the colours in their names, else by the file's own flags.
+
+    A band without a name has the flag of the file; flags that GDAL writes by itself say nothing on a named one.
+    """
     default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
     flags = [_colour(colour) for colour in colours] or [set() for _ in names]
-    if default and tuple(colours[3:]) == ("undefined",) and not texts[3].strip():
+    bare = [not is_named(name, place) for place, name in enumerate(names)]
+    if default and tuple(colours[3:]) == ("undefined",) and bare[3]:
         flags[3] = {NEAR_INFRARED_NM}
     named = [_colour(text) for text in texts]
-    given = named if any(named) else flags
-    nm = [one or (set() if text.strip() else flag) for one, text, flag in zip(given, texts, flags, strict=True)]
+    by_flag = not default and not any(named)
+    nm = [one or (flag if by_flag or no_name else set()) for one, no_name, flag in zip(named, bare, flags, strict=True)]
     centres = [min(one) if len(one) == 1 else np.nan for one in nm]
     if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
         shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
         doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
-        return Bands(notes=(doubt,) if any(text.strip() for text in texts) else ())
+        return Bands(notes=() if all(bare) else (doubt,))
     others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
     if others and not default:
         said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
@@ -395,7 +424,7 @@ def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...]
     """
     bad: set[int] = set()
     notes: list[str] = []
-    for name, value in fields.items():
+    for name, value in _gathered(fields, count).items():
         key = letters(name)
         if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
             flags = [_TRUTH.get(_plain_text(word), _to_number(word)) for word in _words(value)]

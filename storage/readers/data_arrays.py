@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
+from spectralzoom.storage.arrays.band_order import by_wavelength
 from spectralzoom.storage.readers.cube_sources import DIMS, CubeSource
 
 
 def data_array(cube: CubeSource) -> xr.DataArray:
-    """Return the cube for xarray; values are read when they are needed."""
+    """Return the cube for xarray, bands sorted as `by_wavelength`; values are read when they are needed."""
     marked = np.isin(np.arange(cube.shape[2]), cube.bad_bands)
     facts: dict[str, tuple[str | tuple[str, ...], Any, dict[str, str]]] = {
         "wavelength": ("band", cube.bands.wavelength_nm, {"units": "nm"}),
@@ -38,7 +39,7 @@ def data_array(cube: CubeSource) -> xr.DataArray:
     about |= {} if cube.nodata is None else {"_FillValue": cube.nodata}
     about |= {} if cube.acquired is None else {"acquired": cube.acquired}
     lines = indexing.LazilyIndexedArray(_Lines(cube))
-    return xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=cube.name, attrs=about)
+    return by_wavelength(xr.DataArray(xr.Variable(DIMS, lines), {**known, **places}, name=cube.name, attrs=about))
 
 
 class _Lines(BackendArray):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from PIL import ExifTags, Image
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, split_list
+from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, is_named, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -81,7 +82,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = kinds.index("alpha") if "alpha" in kinds else None
         of_all = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
-        if alpha is not None and of_all is not None and np.isfinite(of_all[alpha]):
+        if alpha is not None and ((of_all is not None and np.isfinite(of_all[alpha])) or _is_other(file, alpha)):
             alpha = None  # GDAL calls a fourth band of bytes alpha by default
         keep = [band for band in range(file.count) if band != alpha]
         void = _void(file, alpha)
@@ -154,6 +155,12 @@ def _opened(path: Path) -> Iterator[Any]:
             rasterio.open(path, driver=driver) as file,
         ):
             yield file
+
+
+def _is_other(file: Any, alpha: int) -> bool:
+    """Return whether the band that is flagged as alpha has another name."""
+    name = file.descriptions[alpha]
+    return is_named(name, alpha) and not re.search("alpha|transparen|opacity|mask|^a$", name.lower())
 
 
 def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:

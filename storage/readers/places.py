@@ -36,8 +36,10 @@ if TYPE_CHECKING:
 Place = tuple[GeoBox | None, tuple[str, ...]]
 
 _WKT = ("crs_wkt", "spatial_ref")  # of a grid mapping, before CF's parameters
-_CRS_TEXTS = ("esri_pe_string", "proj4_params", "proj4text", "epsg_code")  # behind them
-_CRS_ATTRIBUTES = ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg", "crs_wkt", "crs")  # image, then dataset
+_CRS_TEXTS = ("esri_pe_string", "proj4_params", "proj4text", "proj4", "epsg_code", "epsg", "code")  # behind them
+_CRS_ATTRIBUTES = (  # image, then dataset
+    *("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg", "crs_wkt", "crs", "CRS", "epsg", "EPSG", "projection"),
+)
 _NAMES = {"y": ("lat", "latitude"), "x": ("lon", "longitude")}
 _DIRECTIONS = {"y": r"degrees?_?n(orth)?", "x": r"degrees?_?e(ast)?"}
 _DEGREES = r"deg(ree)?s?( ?([nsew]|north|south|east|west))?|°"
@@ -141,7 +143,8 @@ def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, axes: list[_Axis], not
             return _plain(dataset.variables[key.removeprefix("/")].attrs)
         notes.append(f"its grid mapping {key} is not in the file")
     scalars = {str(key): _plain(one.attrs) for key, one in dataset.variables.items() if not one.ndim}
-    single = {key: about for key, about in scalars.items() if {"grid_mapping_name", *_WKT} & set(about)}
+    marks = {"grid_mapping_name", *_WKT, *_CRS_TEXTS} - {"code"}  # which may be of anything
+    single = {key: about for key, about in scalars.items() if marks & set(about)}
     if len(single) > 1:
         notes.append(f"the file has several grid mappings ({', '.join(single)}), and the cube names none of them")
         return {}
@@ -157,6 +160,7 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
     given += [(key, attributes[key]) for key in _CRS_ATTRIBUTES if attributes.get(key)]
     if isinstance(attributes.get("_CRS"), dict):  # GDAL's in Zarr
         given += [("_CRS", attributes["_CRS"][key]) for key in ("wkt", "projjson") if key in attributes["_CRS"]]
+    unclear = bool(notes) or any(where != "projection" for where, _ in given)  # which is often words
     for where, value in given:
         try:
             with warnings.catch_warnings():
@@ -167,7 +171,7 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
             notes.append(f"the CRS cannot be read from {where}: {lacks}")
-    if not given and len(axes) == 2 and all(axis.geographic for axis in axes) and not notes:
+    if not unclear and len(axes) == 2 and all(axis.geographic for axis in axes):
         notes.append("its latitudes and longitudes have no grid mapping, and are read as WGS 84")
         return CRS.from_epsg(4326)
     return None

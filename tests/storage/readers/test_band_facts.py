@@ -58,6 +58,7 @@ def centres(bands: Bands) -> list[float] | None:
         ("6605 Ångström", 660.5, None),
         ("450 nm (0.45 um)", 450, None),
         ("Band 7 - 455 nm", 455, None),
+        ("Band 300 (900 nm)", 900, None),
         ("nir 842.5", 842.5, None),
         ("R_550", 550, None),
         ("RedEdge-705", 705, None),
@@ -76,6 +77,7 @@ def test_a_band_name_gives_one_length_or_a_range(name: str, nm: float, width: fl
         *("20 nm at 450 nm", "450, 550 nm", "560/20 nm", "560±10 nm", "450,550 nm", "NDVI 842nm/660nm", "455_515nm"),
         *("490 nm (455-515 nm)", "Band 300 - 455 nm", "B2 (490 nm, 65 nm)", "Green 560 (27 nm)", "FWHM 20, 450 nm"),
         *("S2A_B04_665", "Band 560", "2019", "short wave infrared", "red minus nir"),
+        *("455:515 nm", "min 455 max 515 nm", "455 -> 515 nm", "0.455 < 0.515 um", "Blue 455-515"),
     ],
 )
 def test_a_doubtful_band_name_is_named(name: str) -> None:
@@ -97,6 +99,7 @@ def test_a_doubtful_band_name_is_named(name: str) -> None:
         (["350", "351", "352"], None),
         (["red", "red edge", "red"], None),
         (["blue", "green", "ndvi"], None),
+        (["VNIR 400-1000 nm band 1", "VNIR 400-1000 nm band 2"], None),
     ],
 )
 def test_band_names_agree_on_one_way(names: list[str], nm: list[float] | None) -> None:
@@ -119,10 +122,16 @@ RGB = ("red", "green", "blue")
         (("blue", "green", "red"), ("blue", "red", "green"), "'green' contradicts its colour in the file, red"),
         (COLOURS, (*RGB, "nir"), "'blue' contradicts its colour in the file, red"),
         (("nir", "red", "foo"), RGB, "'foo' do not give each band"),
+        (("B02", "B03", "B04", "B08"), (*RGB, "undefined"), "'B08' do not give each band"),
+        (("SR_B2", "SR_B3", "SR_B4"), RGB, "'SR_B4' do not give each band"),
+        (("Band 1", "Band 2", "Band 3"), RGB, [640, 550, 460]),
     ],
 )
 def test_names_of_colours_win_over_flags(names: Any, flags: tuple[str, ...], nm: Any) -> None:
-    """Red, green and blue are flags that GDAL writes by itself; other flags that contradict the names are refused."""
+    """Red, green and blue are flags that GDAL writes by itself; a band with another name is not read by them.
+
+    Other flags that contradict the names are refused.
+    """
     bands = bands_of_names(names, "a.tif", flags)
     if isinstance(nm, str):
         assert centres(bands) is None
@@ -252,6 +261,14 @@ def test_a_geotiff_named_by_colours_is_read_by_its_names(tmp_path: Path, photome
     assert load_scene_file(tmp_path / "a.tif", wavelengths=NM).wavelength_nm.tolist() == NM
 
 
+@pytest.mark.parametrize(("name", "count"), [("B08", 4), ("Alpha", 3), ("Band 4", 3)])
+def test_a_fourth_band_with_a_name_is_no_alpha(tmp_path: Path, name: str, count: int) -> None:
+    """GDAL calls the fourth band of bytes alpha by itself."""
+    with write(tmp_path / "a.tif", photometric=None) as file:
+        file.descriptions = ("B02", "B03", "B04", name)
+    assert load_scene_file(tmp_path / "a.tif", wavelengths=NM[:count]).wavelength_nm.tolist() == NM[:count]
+
+
 @pytest.mark.parametrize(
     ("of_file", "of_bands"),
     [
@@ -281,6 +298,7 @@ def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
     assert (
         list(bad) == [band for band, one in enumerate(good) if not one] == list(bad_bands({"bbl": good}, len(good))[0])
     )
+    assert list(bad_bands({f"bbl_{at}": int(one) for at, one in enumerate(good)}, len(good))[0]) == list(bad)
     if bad:
         assert [int(str(one)) for part in bands_text(bad).split(",") for one in numbers_of(part)] == list(bad)
         assert SceneSettings.model_validate({"bands": bands_text(bad)}).bands == bad

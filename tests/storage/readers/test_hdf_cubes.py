@@ -164,6 +164,8 @@ COUNTS = np.int16([0, 101, -3, -9])
         (BYTES, {**UNSIGNED, "valid_max": 254, "_FillValue": np.uint8(255)}, [0, 100, 128, NAN]),
         (BYTES, {**UNSIGNED, "_FillValue": np.int16(-1)}, [0, 100, 128, NAN]),
         (BYTES, {"_Unsigned": b"TRUE"}, [0, 100, 128, 255]),
+        (BYTES, {"_Unsigned": 1}, [0, 100, 128, 255]),
+        (COUNTS, {"scale_factor": "0.01", "_FillValue": "-9"}, [0, 1.01, -0.03, NAN]),
         (BYTES.view("u1"), {"_Unsigned": "false", "valid_min": np.int8(-100)}, [0, 100, NAN, -1]),
         (COUNTS, {"scale_factor": -0.01, "valid_range": np.int16([-5, 200])}, [0, -1.01, 0.03, NAN]),
         (COUNTS, {**SCALED, "valid_range": [-0.05, 1.0]}, [0, NAN, -0.03, NAN]),
@@ -185,6 +187,49 @@ def test_netcdf_packing_is_decoded(tmp_path: Path, stored: Any, about: dict[str,
     cube = open_cube_source(f"{tmp_path / 'a.nc'}:values")
     assert cube.dtype == (np.float32 if isinstance(read, list) else read.dtype)
     np.testing.assert_allclose(cube.read(0, 1)[0, :, 0], read, rtol=1e-6 if "scale_factor" in about else 0)
+
+
+def test_scales_may_be_one_a_band(tmp_path: Path) -> None:
+    """Fill values are compared before scaling; a divisor of other conventions is named in a note."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs.update({"scale_factor": NM, "add_offset": 1.0, "_FillValue": CUBE[0, 0, 2], "Scale": 7})
+    cube = open_cube_source(tmp_path / "a.h5")
+    np.testing.assert_allclose(cube.read(0, 7), np.where(CUBE[0, 0, 2] == CUBE, NAN, CUBE * NM + 1), rtol=1e-6)
+    assert "its Scale = 7 is not applied: only scale_factor and add_offset are" in cube.notes
+
+
+@pytest.mark.parametrize("about", [{"scale_factor": "percent"}, {"add_offset": [1.0, 2.0]}, {"_Unsigned": "maybe"}])
+def test_unclear_packing_is_refused(tmp_path: Path, about: dict[str, Any]) -> None:
+    """The message names the attribute."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs.update(about)
+    with pytest.raises(SceneError, match=f"cube has {next(iter(about))} = .*, expected .*; correct it"):
+        open_cube_source(tmp_path / "a.h5")
+
+
+IMAGE = xr.Dataset({"cube": (("y", "x", "band"), CUBE)})
+TEXTS = [f"{one:g}" for one in NM]
+
+
+@pytest.mark.parametrize("ending", ["nc", "zarr"])
+@pytest.mark.parametrize(
+    "data",
+    [
+        IMAGE.assign_attrs(wavelength=NM.tolist()),
+        IMAGE.assign_attrs(wavelengths_nm=", ".join(TEXTS)),
+        IMAGE.assign(cube=IMAGE["cube"].assign_attrs(long_name=[f"{one} nm" for one in TEXTS])),
+        IMAGE.assign_coords(wavelength=("band", TEXTS)),
+        IMAGE.assign_coords(wavelength=("band", (NM * 10).astype("i2"), {"units": "nm", "scale_factor": 0.1})),
+        IMAGE.assign_attrs({f"wavelength_{at}": one for at, one in enumerate(NM, 1)}),
+    ],
+)
+def test_wavelengths_are_attributes_or_texts(tmp_path: Path, data: xr.Dataset, ending: str) -> None:
+    """Of the file or of the array, in one text, in a list, one a band, or packed."""
+    path = tmp_path / f"a.{ending}"
+    _ = data.to_netcdf(path, engine="h5netcdf") if ending == "nc" else data.to_zarr(path, zarr_format=2)
+    np.testing.assert_allclose(load_scene_file(path).wavelength_nm, NM)
 
 
 def test_netcdf_3_is_read(tmp_path: Path) -> None:

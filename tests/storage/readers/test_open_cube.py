@@ -78,12 +78,28 @@ def test_every_kind_is_one_data_array(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(cube.isel(y=slice(0, 0)).values, CUBE[:0])
     if name not in ("a.mat", "a73.mat", "a.npy"):
         np.testing.assert_allclose(cube.wavelength, NM)
+        np.testing.assert_array_equal(cube.sel(wavelength=670, method="nearest"), CUBE[..., 2])
     assert (cube.odc.crs is not None) == (name == "a.tif")
+
+
+def test_bands_of_two_detectors_are_sorted(tmp_path: Path) -> None:
+    """Values, widths and bad bands go with their wavelengths; equal centres stay; cubes with gaps keep their order."""
+    nm = [450, 550, 660, 550, 700]
+    about = {"wavelength": nm, "fwhm": [5, 6, 7, 8, 9], "bbl": [1, 1, 0, 1, 1]}
+    spectral.envi.save_image(str(tmp_path / "a.hdr"), CUBE, ext="img", metadata=about)
+    cube = spectralzoom.open_cube(tmp_path / "a.hdr")
+    np.testing.assert_array_equal(cube.values, CUBE[..., [0, 1, 3, 2, 4]])
+    assert cube.detector.values.tolist() == [0, 0, 1, 0, 1]
+    assert (cube.fwhm.values.tolist(), cube.bad_band.values.tolist()) == ([5, 6, 8, 7, 9], [False] * 3 + [True, False])
+    np.testing.assert_array_equal(cube.sel(wavelength=slice(540, 560)), CUBE[..., [1, 3]])
+    gaps = {"wavelength": [900, "nan", 660, 550, 450]}
+    spectral.envi.save_image(str(tmp_path / "b.hdr"), CUBE, ext="img", metadata=gaps)
+    np.testing.assert_array_equal(spectralzoom.open_cube(tmp_path / "b.hdr").values, CUBE)
 
 
 @pytest.mark.parametrize("shape", [(7, 6), (6, 7)])
 @pytest.mark.parametrize("bands_first", [True, False])
-@pytest.mark.parametrize("words", [("nRow", "nCol"), ("rows", "cols"), ("lines", "samples")])
+@pytest.mark.parametrize("words", [("nRow", "nCol"), ("lines", "samples"), ("H", "W"), ("row", "col"), ("nr", "nc")])
 def test_a_table_of_matlab_is_a_cube(tmp_path: Path, shape: tuple[int, int], bands_first: bool, words: tuple) -> None:
     """Sizes beside it give its rows and columns; pixels go down the columns, and a note says so."""
     picture = CUBE.reshape(*shape, 5)

@@ -141,6 +141,12 @@ DATASETS: dict[str, tuple[xr.Dataset, tuple[Any, ...], Affine, Any]] = {
     ),
     "satellite": (dataset(Y - 2_900_000, X, mapping=SATELLITE), EVERY[:2], SOUTH, CRS.from_cf(SATELLITE)),
     "GeoZarr": (dataset(**GEOZARR), (), PLACE, 32632),
+    **{
+        key: (dataset(Y, X, mapping={key: value}), (), PLACE, 32632)
+        for key, value in (("proj4", "+proj=utm +zone=32"), ("epsg", 32632), ("code", "EPSG:32632"))
+    },
+    **{f"attribute {key}": (dataset(Y, X, **{key: "EPSG:32632"}), (), PLACE, 32632) for key in ("CRS", "projection")},
+    "attribute epsg": (dataset(Y, X, epsg=32632), (), PLACE, 32632),
     "old xarray": (dataset(Y, X, crs="+init=epsg:32632", transform=PLACE[:6]), (), PLACE, 32632),
 }
 
@@ -248,7 +254,7 @@ def test_units_that_do_not_fit_the_crs_are_refused(tmp_path: Path, content: xr.D
             dataset(Y, X, mapping={**TRANSVERSE, "crs_wkt": "PROJCS["}),
             "cannot be read from crs_wkt of its grid mapping",
         ),
-        (dataset(LAT, LON, NORTH_EAST, dims=("lat", "lon")), "have no grid mapping, and are read as WGS 84"),
+        (dataset(LAT, LON, NORTH_EAST, dims=("lat", "lon"), projection="Geographic"), "and are read as WGS 84"),
         (dataset(Y, X, mapping=geotransform(TURNED, **WKT)), "its grid is turned, so that y and x are not used"),
     ],
 )
@@ -266,6 +272,7 @@ SWATH = dataset().assign(lat=(("y", "x"), np.ones(SHAPE)), lon=(("y", "x"), np.o
 LOCAL = {"crs_wkt": 'LOCAL_CS["field",UNIT["metre",1]]'}
 DROPPED: list[tuple[xr.Dataset, str]] = [
     (dataset(Y, X), "it has coordinates and no CRS (write one: rio.write_crs of rioxarray)"),
+    (dataset(Y, X, projection="UTM"), "the CRS cannot be read from projection"),
     (dataset(Y, X, grid_mapping="lost"), "its grid mapping lost is not in the file"),
     (dataset(Y, X, mapping={"crs_wkt": "PROJCS[broken"}), "the CRS cannot be read from crs_wkt of its grid mapping"),
     (dataset(Y, X, mapping={"grid_mapping_name": "polar_stereographic"}), "it lacks 'latitude_of_projection_origin'"),

@@ -17,10 +17,11 @@ NM = [450.0, 550.0, 660.5, 800.0]
 
 
 def write(path: Path, values: Any = VALUES, **profile: Any) -> rasterio.io.DatasetWriter:
-    """Return an open GeoTIFF of (band, y, x) values, to which metadata can be added."""
+    """Return an open GeoTIFF of (band, y, x) values, to which metadata can be added; None leaves a default of GDAL."""
     count, height, width = values.shape
     size = {"count": count, "height": height, "width": width, "dtype": values.dtype.name}
-    file = rasterio.open(path, "w", **{"driver": "GTiff", "photometric": "MINISBLACK", **size, **profile})
+    about = {"driver": "GTiff", "photometric": "MINISBLACK", **size, **profile}
+    file = rasterio.open(path, "w", **{key: value for key, value in about.items() if value is not None})
     file.write(values)
     return file
 
