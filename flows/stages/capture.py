@@ -25,7 +25,7 @@ from spectralzoom.storage.arrays.spool import Spool
 from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.store import Ref, write_table
 
-RAW, RAW_VERSION = "capture", 14
+RAW, RAW_VERSION = "capture", 15
 MADE_BY = ("pipeline/simulator", "pipeline/rig", "pipeline/capture", "storage/arrays/cubes.py")
 RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes
 

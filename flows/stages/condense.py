@@ -53,13 +53,13 @@ MOST_COMPARED = 65_536  # rare spectra, in which shared directions are searched 
 MOST_RARE = 0.05  # fraction of spectra, above which raw lines are kept
 
 
-@stage("signal", version=6, product="condense", made_by=MADE_BY)
+@stage("signal", version=7, product="condense", made_by=MADE_BY)
 def condense_coarse(out: Output, raw: Ref, *, camera: LineCamera, signal: SignalChoice) -> None:
     """Compress the sweeps of the first pass, or of the uniform scan."""
     condense(out, [raw], camera, signal)
 
 
-@stage("signal of all passes", version=7, made_by=MADE_BY)
+@stage("signal of all passes", version=8, made_by=MADE_BY)
 def condense_fine(out: Output, raw: Ref, first: Ref, *, camera: LineCamera, signal: SignalChoice) -> None:
     """Compress the sweeps of both passes, ``raw`` of the second one, with common components."""
     condense(out, [raw, first], camera, signal)
@@ -195,7 +195,7 @@ def _lines_differ(passes: Sequence[Ref], signal: Ref, camera: LineCamera) -> str
     return None
 
 
-@stage("signal of the raster", version=8, product="rectify", made_by=MADE_BY)
+@stage("signal of the raster", version=9, product="rectify", made_by=MADE_BY)
 def condense_raster(
     out: Output,
     *,

@@ -34,7 +34,7 @@ from spectralzoom.storage.whole_files import to_json
 RECORD = "accuracy.json"
 
 
-@stage("accuracy", version=19, made_by=("models/evaluation", "models/network", "models/reading"))
+@stage("accuracy", version=20, made_by=("models/evaluation", "models/network", "models/reading"))
 def evaluate(
     out: Output,
     mosaic: Ref,

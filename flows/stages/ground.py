@@ -20,7 +20,7 @@ from spectralzoom.storage.store import Ref
 STORE = "ground_map.zarr"
 
 
-@stage("map in a projected CRS", version=8, made_by=("pipeline/ground", "storage/arrays/ground_maps.py"))
+@stage("map in a projected CRS", version=9, made_by=("pipeline/ground", "storage/arrays/ground_maps.py"))
 def ground(out: Output, class_map: Ref, mosaic: Ref, *, ground_grid: GroundGrid) -> None:
     """Project class map, changes and picture to the ground, in blocks, and measure the area of each class."""
     found = load_class_map(class_map.path / MAP)

@@ -17,7 +17,7 @@ TIE_POINTS = "geolocation.zarr"
 MADE_BY = ("pipeline/rectify", "pipeline/geometry", "storage/arrays/geolocation.py")
 
 
-@stage("geolocation grid", version=5, made_by=MADE_BY)
+@stage("geolocation grid", version=6, made_by=MADE_BY)
 def locate(out: Output, signal: Ref, seams: Ref | None = None, *, camera: LineCamera, grid: SceneGrid) -> None:
     """Write the tie points of each sweep; none where they are not accurate enough."""
     tables: dict[str, list[tuple[ScanPath, TieTable]]] = {}

@@ -48,7 +48,7 @@ MOSAIC_STEP = 0.5  # quantisation step, relative to the sweeps: resampled scores
 KERNEL_GAIN = 2.0  # greatest overshoot of the kernels
 
 
-@stage("mosaic", version=8, made_by=MADE_BY)
+@stage("mosaic", version=9, made_by=MADE_BY)
 def rectify(
     out: Output,
     signal: Ref,
@@ -72,7 +72,7 @@ def rectify(
     write_table(out.path / "lines.json", {one.lines.sweep.name: one.facts() for one in recipe.sweeps()})
 
 
-@stage("mosaic of all passes", version=7, made_by=MADE_BY)
+@stage("mosaic of all passes", version=8, made_by=MADE_BY)
 def rectify_fine(
     out: Output,
     signal: Ref,

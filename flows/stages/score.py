@@ -80,7 +80,7 @@ class PatchGains:
         return patch_index if fractions is None else patch_index[fractions[patch_index] > 0]
 
 
-@stage("patch scores", version=21, made_by=MADE_BY)
+@stage("patch scores", version=22, made_by=MADE_BY)
 def score(
     out: Output,
     mosaic: Ref,

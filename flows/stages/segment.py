@@ -37,7 +37,7 @@ MADE_BY = (
 )
 
 
-@stage("class map", version=28, made_by=MADE_BY)
+@stage("class map", version=29, made_by=MADE_BY)
 def segment(
     out: Output,
     mosaic: Ref,
