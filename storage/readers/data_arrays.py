@@ -16,9 +16,13 @@ from spectralzoom.storage.readers.cube_sources import DIMS, CubeSource
 
 
 def data_array(cube: CubeSource) -> xr.DataArray:
-    """Return the cube for xarray, bands sorted as `by_wavelength`; values are read when they are needed."""
+    """Return the cube for xarray, bands sorted as `by_wavelength`; values are read when they are needed.
+
+    ``file_band`` is the place of each band in the file, from 0.
+    """
     marked = np.isin(np.arange(cube.shape[2]), cube.bad_bands)
     facts: dict[str, tuple[str | tuple[str, ...], Any, dict[str, str]]] = {
+        "file_band": ("band", np.arange(cube.shape[2]), {"long_name": "band of the file, from 0"}),
         "wavelength": ("band", cube.bands.wavelength_nm, {"units": "nm"}),
         "fwhm": ("band", cube.bands.fwhm_nm, {"units": "nm"}),
         "bad_band": ("band", marked if marked.any() else None, {}),

@@ -54,15 +54,16 @@ def rows() -> list[Row]:
 def _compared(one: Format) -> Row:
     """Compare one file's content by both readers, and their time."""
     cube = spectralzoom.open_cube(one.path)
-    values = np.array_equal(cube.values, one.read(), equal_nan=True)
-    bands = one.nm is None or np.allclose(cube.wavelength, one.nm)
+    bands = cube.file_band.values  # sorted by wavelength
+    values = np.array_equal(cube.values, one.read()[..., bands], equal_nan=True)
+    rising = one.nm is None or np.allclose(cube.wavelength, one.nm)
     place = one.transform is None or cube.odc.geobox.affine.almost_equals(one.transform)
     clocks = time_in_turn({"ours": lambda: spectralzoom.open_cube(one.path).values, "other": one.read}, 3)
-    parts = {"values": values, "wavelengths": bands if one.nm is not None else None}
+    parts = {"values": values, "wavelengths": rising if one.nm is not None else None}
     parts["place"] = place if one.transform is not None else None
     equal = ", ".join(f"{name} {'equal' if found else 'DIFFER'}" for name, found in parts.items() if found is not None)
     more = f"{one.reader}; our time over its {ratio(clocks, 'ours', 'other'):.2f}"
-    return Row(one.name, equal, "equal", values and bands and place, more)
+    return Row(one.name, equal, "equal", values and rising and place, more)
 
 
 def _formats(folder: Path, cube: NDArray[np.uint16]) -> Iterator[Format]:

@@ -46,15 +46,15 @@ def write_tile(folder: Path, number: int) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with four tiles and weights that learned from t1 to t3; t0 was kept for validation."""
+    """Return a folder with five tiles and weights of t0 to t3; t0 judged the network, t4 was held out."""
     here = tmp_path_factory.mktemp("tiles")
     for name in ("images", "labels"):
         (here / "field" / name).mkdir(parents=True)
-    for number in range(4):
+    for number in range(5):
         write_tile(here / "field", number)
-    words = ["train", here / "field", "-o", here / "w.safetensors", "--validation", "1", "--min-exposure-ms", "3"]
+    words = ["train", here / "field", "-o", here / "w.safetensors", "--validation", "1", "--hold-out", "4"]
     with pytest.raises(SystemExit) as ended:
-        main([*map(str, words), *SMALL])
+        main([*map(str, words), "--min-exposure-ms", "3", *SMALL])
     assert not ended.value.code
     assert list(describe_weights(here / "w.safetensors").record["split"]["validation"]) == ["0"]
     return here
@@ -69,7 +69,7 @@ def survey(command_line: Any, made: Path, scene: object, out: Path, *words: str)
 
 
 def test_a_training_scene_and_lacking_bands_are_marked(made: Path, tmp_path: Path, command_line: Any) -> None:
-    """Terminal, report, receipt and `ls` mark the score of a training scene, and not that of a validation scene.
+    """Terminal, report, receipt and `ls` mark the score of a training scene, and not that of a scene held out.
 
     The scene is recognized by its content: it has another file name and fewer bands here. A note counts only spectral
     features that training reached; a survey of fewer bands brings it, and one of all bands does not.
@@ -84,7 +84,7 @@ def test_a_training_scene_and_lacking_bands_are_marked(made: Path, tmp_path: Pat
     assert receipt["training_scene"] == "all"
     assert sentence in (open_archive(tmp_path / "a").latest.folder / "report.html").read_text()
     assert "* on a scene that the weights were trained on" in command_line("ls", tmp_path / "a").out
-    said, receipt = survey(command_line, made, made / "field" / "images" / "t0.tif", tmp_path / "b")
+    said, receipt = survey(command_line, made, made / "field" / "images" / "t4.tif", tmp_path / "b")
     assert "of 100 against the labels (" in said
     assert "spectral features" not in said
     assert "training_scene" not in receipt
