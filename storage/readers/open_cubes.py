@@ -63,9 +63,9 @@ def open_cube(address: str | Path) -> xr.DataArray:
     ``address`` is an image, .npy, .mat, ENVI, NetCDF or HDF5 file, a Zarr store or the folder of a Headwall camera; it
     may name an array: ``FILE.mat:ARRAY``. Scale and offset of the file are applied. Bands that all have a wavelength
     are sorted by it, for ``.sel(wavelength=660, method="nearest")``. Coordinates, where the file has them:
-    ``wavelength``, ``fwhm`` [nm], ``file_band``, ``detector`` and ``bad_band`` of bands; ``x``, ``y`` and ``spatial_ref`` of the
-    place; ``valid``, ``time_s`` and ``exposure_ms`` of each line; ``void`` of transparent and masked pixels; the frames
-    ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out, ``files``,
+    ``wavelength``, ``fwhm`` [nm], ``file_band``, ``detector`` and ``bad_band`` of bands; ``x``, ``y`` and
+    ``spatial_ref`` of the place; ``valid``, ``time_s`` and ``exposure_ms`` of each line; ``void`` of transparent and
+    masked pixels; the frames ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out, ``files``,
     ``wavelengths_from``, ``acquired`` (a day or a moment in UTC, ISO 8601) and ``_FillValue``. Raises SceneError: there
     is no such file, it is damaged, or its kind or shape cannot be used.
     """
