@@ -65,9 +65,9 @@ def open_cube(address: str | Path) -> xr.DataArray:
     are sorted by it, for ``.sel(wavelength=660, method="nearest")``. Coordinates, where the file has them:
     ``wavelength``, ``fwhm`` [nm], ``file_band``, ``detector`` and ``bad_band`` of bands; ``x``, ``y`` and
     ``spatial_ref`` of the place; ``valid``, ``time_s`` and ``exposure_ms`` of each line; ``void`` of transparent and
-    masked pixels; the frames ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out, ``files``,
-    ``wavelengths_from``, ``acquired`` (a day or a moment in UTC, ISO 8601) and ``_FillValue``. Raises SceneError: there
-    is no such file, it is damaged, or its kind or shape cannot be used.
+    masked pixels; the frames ``dark`` and ``white`` (x, band). Attributes: ``notes`` on what was assumed or left out,
+    ``files``, ``wavelengths_from``, ``acquired`` (a day or a moment in UTC, ISO 8601) and ``_FillValue``. Raises
+    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
     """
     source = open_cube_source(address)
     from spectralzoom.storage.readers.data_arrays import data_array
