@@ -126,8 +126,8 @@ def _formats(folder: Path, cube: NDArray[np.uint16]) -> Iterator[Format]:
     yield Format("MATLAB 5", folder / "a.mat", "scipy", lambda: scipy.io.loadmat(folder / "a.mat")["cube"])
     np.save(folder / "a.npy", cube)
     yield Format(".npy", folder / "a.npy", "numpy", lambda: np.load(folder / "a.npy"))
-    zarr.create_array(folder / "plain.zarr", data=cube)
-    yield Format("Zarr, bare array", folder / "plain.zarr", "zarr", lambda: zarr.open_array(folder / "plain.zarr")[...])
+    zarr.create_array(path := folder / "plain.zarr", data=cube)
+    yield Format("Zarr, bare array", path, "zarr", lambda: np.asarray(zarr.open_array(path)[...]))
 
 
 def _large(folder: Path) -> list[Row]:
