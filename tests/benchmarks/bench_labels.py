@@ -2,7 +2,8 @@
 
 Ours runs through `train_weights` on files, and reads every patch of the test scenes. The peers are linear
 discriminants, a logistic regression and 100 extra trees of single spectra, with the settings of scikit-learn.
-Whichever of them the test labels favour is the one compared. The splits were named before any result.
+Whichever of them the test labels favour is the one compared. The method was chosen on splits of seeds 0 to 2. The seeds
+here were named afterwards and used once.
 `bench_labels.py SET ...` runs some of the sets. Set OMP_NUM_THREADS=1.
 """
 
@@ -40,7 +41,8 @@ from spectralzoom.models.weights.files import load_weights
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
-SEEDS = 0, 1, 2
+SEEDS = 11, 12, 13  # of splits; nothing was chosen by them
+TRAININGS = 0, 1, 2  # seeds of the training, for a split that is given
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # Indian Pines: classes by the mask's numbers
 WATER_BANDS = (*range(104, 109), *range(150, 164), 220)  # Indian Pines: bands that its file lacks, counted from 1
 UNMIXED = {"Jasper": "JasperRidge2_R198", "Samson": "Samson"}  # files
@@ -122,7 +124,7 @@ def _row(one: Result) -> Row:
 def _of_pines() -> list[Row]:
     """Return the rows with a goal of Indian Pines alone."""
     disjoint = next(iter(SETS["Indian Pines, disjoint"]()))
-    overall = [round(100 * overall_accuracy(ours(replace(disjoint, seed=seed)).ours), 1) for seed in SEEDS]
+    overall = [round(100 * overall_accuracy(ours(replace(disjoint, seed=seed)).ours), 1) for seed in TRAININGS]
     thirds = np.sum([ours(one).ours for one in _thirds()], axis=0)
     short = ours(_small_tiles())
     return [
@@ -293,9 +295,9 @@ def _thirds() -> Iterator[Split]:
     """Yield splits of 20 tiles of Indian Pines: each third judges once."""
     values, labels, nm = _pines()
     tiles = cut(values, labels, 29, 36)
-    for seed in SEEDS:
-        train = [tile for number, tile in enumerate(tiles) if number % 3 != seed]
-        yield Split(f"20 tiles, third {seed}", train, tiles[seed::3], 16, nm, seed)
+    for third in range(3):
+        train = [tile for number, tile in enumerate(tiles) if number % 3 != third]
+        yield Split(f"20 tiles, third {third}", train, tiles[third::3], 16, nm, third)
 
 
 def _small_tiles() -> Split:

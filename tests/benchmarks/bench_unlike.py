@@ -30,7 +30,7 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 
-TILE, TILE_SEEDS, FRAME_SEEDS, TRAINED = (29, 36), (10, 11, 12), (20, 21), 12
+TILE, TILE_SEEDS, FRAME_SEEDS, TRAINED = (29, 36), (31, 32, 33), (41, 42), 12
 FARMS, OTHER_DAYS, DARK_MS = 6, (20, 340), 3.0
 Floats = NDArray[np.floating]
 
