@@ -1,7 +1,7 @@
 """Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy and .mat.
 
-Axes are found by their names; without names they are y, x and band. xarray decodes scale, offset, fill value and
-unsigned numbers; the valid range, which it leaves out, is applied here.
+Axes are found by their names; without names they are y, x and band. Scale, offset, sign, fill values and valid range
+are applied by CF's rules; scale and offset may be one a band, which xarray does not decode.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         acquired = acquired_of({**stated, **time})
         packing = _packing_of(array.attrs, array.where, count)
         native = array.dtype.newbyteorder("=")
-        unpack, nodata = _unpacking_bands(packing, native, count)
+        unpack, nodata = _unpacking(packing, native)
         taken = taken_with(path.name, about, array.attrs)
         files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
 
@@ -90,7 +90,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         with guard():
             block = np.ascontiguousarray(np.transpose(np.asarray(array[tuple(selection)]), order), native)
             block = block.reshape(*block.shape[:2], count)
-            return block if unpack is None else unpack(block)
+            return block if unpack is None else unpack(block).astype(np.float32)
 
     unit = str(array.attrs.get("units", "")).strip()
     said = [*of_time, *acquired.notes, *array.notes, *notes]
@@ -138,7 +138,7 @@ def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
         return {}, [f"time in {words!r} is not used as the day of acquisition ({type(error).__name__}); use --visit"]
 
 
-_CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
+_CODED = ("scale_factor", "add_offset", "_Unsigned")
 _FILLS = ("_FillValue", "missing_value")
 _ENDS = ("valid_range", "valid_min", "valid_max")
 _SIGNS = {"true": "true", "1": "true", "false": "false", "0": "false"}
@@ -177,77 +177,61 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _unpacking_bands(about: Mapping[str, Any], stored: np.dtype[Any], count: int) -> tuple[Turn | None, float | None]:
-    """Return the function and the no-data value as `_unpacking`, for scales that may be one a band."""
-    listed = {name: about[name] for name in _CODED[:2] if np.size(about.get(name, 1)) > 1}
-    if not listed:
-        return _unpacking(about, stored)
-    each = [{name: one[band] for name, one in listed.items()} for band in range(count)]
-    turns = [_unpacking({**about, **own}, stored, always=True)[0] for own in each]
-    return lambda block: np.stack([turn(block[..., band]) for band, turn in enumerate(turns) if turn], -1), None
-
-
-def _unpacking(
-    about: Mapping[str, Any], stored: np.dtype[Any], *, always: bool = False
-) -> tuple[Turn | None, float | None]:
+def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
     """Return the function from numbers of a file to values, NaN where there is none, and the no-data value.
 
-    The function is None, unless ``always``, where the numbers are the values, with one no-data value at most.
+    The function is None where the numbers are the values, with one no-data value at most.
     """
-    coded = {name: about[name] for name in _CODED if name in about}
-    if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
-        coded = {name: value for name, value in coded.items() if name == "_Unsigned"}
-    listed = [_as_value(number, coded, stored) for name in _FILLS for number in np.ravel(about.get(name, ()))]
+    kind = _kind_of(about, stored)
+    scale, offset = about.get("scale_factor", 1.0), about.get("add_offset", 0.0)
+    scaled = bool(np.any(scale != 1) or np.any(offset != 0))
+    listed = [_held(number, stored, kind) for name in _FILLS for number in np.ravel(about.get(name, ()))]
     fills = list(dict.fromkeys(one for one in listed if one is not None))
     pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
     pair = pair if np.size(pair) == 2 else (None, None)
     # floating ends of whole numbers with a scale are values, others are packed (NetCDF Users Guide, conventions)
-    scaled = stored.kind in "biu" and bool(set(coded) - {"_Unsigned"})
-    are_values = [scaled and np.asarray(end).dtype.kind == "f" for end in pair]
-    ends = [
-        None if end is None else float(end) if is_value else _as_value(end, coded, stored)
+    are_values = [scaled and stored.kind in "biu" and np.asarray(end).dtype.kind == "f" for end in pair]
+    low, high = (
+        None if end is None else float(end) if is_value else _held(end, stored, kind)
         for end, is_value in zip(pair, are_values, strict=True)
-    ]
-    if not always and not coded and len(fills) < 2 and ends == [None, None]:
+    )
+    if not scaled and "_Unsigned" not in about and len(fills) < 2 and (low, high) == (None, None):
         return None, fills[0] if fills else None
-    low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
 
     def unpack(numbers: NDArray[Any]) -> NDArray[Any]:
-        values = _decoded(numbers, coded)
-        out = np.isin(values, fills)
-        out |= False if low is None else values < low
-        out |= False if high is None else values > high
-        return np.where(out, np.float32(np.nan), values.astype(np.float32))
+        packed = numbers.view(kind)
+        values = packed * scale + offset if scaled else packed
+        out = np.isin(packed, fills)
+        out |= False if low is None else (values if are_values[0] else packed) < low
+        out |= False if high is None else (values if are_values[1] else packed) > high
+        return np.where(out, np.float32(np.nan), values)
 
     return unpack, None
 
 
-def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
-    """Return numbers of a file as values, decoded by xarray."""
-    import xarray as xr
+def _kind_of(about: Mapping[str, Any], stored: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the numbers of a file, with the sign that _Unsigned states."""
+    if stored.kind not in "iu" or "_Unsigned" not in about:
+        return stored
+    return np.dtype(f"{stored.byteorder}{'u' if about['_Unsigned'] == 'true' else 'i'}{stored.itemsize}")
 
-    packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
-    return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
+
+def _held(number: Any, stored: np.dtype[Any], kind: np.dtype[Any]) -> float | None:
+    """Return a number of an attribute as the ``kind`` of number in the file; None where the file cannot hold it."""
+    if stored.kind == "f":
+        return float(number)
+    if np.isfinite(number) and int(number) == number:
+        for one in (stored, kind):  # _Unsigned may be written with either sign
+            if np.iinfo(one).min <= number <= np.iinfo(one).max:
+                return int(np.array(int(number), one).view(kind))
+    return None
 
 
 def _values(one: FileArray) -> NDArray[Any]:
     """Return an array whole, with its scale and offset (SceneError: as `_packing_of`)."""
     packing = _packing_of(one.attrs, one.where)
-    return _decoded(one[...], {name: packing[name] for name in _CODED if name in packing})
-
-
-def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
-    """Return a number of an attribute as the value that it stands for; None where the file cannot hold it."""
-    if stored.kind == "f":
-        return float(number)
-    if not np.isfinite(number) or int(number) != number:
-        return None
-    held, limits = int(number), np.iinfo(stored)
-    if "_Unsigned" in coded and not limits.min <= held <= limits.max:  # written with the other sign
-        held = (held - int(limits.min)) % 2 ** (8 * stored.itemsize) + int(limits.min)
-    if not limits.min <= held <= limits.max:
-        return None
-    return float(_decoded(np.array([held], stored), coded)[0])
+    unpack, _ = _unpacking({name: packing[name] for name in _CODED if name in packing}, one.dtype)
+    return one[...] if unpack is None else unpack(one[...])
 
 
 def _place_of(
