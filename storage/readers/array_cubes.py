@@ -283,7 +283,11 @@ def _bands_of(
         values = _values(arrays[axis]).astype(np.float64).ravel()
         if are_wavelengths(values):
             fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
-    usable = {key: value for key, value in attributes.items() if _is_list(value)}
+    usable = {
+        key: value
+        for key, value in attributes.items()
+        if all(isinstance(one, str | float | int | np.number) for one in np.asarray(value, object).ravel().tolist())
+    }
     names = _names_of(arrays, (axis, "band_names", "band_name"), count)
     found = bands_of_fields(usable | fields, names, cube or "the file")
     return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
@@ -296,11 +300,6 @@ def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | No
     each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
     plain = [one.item() if isinstance(one, np.ndarray) else one for one in each]
     return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in plain]
-
-
-def _is_list(value: object) -> bool:
-    """Return whether an attribute is a text or a number, or a list of them."""
-    return all(isinstance(one, str | float | int | np.number) for one in np.asarray(value, object).ravel().tolist())
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:

@@ -107,7 +107,7 @@ class CubeSource:
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
-    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
+    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value; some, not all
     acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     notes: tuple[str, ...] = ()

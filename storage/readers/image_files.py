@@ -69,14 +69,14 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
         alpha = _alpha_band(file, path)
         keep = [band for band in range(file.count) if band != alpha]
-        void = _void(file, alpha)
+        void, of_mask = _void(file, alpha)
         geobox, where = place_of_file(file)
         tags = _tags_of(file, keep)
         names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
         bands = bands_of_fields(tags, names, str(path), colours)
         bad, doubts = bad_bands(tags, len(keep))
         acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
-        kind, read = _values_of(file, path, keep, void if scaled and void is not None and not void.all() else None)
+        kind, read = _values_of(file, path, keep, void if scaled else None)
         source = CubeSource(
             name=path.name,
             shape=(file.height, file.width, len(keep)),
@@ -89,7 +89,7 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
             bad_bands=bad,
             void=void,
             acquired=acquired.text,
-            notes=(*(() if alpha is None else (ALPHA_NOTE,)), *where, *bands.notes, *doubts, *acquired.notes),
+            notes=(*(() if alpha is None else (ALPHA_NOTE,)), *of_mask, *where, *bands.notes, *doubts, *acquired.notes),
         )
         scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
@@ -174,18 +174,20 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
 
 
-def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
-    """Return (y, x) pixels that are transparent or masked; None without a mask."""
+def _void(file: Any, alpha: int | None) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
+    """Return (y, x) pixels that are transparent or masked, None without any or with all of them; and notes."""
     flags = {flag.name for flag in file.mask_flag_enums[0]}
     if alpha is None and ("per_dataset" not in flags or "alpha" in flags):
-        return None
+        return None, ()
     parts = []
     for first in range(0, file.height, BLOCK_LINES):
         window = ((first, min(first + BLOCK_LINES, file.height)), (0, file.width))
         seen = file.read_masks(1, window=window) if alpha is None else file.read(alpha + 1, window=window)
         parts.append(seen == 0)
     found = np.concatenate(parts)
-    return found if found.any() else None
+    if found.all():
+        return None, ("every pixel is transparent or masked: the mask is left out",)
+    return found if found.any() else None, ()
 
 
 def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:

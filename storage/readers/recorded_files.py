@@ -47,10 +47,6 @@ class FileCube:
         count = self.source.shape[2]
         return np.isin(np.arange(count), self.source.bad_bands if len(self.source.bad_bands) < count else ())
 
-    def owns(self, frame: Frame) -> bool:
-        """Return whether a frame is named like the cube, and so is of no other cube."""
-        return frame.files[0].name.startswith(f"{self.name}.")
-
     @property
     def exposure_ms(self) -> Floats | None:
         """Return (line,) exposures by the pointing table, else by the files; None if nothing states them."""
@@ -159,13 +155,9 @@ def references_of(
     frame = source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
     notes = [f"{kind} frame from {one.files[0].name}" for kind, one in frames.items()]
-    white_ms, more = match_exposures(
-        taken_of(frames),
-        source.taken,
-        exposure_ms,
-        stated=stated,
-        usual_ms=None if "white" in frames and cube.owns(frames["white"]) else camera.exposure_ms,
-    )
+    own_white = "white" in frames and frames["white"].files[0].name.startswith(f"{name}.")  # of no other cube
+    usual_ms = None if own_white else camera.exposure_ms
+    white_ms, more = match_exposures(taken_of(frames), source.taken, exposure_ms, stated=stated, usual_ms=usual_ms)
     notes += more
     for kind, one in frames.items():
         if one.values.shape != frame:
