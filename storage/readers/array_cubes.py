@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,7 +34,15 @@ from spectralzoom.storage.readers.band_facts import (
     is_spectral,
     letters,
 )
-from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, DIMS, CubeSource, LineFacts, read_by_chunks, reading
+from spectralzoom.storage.readers.cube_sources import (
+    BLOCK_LINES,
+    DIMS,
+    CubeSource,
+    LineFacts,
+    ReadLines,
+    read_by_chunks,
+    reading,
+)
 from spectralzoom.storage.readers.places import Place, place_of_dataset
 
 if TYPE_CHECKING:
@@ -78,10 +87,35 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         time, of_time = _time_of(near)
         acquired = acquired_of({**stated, **time})
         packing = _packing_of(array.attrs, array.where, count)
-        native = array.dtype.newbyteorder("=")
-        unpack, nodata = _unpacking(packing, native)
+        unpack, nodata = _unpacking(packing, array.dtype.newbyteorder("="))
         taken = taken_with(path.name, about, array.attrs)
         files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
+    unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
+    said = [*of_time, *acquired.notes, *array.notes, *notes, *_value_notes(array), *unnamed]
+    dtype, read = _reader_of(array, order, unpack, guard)
+    return CubeSource(
+        name=path.name,
+        shape=(height, width, count),
+        dtype=dtype,
+        read=read_by_chunks(read, height, array.chunks[order[0]]),
+        files=files,
+        lines=LineFacts(exposure_ms=None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)),
+        taken=taken,
+        bands=bands,
+        nodata=nodata,
+        geobox=geobox,
+        bad_bands=bad,
+        acquired=acquired.text,
+        scaling="" if unpack is None else json.dumps({key: np.ravel(packing[key]).tolist() for key in sorted(packing)}),
+        notes=(*said, *of_place, *bands.notes, *doubts),
+    )
+
+
+def _reader_of(
+    array: FileArray, order: Sequence[int], unpack: Turn | None, guard: Callable[[], AbstractContextManager[None]]
+) -> tuple[np.dtype[Any], ReadLines]:
+    """Return type and reader of lines (line, sample, band) of an array whose axes have this ``order``."""
+    native = array.dtype.newbyteorder("=")
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -89,36 +123,21 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         selection[order[0]] = slice(start, stop)
         with guard():
             block = np.ascontiguousarray(np.transpose(np.asarray(array[tuple(selection)]), order), native)
-            block = block.reshape(*block.shape[:2], count)
+            block = block if len(order) == 3 else block[..., None]
             return block if unpack is None else unpack(block).astype(np.float32)
 
+    return native if unpack is None else np.dtype(np.float32), read
+
+
+def _value_notes(array: FileArray) -> list[str]:
+    """Return notes on the unit of the values, and on scales by names that are not CF's."""
     unit = str(array.attrs.get("units", "")).strip()
-    said = [*of_time, *acquired.notes, *array.notes, *notes]
-    said += [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
-    said += [
+    values = {key: value for key, value in array.attrs.items() if re.search("scale|offset", key.lower())}
+    return ([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]) + [
         f"its {key} = {_shown(value)} is not applied: only scale_factor and add_offset are"
-        for key, value in array.attrs.items()
-        if key not in _CODED and re.search("scale|offset", key.lower())
+        for key, value in values.items()
+        if key not in _CODED
     ]
-    said += [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
-    exposure_ms = None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)
-    packed = {key: np.ravel(one).tolist() for key, one in sorted(packing.items())}
-    return CubeSource(
-        name=path.name,
-        shape=(height, width, count),
-        dtype=native if unpack is None else np.dtype(np.float32),
-        read=read_by_chunks(read, height, array.chunks[order[0]]),
-        files=files,
-        lines=LineFacts(exposure_ms=exposure_ms),
-        taken=taken,
-        bands=bands,
-        nodata=nodata,
-        geobox=geobox,
-        bad_bands=bad,
-        acquired=acquired.text,
-        scaling="" if unpack is None else json.dumps(packed),
-        notes=(*said, *of_place, *bands.notes, *doubts),
-    )
 
 
 def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
