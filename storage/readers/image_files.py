@@ -57,10 +57,8 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open an image, (y, x, band), without its alpha channel.
 
     Scale and offset of the file are applied if ``scaled``; else the numbers of a palette are kept. Raises SceneError:
-    there is no such file, it is damaged, claims more than its bytes can hold, or is a scene with a palette.
+    it is damaged, claims more than its bytes can hold, or is a scene with a palette.
     """
-    if not path.is_file():
-        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     check_sidecars(path)
     with _opened(path) as file:
         _check_image(file, path)
