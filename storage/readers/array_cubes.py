@@ -201,7 +201,9 @@ def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | 
 
     The function is None where the numbers are the values, with one no-data value at most.
     """
-    kind = _kind_of(about, stored)
+    kind = stored
+    if "_Unsigned" in about and stored.kind in "iu":
+        kind = np.dtype(f"{stored.byteorder}{'u' if about['_Unsigned'] == 'true' else 'i'}{stored.itemsize}")
     scale, offset = about.get("scale_factor", 1.0), about.get("add_offset", 0.0)
     scaled = bool(np.any(scale != 1) or np.any(offset != 0))
     listed = [_held(number, stored, kind) for name in _FILLS for number in np.ravel(about.get(name, ()))]
@@ -226,13 +228,6 @@ def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | 
         return np.where(out, np.float32(np.nan), values)
 
     return unpack, None
-
-
-def _kind_of(about: Mapping[str, Any], stored: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of the numbers of a file, with the sign that _Unsigned states."""
-    if stored.kind not in "iu" or "_Unsigned" not in about:
-        return stored
-    return np.dtype(f"{stored.byteorder}{'u' if about['_Unsigned'] == 'true' else 'i'}{stored.itemsize}")
 
 
 def _held(number: Any, stored: np.dtype[Any], kind: np.dtype[Any]) -> float | None:
@@ -260,8 +255,7 @@ def _place_of(
     sizes = dict(zip(dims, arrays[name].shape, strict=True))
     import xarray as xr
 
-    read: dict[str, xr.Variable] = {}
-    named: dict[str, xr.Variable] = {}
+    found: dict[str, xr.Variable] = {}
     for key, one in arrays.items():
         axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if key.lower() in words), None)
         by_name = key if key in dims or axis is None else dims[order[axis]]
@@ -269,12 +263,11 @@ def _place_of(
         fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
         if one.ndim < 2 and fits and one.dtype.kind in "iuf":
             plain = {text: value for text, value in one.attrs.items() if text not in (*_CODED, *_FILLS, *_ENDS)}
-            read[key] = xr.Variable(own, one[...], plain | _packing_of(one.attrs, one.where))
+            found[key] = xr.Variable(own, _values(one), plain)
         else:
             own = tuple(dims) if key == name else tuple(f"{key} {axis}" for axis in range(one.ndim))
-            named[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
-    dataset = xr.decode_cf(xr.Dataset(read, attrs=dict(attributes)), decode_times=False, decode_coords=False)
-    return place_of_dataset(dataset.assign(named), name, (dims[order[0]], dims[order[1]]))
+            found[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
+    return place_of_dataset(xr.Dataset(found, attrs=dict(attributes)), name, (dims[order[0]], dims[order[1]]))
 
 
 def _bands_of(

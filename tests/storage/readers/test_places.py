@@ -334,6 +334,7 @@ def test_netcdf_and_zarr_of_gdal_have_gdals_place(tmp_path: Path) -> None:
     rasterio.shutil.copy(tmp_path / "a.tif", tmp_path / "a.zarr", driver="Zarr")
     cube = open_cube_source(f"{tmp_path / 'a.nc'}:Band1")
     assert cube.geobox == GeoBox(SHAPE, PLACE * Affine(1, 0, 0, 0, -1, 6), "EPSG:32632")
+    assert not any("contradicts" in note for note in cube.notes)
     np.testing.assert_array_equal(cube.read(0, 6)[::-1, :, 0], VALUES)
     assert open_cube_source(f"{tmp_path / 'a.zarr'}:a").geobox == GeoBox(SHAPE, PLACE, "EPSG:32632")
 
