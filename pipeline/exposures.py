@@ -260,7 +260,7 @@ def _dark_note(frames: Frames, dark_ms: float, white_ms: float, lines_ms: NDArra
     (dark, taken), (white, of_white) = frames["dark"], frames.get("white", (None, Taken()))
     what = f"{taken.where} was taken with {taken.text}, the lines with {lines}"
     kept = "it is used as it is, since its bias does not depend on the exposure"
-    if white is None or white.shape != dark.shape:
+    if white is None:
         return f"{what}: {kept}"
     lit = (white - dark)[white > dark]
     level = abs(float(np.nanmedian(dark))) / float(np.median(lit)) if lit.size else 0.0

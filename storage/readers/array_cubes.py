@@ -1,7 +1,7 @@
 """Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy and .mat.
 
-Axes are found by their names; without names they are y, x and band. xarray decodes scale, offset, fill value and
-unsigned numbers; the valid range, which it leaves out, is applied here.
+Axes are found by their names; without names they are y, x and band. Scale, offset, sign, fill values and valid range
+are applied by CF's rules; scale and offset may be one a band, which xarray does not decode.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,7 +34,15 @@ from spectralzoom.storage.readers.band_facts import (
     is_spectral,
     letters,
 )
-from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, DIMS, CubeSource, LineFacts, read_by_chunks, reading
+from spectralzoom.storage.readers.cube_sources import (
+    BLOCK_LINES,
+    DIMS,
+    CubeSource,
+    LineFacts,
+    ReadLines,
+    read_by_chunks,
+    reading,
+)
 from spectralzoom.storage.readers.places import Place, place_of_dataset
 
 if TYPE_CHECKING:
@@ -78,10 +87,35 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         time, of_time = _time_of(near)
         acquired = acquired_of({**stated, **time})
         packing = _packing_of(array.attrs, array.where, count)
-        native = array.dtype.newbyteorder("=")
-        unpack, nodata = _unpacking_bands(packing, native, count)
+        unpack, nodata = _unpacking(packing, array.dtype.newbyteorder("="))
         taken = taken_with(path.name, about, array.attrs)
         files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
+    unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
+    said = [*of_time, *acquired.notes, *array.notes, *notes, *_value_notes(array), *unnamed]
+    dtype, read = _reader_of(array, order, unpack, guard)
+    return CubeSource(
+        name=path.name,
+        shape=(height, width, count),
+        dtype=dtype,
+        read=read_by_chunks(read, height, array.chunks[order[0]]),
+        files=files,
+        lines=LineFacts(exposure_ms=None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)),
+        taken=taken,
+        bands=bands,
+        nodata=nodata,
+        geobox=geobox,
+        bad_bands=bad,
+        acquired=acquired.text,
+        scaling="" if unpack is None else json.dumps({key: np.ravel(packing[key]).tolist() for key in sorted(packing)}),
+        notes=(*said, *of_place, *bands.notes, *doubts),
+    )
+
+
+def _reader_of(
+    array: FileArray, order: Sequence[int], unpack: Turn | None, guard: Callable[[], AbstractContextManager[None]]
+) -> tuple[np.dtype[Any], ReadLines]:
+    """Return type and reader of lines (line, sample, band) of an array whose axes have this ``order``."""
+    native = array.dtype.newbyteorder("=")
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
@@ -89,36 +123,21 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         selection[order[0]] = slice(start, stop)
         with guard():
             block = np.ascontiguousarray(np.transpose(np.asarray(array[tuple(selection)]), order), native)
-            block = block.reshape(*block.shape[:2], count)
-            return block if unpack is None else unpack(block)
+            block = block if len(order) == 3 else block[..., None]
+            return block if unpack is None else unpack(block).astype(np.float32)
 
+    return native if unpack is None else np.dtype(np.float32), read
+
+
+def _value_notes(array: FileArray) -> list[str]:
+    """Return notes on the unit of the values, and on scales by names that are not CF's."""
     unit = str(array.attrs.get("units", "")).strip()
-    said = [*of_time, *acquired.notes, *array.notes, *notes]
-    said += [] if unit.lower() in NO_UNIT else [f"values are in {unit}"]
-    said += [
+    values = {key: value for key, value in array.attrs.items() if re.search("scale|offset", key.lower())}
+    return ([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]) + [
         f"its {key} = {_shown(value)} is not applied: only scale_factor and add_offset are"
-        for key, value in array.attrs.items()
-        if key not in _CODED and re.search("scale|offset", key.lower())
+        for key, value in values.items()
+        if key not in _CODED
     ]
-    said += [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
-    exposure_ms = None if taken.exposure_ms is None else np.full(height, taken.exposure_ms)
-    packed = {key: np.ravel(one).tolist() for key, one in sorted(packing.items())}
-    return CubeSource(
-        name=path.name,
-        shape=(height, width, count),
-        dtype=native if unpack is None else np.dtype(np.float32),
-        read=read_by_chunks(read, height, array.chunks[order[0]]),
-        files=files,
-        lines=LineFacts(exposure_ms=exposure_ms),
-        taken=taken,
-        bands=bands,
-        nodata=nodata,
-        geobox=geobox,
-        bad_bands=bad,
-        acquired=acquired.text,
-        scaling="" if unpack is None else json.dumps(packed),
-        notes=(*said, *of_place, *bands.notes, *doubts),
-    )
 
 
 def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
@@ -138,7 +157,7 @@ def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
         return {}, [f"time in {words!r} is not used as the day of acquisition ({type(error).__name__}); use --visit"]
 
 
-_CODED = ("scale_factor", "add_offset", "_Unsigned")  # which xarray decodes
+_CODED = ("scale_factor", "add_offset", "_Unsigned")
 _FILLS = ("_FillValue", "missing_value")
 _ENDS = ("valid_range", "valid_min", "valid_max")
 _SIGNS = {"true": "true", "1": "true", "false": "false", "0": "false"}
@@ -177,77 +196,56 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _unpacking_bands(about: Mapping[str, Any], stored: np.dtype[Any], count: int) -> tuple[Turn | None, float | None]:
-    """Return the function and the no-data value as `_unpacking`, for scales that may be one a band."""
-    listed = {name: about[name] for name in _CODED[:2] if np.size(about.get(name, 1)) > 1}
-    if not listed:
-        return _unpacking(about, stored)
-    each = [{name: one[band] for name, one in listed.items()} for band in range(count)]
-    turns = [_unpacking({**about, **own}, stored, always=True)[0] for own in each]
-    return lambda block: np.stack([turn(block[..., band]) for band, turn in enumerate(turns) if turn], -1), None
-
-
-def _unpacking(
-    about: Mapping[str, Any], stored: np.dtype[Any], *, always: bool = False
-) -> tuple[Turn | None, float | None]:
+def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
     """Return the function from numbers of a file to values, NaN where there is none, and the no-data value.
 
-    The function is None, unless ``always``, where the numbers are the values, with one no-data value at most.
+    The function is None where the numbers are the values, with one no-data value at most.
     """
-    coded = {name: about[name] for name in _CODED if name in about}
-    if (coded.get("scale_factor", 1.0), coded.get("add_offset", 0.0)) == (1.0, 0.0):
-        coded = {name: value for name, value in coded.items() if name == "_Unsigned"}
-    listed = [_as_value(number, coded, stored) for name in _FILLS for number in np.ravel(about.get(name, ()))]
+    kind = stored
+    if "_Unsigned" in about and stored.kind in "iu":
+        kind = np.dtype(f"{stored.byteorder}{'u' if about['_Unsigned'] == 'true' else 'i'}{stored.itemsize}")
+    scale, offset = about.get("scale_factor", 1.0), about.get("add_offset", 0.0)
+    scaled = bool(np.any(scale != 1) or np.any(offset != 0))
+    listed = [_held(number, stored, kind) for name in _FILLS for number in np.ravel(about.get(name, ()))]
     fills = list(dict.fromkeys(one for one in listed if one is not None))
     pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
     pair = pair if np.size(pair) == 2 else (None, None)
     # floating ends of whole numbers with a scale are values, others are packed (NetCDF Users Guide, conventions)
-    scaled = stored.kind in "biu" and bool(set(coded) - {"_Unsigned"})
-    are_values = [scaled and np.asarray(end).dtype.kind == "f" for end in pair]
-    ends = [
-        None if end is None else float(end) if is_value else _as_value(end, coded, stored)
+    are_values = [scaled and stored.kind in "biu" and np.asarray(end).dtype.kind == "f" for end in pair]
+    low, high = (
+        None if end is None else float(end) if is_value else _held(end, stored, kind)
         for end, is_value in zip(pair, are_values, strict=True)
-    ]
-    if not always and not coded and len(fills) < 2 and ends == [None, None]:
+    )
+    if not scaled and "_Unsigned" not in about and len(fills) < 2 and (low, high) == (None, None):
         return None, fills[0] if fills else None
-    low, high = ends[::-1] if coded.get("scale_factor", 1.0) < 0 else ends
 
     def unpack(numbers: NDArray[Any]) -> NDArray[Any]:
-        values = _decoded(numbers, coded)
-        out = np.isin(values, fills)
-        out |= False if low is None else values < low
-        out |= False if high is None else values > high
-        return np.where(out, np.float32(np.nan), values.astype(np.float32))
+        packed = numbers.view(kind)
+        values = packed * scale + offset if scaled else packed
+        out = np.isin(packed, fills)
+        out |= False if low is None else (values if are_values[0] else packed) < low
+        out |= False if high is None else (values if are_values[1] else packed) > high
+        return np.where(out, np.float32(np.nan), values)
 
     return unpack, None
 
 
-def _decoded(numbers: NDArray[Any], coded: Mapping[str, Any]) -> NDArray[Any]:
-    """Return numbers of a file as values, decoded by xarray."""
-    import xarray as xr
-
-    packed = xr.Dataset({"values": xr.Variable([f"axis_{at}" for at in range(numbers.ndim)], numbers, dict(coded))})
-    return np.asarray(xr.decode_cf(packed, decode_times=False, decode_coords=False)["values"].values)
+def _held(number: Any, stored: np.dtype[Any], kind: np.dtype[Any]) -> float | None:
+    """Return a number of an attribute as the ``kind`` of number in the file; None where the file cannot hold it."""
+    if stored.kind == "f":
+        return float(number)
+    if np.isfinite(number) and int(number) == number:
+        for one in (stored, kind):  # _Unsigned may be written with either sign
+            if np.iinfo(one).min <= number <= np.iinfo(one).max:
+                return int(np.array(int(number), one).view(kind))
+    return None
 
 
 def _values(one: FileArray) -> NDArray[Any]:
     """Return an array whole, with its scale and offset (SceneError: as `_packing_of`)."""
     packing = _packing_of(one.attrs, one.where)
-    return _decoded(one[...], {name: packing[name] for name in _CODED if name in packing})
-
-
-def _as_value(number: Any, coded: Mapping[str, Any], stored: np.dtype[Any]) -> float | None:
-    """Return a number of an attribute as the value that it stands for; None where the file cannot hold it."""
-    if stored.kind == "f":
-        return float(number)
-    if not np.isfinite(number) or int(number) != number:
-        return None
-    held, limits = int(number), np.iinfo(stored)
-    if "_Unsigned" in coded and not limits.min <= held <= limits.max:  # written with the other sign
-        held = (held - int(limits.min)) % 2 ** (8 * stored.itemsize) + int(limits.min)
-    if not limits.min <= held <= limits.max:
-        return None
-    return float(_decoded(np.array([held], stored), coded)[0])
+    unpack, _ = _unpacking({name: packing[name] for name in _CODED if name in packing}, one.dtype)
+    return one[...] if unpack is None else unpack(one[...])
 
 
 def _place_of(
@@ -257,8 +255,7 @@ def _place_of(
     sizes = dict(zip(dims, arrays[name].shape, strict=True))
     import xarray as xr
 
-    read: dict[str, xr.Variable] = {}
-    named: dict[str, xr.Variable] = {}
+    found: dict[str, xr.Variable] = {}
     for key, one in arrays.items():
         axis = next((at for at, words in enumerate((ROWS, COLUMNS)) if key.lower() in words), None)
         by_name = key if key in dims or axis is None else dims[order[axis]]
@@ -266,12 +263,11 @@ def _place_of(
         fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
         if one.ndim < 2 and fits and one.dtype.kind in "iuf":
             plain = {text: value for text, value in one.attrs.items() if text not in (*_CODED, *_FILLS, *_ENDS)}
-            read[key] = xr.Variable(own, one[...], plain | _packing_of(one.attrs, one.where))
+            found[key] = xr.Variable(own, _values(one), plain)
         else:
             own = tuple(dims) if key == name else tuple(f"{key} {axis}" for axis in range(one.ndim))
-            named[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
-    dataset = xr.decode_cf(xr.Dataset(read, attrs=dict(attributes)), decode_times=False, decode_coords=False)
-    return place_of_dataset(dataset.assign(named), name, (dims[order[0]], dims[order[1]]))
+            found[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
+    return place_of_dataset(xr.Dataset(found, attrs=dict(attributes)), name, (dims[order[0]], dims[order[1]]))
 
 
 def _bands_of(
@@ -299,7 +295,11 @@ def _bands_of(
         values = _values(arrays[axis]).astype(np.float64).ravel()
         if are_wavelengths(values):
             fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
-    usable = {key: value for key, value in attributes.items() if _is_list(value)}
+    usable = {
+        key: value
+        for key, value in attributes.items()
+        if all(isinstance(one, str | float | int | np.number) for one in np.asarray(value, object).ravel().tolist())
+    }
     names = _names_of(arrays, (axis, "band_names", "band_name"), count)
     found = bands_of_fields(usable | fields, names, cube or "the file")
     return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
@@ -312,11 +312,6 @@ def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | No
     each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
     plain = [one.item() if isinstance(one, np.ndarray) else one for one in each]
     return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in plain]
-
-
-def _is_list(value: object) -> bool:
-    """Return whether an attribute is a text or a number, or a list of them."""
-    return all(isinstance(one, str | float | int | np.number) for one in np.asarray(value, object).ravel().tolist())
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:

@@ -273,8 +273,12 @@ def _lists(
     fields: Mapping[str, object], kind: re.Pattern[str], count: int, notes: list[str]
 ) -> Iterator[tuple[str, NDArray[np.float64], object]]:
     """Yield key, (band,) numbers and unit of each list of a kind; ``notes`` say why others are left out."""
-    of_lists = {_before_unit(letters(key)): value for key, value in fields.items()}
-    stated = {key: value for key, value in of_lists.items() if kind.fullmatch(key)}
+    units_of = {letters(key): value for key, value in fields.items()}
+    stated = {
+        key[: found.end(1)]: value
+        for key, value in units_of.items()
+        if (found := re.fullmatch("(.+?)units?", key)) and kind.fullmatch(found[1])
+    }
     for key in sorted(fields, key=len):
         if (known := kind.fullmatch(letters(key))) is None:
             continue
@@ -292,12 +296,6 @@ def _lists(
         if len(different := set(filter(None, units))) > 1:
             numbers, different = numbers * [scale_nm(unit) or np.nan for unit in units], {"nm"}
         yield key, numbers, "".join(different)
-
-
-def _before_unit(key: str) -> str:
-    """Return the name of the list that a key such as ``wavelengthunits`` belongs to; "" for other keys."""
-    found = re.fullmatch("(.+?)units?", key)
-    return "" if found is None else found[1]
 
 
 def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[str] = ()) -> Bands:

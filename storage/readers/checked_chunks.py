@@ -95,6 +95,7 @@ class CheckedCodec(BytesBytesCodec):
         return {"name": _NAME, "configuration": {"packer": self.packer}}
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
+        """Raise NotImplementedError, as zarr asks of codecs whose output has no fixed size."""
         raise NotImplementedError
 
     async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> Buffer:
@@ -112,6 +113,7 @@ class CheckedPacker(numcodecs.abc.Codec):  # type: ignore[misc]
         self.packer, self.size = packer, size
 
     def encode(self, buf: Any) -> Any:
+        """Raise NotImplementedError: numcodecs requires this method, and readers write nothing."""
         raise NotImplementedError
 
     def decode(self, buf: Any, out: Any = None) -> Any:

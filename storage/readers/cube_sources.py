@@ -107,7 +107,7 @@ class CubeSource:
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
-    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value
+    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value; some, not all
     acquired: str | None = None  # when the light was captured: a day or a moment in UTC, ISO 8601
     scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     notes: tuple[str, ...] = ()
@@ -119,18 +119,12 @@ class CubeSource:
 
 
 def check_cube_source(source: CubeSource) -> None:
-    """Refuse a cube without real numbers, without pixels, or with frames of another size (SceneError)."""
+    """Refuse a cube without real numbers or without pixels (SceneError)."""
     where = source.name
     if source.dtype.kind not in "buif":
         raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers; store numbers of these")
     if min(source.shape) < 1:
         raise SceneError(f"{where} holds an empty cube of shape {source.shape}")
-    for name, frame in (("dark", source.dark), ("white", source.white)):
-        if frame is not None and frame.shape != source.shape[1:]:
-            raise SceneError(
-                f"the {name} frame is {frame.shape} (sample, band), {where} is {source.shape[1:]}; give one taken with "
-                "the cube's own binning"
-            )
 
 
 def unpacked(

@@ -29,7 +29,7 @@ from spectralzoom.pipeline.rig.camera.frame_indices import (
     times_of_lines,
 )
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import Bands, bad_bands, bands_of_fields, numbers_of_list
+from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, numbers_of_list
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import rescaled
 from spectralzoom.storage.readers.own_files import within
@@ -211,12 +211,6 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     return replace(source, files=(*source.files, *indices.values()), lines=lines, notes=tuple(notes))
 
 
-def bands_of_header(header: EnviHeader, where: str) -> Bands:
-    """Return (band,) wavelengths and widths of a header, of a library (sample,), or the notes on why there are none."""
-    count = header.samples if "spectral library" in header.kind.lower() else header.bands
-    return bands_of_fields(header.fields, [None] * count, where)
-
-
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
     """Return files by their first lines as one cube; lines that are in no file are 0 and not valid."""
     cubes = list(parts.values())
@@ -231,7 +225,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
     taken, exposure_ms = _taken(parts, height, notes)
-    of_parts = [bands_of_header(one.header, one.header_path.name) for one in cubes]
+    of_parts = [bands_of_fields(one.header.fields, [None] * count, one.header_path.name) for one in cubes]
     bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
     bad, doubts = bad_bands(cubes[0].header.fields, count)
     notes += [*bands.notes, *doubts]

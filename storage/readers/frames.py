@@ -39,10 +39,10 @@ def find_reference(folder: Path, kind: str) -> Path | None:
     return within(folder, found[0]) if found else None
 
 
-def find_frames(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Frame]:
+def find_frames(stem: Path, stated: Mapping[str, Path | None], shape: tuple[int, int]) -> dict[str, Frame]:
     """Return the frames of a cube by their kinds: ``stated``, else those beside the cube ``stem``, else of its folder.
 
-    Raises SceneError: a file is missing, damaged or no frame, or a folder has several of a kind.
+    Raises SceneError: a file is missing, damaged or no frame of ``shape``, or a folder has several of a kind.
     """
     frames: dict[str, Frame] = {}
     for kind in KINDS:
@@ -52,12 +52,12 @@ def find_frames(stem: Path, stated: Mapping[str, Path | None]) -> dict[str, Fram
         file = file or next((within(stem.parent, one) for one in beside if one.is_file()), None)
         file = find_reference(stem.parent, kind) if file is None and kind != "bad" else file
         if file is not None:
-            frames[kind] = load_frame(file, kind)
+            frames[kind] = load_frame(file, kind, shape)
     return frames
 
 
-def load_frame(path: Path, kind: str = "reference") -> Frame:
-    """Read one ENVI or .npy frame (SceneError: it cannot be read or holds no real numbers)."""
+def load_frame(path: Path, kind: str, shape: tuple[int, int]) -> Frame:
+    """Read one ENVI or .npy frame (SceneError: it has no real numbers of the (sample, band) ``shape``)."""
     where = f"the {kind} frame {path.name}"
     if path.is_dir():
         raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
@@ -74,6 +74,9 @@ def load_frame(path: Path, kind: str = "reference") -> Frame:
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
     frame = values[None] if values.ndim == 2 else values
+    if frame.shape[1:] != shape:
+        is_not = f"the {kind} frame {path} is {frame.shape[1:]} (sample, band), the cube {shape}"
+        raise SceneError(f"{is_not}; give one taken with the cube's own samples and bands")
     return Frame(np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files, taken, fields)
 
 

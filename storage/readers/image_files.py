@@ -29,6 +29,7 @@ from spectralzoom.storage.readers.cube_sources import (
     DEFLATE_RATIO,
     MOST_RATIO,
     CubeSource,
+    ReadLines,
     check_claim,
     check_memory,
     read_by_chunks,
@@ -56,74 +57,88 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     """Open an image, (y, x, band), without its alpha channel.
 
     Scale and offset of the file are applied if ``scaled``; else the numbers of a palette are kept. Raises SceneError:
-    there is no such file, it is damaged, claims more than its bytes can hold, or is a scene with a palette.
+    it is damaged, claims more than its bytes can hold, or is a scene with a palette.
     """
-    if not path.is_file():
-        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-    driver = _DRIVERS[path.suffix.lower()]
     check_sidecars(path)
     with _opened(path) as file:
-        check_overviews(file, path)
-        if len(file.subdatasets) > 1:
-            raise SceneError(
-                f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
-                " one (rio stack), or give the image alone in a file"
-            )
-        block = max(file.block_shapes)
-        item = max(np.dtype(one).itemsize for one in file.dtypes)
-        claimed = file.height * file.width * file.count * item
-        if driver != "JPEG":  # its blocks may have no byte each
-            check_claim(path, claimed, path.stat().st_size, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
-        at_a_time = math.prod(block) * file.count * item + claimed // file.height * BLOCK_LINES
-        check_memory(path, at_a_time if driver in _CALLED else claimed * 3)
+        _check_image(file, path)
         orientation, exif = _exif_of(path)
-        kinds = [kind.name for kind in file.colorinterp]
-        if scaled and kinds == ["palette"]:
+        if scaled and [kind.name for kind in file.colorinterp] == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
-        alpha = kinds.index("alpha") if "alpha" in kinds else None
-        of_all = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
-        if alpha is not None and ((of_all is not None and np.isfinite(of_all[alpha])) or _is_other(file, alpha)):
-            alpha = None  # GDAL calls a fourth band of bytes alpha by default
+        alpha = _alpha_band(file, path)
         keep = [band for band in range(file.count) if band != alpha]
-        void = _void(file, alpha)
-        masked = void if scaled and void is not None and not void.all() else None
-        kinds_of_kept = (np.dtype(file.dtypes[band]) for band in keep or [0])
-        kind = np.dtype(np.float32) if masked is not None else np.result_type(*kinds_of_kept)
-        height, width = file.height, file.width
+        void, of_mask = _void(file, alpha)
         geobox, where = place_of_file(file)
-        tags, (names, colours) = _tags_of(file, keep), ([one[at] for at in keep] for one in (file.descriptions, kinds))
-        known = bands_of_fields(tags, names, str(path), colours)
+        tags = _tags_of(file, keep)
+        names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
+        bands = bands_of_fields(tags, names, str(path), colours)
         bad, doubts = bad_bands(tags, len(keep))
         acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
-        notes = [*([] if alpha is None else [ALPHA_NOTE]), *where, *known.notes, *doubts, *acquired.notes]
-        scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
-        at_once = height if driver not in _CALLED else block[0] if driver == "JP2OpenJPEG" else 1
-
-        def read_rows(first: int, last: int) -> NDArray[Any]:
-            """Return some rows, (y, x, band) (SceneError: they are damaged)."""
-            with _opened(path) as opened:
-                planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
-            lines = np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
-            if masked is not None:
-                lines[masked[first:last]] = np.nan
-            return lines
-
+        kind, read = _values_of(file, path, keep, void if scaled else None)
         source = CubeSource(
             name=path.name,
-            shape=(height, width, len(keep)),
+            shape=(file.height, file.width, len(keep)),
             dtype=kind,
-            read=read_by_chunks(read_rows, height, at_once),
+            read=read,
             files=(path,),
-            bands=known,
+            bands=bands,
             nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
             geobox=geobox,
             bad_bands=bad,
             void=void,
             acquired=acquired.text,
-            notes=tuple(notes),
+            notes=(*(() if alpha is None else (ALPHA_NOTE,)), *of_mask, *where, *bands.notes, *doubts, *acquired.notes),
         )
+        scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
     plain = not scaled or ((scale == 1).all() and (offset == 0).all())
     return _upright(source if plain else rescaled(source, scale, offset), orientation)
+
+
+def _check_image(file: Any, path: Path) -> None:
+    """Refuse several images, overviews elsewhere, and a size beyond bytes or memory (SceneError)."""
+    check_overviews(file, path)
+    if len(file.subdatasets) > 1:
+        raise SceneError(
+            f"{path} holds {len(file.subdatasets)} images, expected one with all bands; write them as the bands of"
+            " one (rio stack), or give the image alone in a file"
+        )
+    item = max(np.dtype(one).itemsize for one in file.dtypes)
+    claimed = file.height * file.width * file.count * item
+    if file.driver != "JPEG":  # its blocks may have no byte each
+        check_claim(path, claimed, path.stat().st_size, MOST_RATIO if file.driver in _CALLED else DEFLATE_RATIO)
+    at_a_time = math.prod(max(file.block_shapes)) * file.count * item + claimed // file.height * BLOCK_LINES
+    check_memory(path, at_a_time if file.driver in _CALLED else claimed * 3)
+
+
+def _alpha_band(file: Any, path: Path) -> int | None:
+    """Return the alpha channel, from 0; None without one, as GDAL calls a fourth band of bytes alpha by default."""
+    kinds = [kind.name for kind in file.colorinterp]
+    if "alpha" not in kinds:
+        return None
+    alpha, name = kinds.index("alpha"), file.descriptions[kinds.index("alpha")]
+    known = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
+    named = is_named(name, alpha) and not re.search("alpha|transparen|opacity|mask|^a$", name.lower())
+    return None if named or (known is not None and np.isfinite(known[alpha])) else alpha
+
+
+def _values_of(
+    file: Any, path: Path, keep: Sequence[int], masked: NDArray[np.bool_] | None
+) -> tuple[np.dtype[Any], ReadLines]:
+    """Return type and reader of the values of some bands, NaN in ``masked`` (y, x) pixels."""
+    whole = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
+    kind, width = whole if masked is None else np.dtype(np.float32), file.width
+    rows = {"GTiff": 1, "JP2OpenJPEG": max(file.block_shapes)[0]}.get(file.driver, file.height)  # at a time
+
+    def read_rows(first: int, last: int) -> NDArray[Any]:
+        """Return some rows, (y, x, band) (SceneError: they are damaged)."""
+        with _opened(path) as opened:
+            planes = opened.read([band + 1 for band in keep], window=((first, last), (0, width)))
+        lines = np.ascontiguousarray(np.moveaxis(planes, 0, -1), kind)
+        if masked is not None:
+            lines[masked[first:last]] = np.nan
+        return lines
+
+    return kind, read_by_chunks(read_rows, file.height, rows)
 
 
 def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
@@ -157,25 +172,20 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
 
 
-def _is_other(file: Any, alpha: int) -> bool:
-    """Return whether the band that is flagged as alpha has another name."""
-    name = file.descriptions[alpha]
-    return is_named(name, alpha) and not re.search("alpha|transparen|opacity|mask|^a$", name.lower())
-
-
-def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
-    """Return (y, x) pixels that are transparent or masked; None without a mask."""
-    kinds = importlib.import_module("rasterio").enums.MaskFlags
-    flags = file.mask_flag_enums[0]
-    if alpha is None and (kinds.per_dataset not in flags or kinds.alpha in flags):
-        return None
+def _void(file: Any, alpha: int | None) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
+    """Return (y, x) pixels that are transparent or masked, None without any or with all of them; and notes."""
+    flags = {flag.name for flag in file.mask_flag_enums[0]}
+    if alpha is None and ("per_dataset" not in flags or "alpha" in flags):
+        return None, ()
     parts = []
     for first in range(0, file.height, BLOCK_LINES):
         window = ((first, min(first + BLOCK_LINES, file.height)), (0, file.width))
         seen = file.read_masks(1, window=window) if alpha is None else file.read(alpha + 1, window=window)
         parts.append(seen == 0)
     found = np.concatenate(parts)
-    return found if found.any() else None
+    if found.all():
+        return None, ("every pixel is transparent or masked: the mask is left out",)
+    return found if found.any() else None, ()
 
 
 def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:

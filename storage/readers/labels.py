@@ -146,7 +146,7 @@ def load_codes(
         if void.any() and codes[void][0] not in map(_code, classes):
             codes[void] = NO_VALUE
             notes.append(f"{void.sum()} px have the label file's no-data value {source.nodata:g}: unlabelled")
-    if source.void is not None and not source.void.all():
+    if source.void is not None:
         clear = source.void & ~np.isin(codes, [*map(_code, classes)])
         codes[clear] = NO_VALUE
         notes += [f"{clear.sum()} px of the label file are transparent or masked: unlabelled"] if clear.any() else []

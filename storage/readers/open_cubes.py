@@ -106,7 +106,7 @@ def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource
 def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     """Return a Headwall cube with the dark and white frames of its folder, if there are some."""
     found = {kind: find_reference(folder, kind) for kind in ("dark", "white")}
-    frames = {kind: load_frame(file, kind) for kind, file in found.items() if file is not None}
+    frames = {kind: load_frame(file, kind, source.shape[1:]) for kind, file in found.items() if file is not None}
     stated_ms = source.lines.exposure_ms
     lines_ms = np.ones(1) if stated_ms is None else stated_ms
     notes = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]

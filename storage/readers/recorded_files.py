@@ -47,10 +47,6 @@ class FileCube:
         count = self.source.shape[2]
         return np.isin(np.arange(count), self.source.bad_bands if len(self.source.bad_bands) < count else ())
 
-    def owns(self, frame: Frame) -> bool:
-        """Return whether a frame is named like the cube, and so is of no other cube."""
-        return frame.files[0].name.startswith(f"{self.name}.")
-
     @property
     def exposure_ms(self) -> Floats | None:
         """Return (line,) exposures by the pointing table, else by the files; None if nothing states them."""
@@ -115,7 +111,9 @@ def open_file_cube(path: Path, wavelengths: Sequence[float] | None, stated: Mapp
     fields = load_envi_header(find_envi_pair(path)[0]).fields if reader_of(path) == "envi" else {}
     if (axis := fields.get("line axis", "x").strip()) not in ("x", "y"):
         raise SceneError(f"{path} has line axis = {axis!r}, expected x or y; correct the header")
-    return FileCube(name, folder, source, find_frames(folder / name, stated), "y" if axis == "y" else "x")
+    return FileCube(
+        name, folder, source, find_frames(folder / name, stated, source.shape[1:]), "y" if axis == "y" else "x"
+    )
 
 
 def with_bits(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera, list[str]]:
@@ -132,8 +130,8 @@ def with_bits(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera
         lines = np.concatenate([source.read(int(line), int(line) + 1) for line in chosen])
         void = np.nan if source.nodata is None else source.nodata
         most = int(lines.max(initial=0, where=~cube.bad_bands & (lines != void)))
-        white = cube.frames["white"].values if "white" in cube.frames else None
-        if white is not None and white.shape == source.shape[1:]:  # `references_of` refuses others
+        if "white" in cube.frames:
+            white = cube.frames["white"].values
             most = max(most, int(white[np.isfinite(white) & ~cube.bad_bands].max(initial=0)))
         full = camera.full_scale_dn * max(camera.samples // source.shape[1], 1)
         needed = (most * camera.full_scale_dn // full).bit_length()
@@ -153,24 +151,16 @@ def references_of(
 
     ``exposure_ms`` (line,) are those of its lines, by a file if ``stated``; ``white_reference`` is the default value of
     the white reference, one or (band,). Without a white frame, values are those of the exposure of the camera. Raises
-    SceneError: a frame does not fit the cube, or white is not brighter than dark.
+    SceneError: frames do not fit each other or the cube, or white is not brighter than dark.
     """
     name, source, frames = cube.name, cube.source, cube.frames
     frame = source.shape[1:]
     white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
     notes = [f"{kind} frame from {one.files[0].name}" for kind, one in frames.items()]
-    white_ms, more = match_exposures(
-        taken_of(frames),
-        source.taken,
-        exposure_ms,
-        stated=stated,
-        usual_ms=None if "white" in frames and cube.owns(frames["white"]) else camera.exposure_ms,
-    )
+    own_white = "white" in frames and frames["white"].files[0].name.startswith(f"{name}.")  # of no other cube
+    usual_ms = None if own_white else camera.exposure_ms
+    white_ms, more = match_exposures(taken_of(frames), source.taken, exposure_ms, stated=stated, usual_ms=usual_ms)
     notes += more
-    for kind, one in frames.items():
-        if one.values.shape != frame:
-            is_not = f"the {kind} frame {one.files[0]} is {one.values.shape} (sample, band), the cube {frame}"
-            raise SceneError(f"{is_not}; give one taken with the cube's own samples and bands")
     found = {kind: one.values for kind, one in frames.items()}
     measured = {"dark", "white"} <= set(found)
     if "dark" not in found:

@@ -150,7 +150,8 @@ def _light_hash(
     widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
     nodata = values.nodata if values.assumed and used else stated
     more = [] if nodata is None else [f"nodata {nodata!r}"]
-    more += [] if values.void is None else [f"void {hashlib.sha256(np.packbits(values.void).tobytes()).hexdigest()}"]
+    void = values.source.void
+    more += [] if void is None else [f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}"]
     more += [one for one in (values.source.scaling, values.scaling) if one]
     return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
 
@@ -238,18 +239,16 @@ class FileValues:
     bands: list[int]
     nodata: float | None
     assumed: bool  # nothing states the no-data value
-    void: NDArray[np.bool_] | None  # (y, x) transparent or masked
     scale: float  # of scene.toml
     offset: float
 
     @classmethod
     def of(cls, source: CubeSource, bands: list[int], settings: SceneSettings) -> FileValues:
-        """Use the no-data value of scene.toml, of the file, or the usual one; a mask of all pixels is ignored."""
+        """Use the no-data value of scene.toml, of the file, or the usual one."""
         calibrated = source.dark is not None and source.white is not None
         nodata = settings.nodata if settings.nodata is not None or calibrated else source.nodata
         assumed = nodata is None and not calibrated and source.dtype.kind in "if"
-        void = None if source.void is None or source.void.all() else source.void
-        return cls(source, bands, USUAL_NODATA if assumed else nodata, assumed, void, settings.scale, settings.offset)
+        return cls(source, bands, USUAL_NODATA if assumed else nodata, assumed, settings.scale, settings.offset)
 
     @property
     def scaling(self) -> str:
@@ -264,10 +263,8 @@ class FileValues:
             notes.append("values are over the white reference")
         if self.scaling:
             notes.append(f"values are the file's times {self.scale:g} plus {self.offset:g}, as {settings} says")
-        if self.void is not None:
-            notes.append(f"{self.void.sum()} transparent or masked pixels have no value, and no class in a map")
-        elif self.source.void is not None:
-            notes.append("every pixel is transparent or masked: the mask is left out")
+        if self.source.void is not None:
+            notes.append(f"{self.source.void.sum()} transparent or masked pixels have no value, and no class in a map")
         return notes
 
     def converted(self, first: int, stop: int) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.bool_] | None]:

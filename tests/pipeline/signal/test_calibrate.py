@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import PoseError, RigError, ShapeError
 from spectralzoom.pipeline.geometry.mirror import mirror_throughput
-from spectralzoom.pipeline.signal.calibrate import calibrate, find_bad_elements, full_scale_notes
+from spectralzoom.pipeline.signal.calibrate import calibrate, find_bad_elements, full_scale_notes, number_values
 from spectralzoom.pipeline.source import References
 
 
@@ -133,6 +133,13 @@ def test_mirror_throughput_divides_the_values() -> None:
     values = reflectance(np.full((2, 4, 3), 560, np.uint16), replace(frames(), by_mirror=True), position=position)
     np.testing.assert_allclose(values[0, :, 0], 1, rtol=1e-6)
     np.testing.assert_allclose(values[1] * mirror_throughput(position[1]), values[0], rtol=1e-6)
+
+
+def test_a_number_has_its_value_at_the_longest_exposure() -> None:
+    """White of 5 ms and lines of up to 10 ms: a DN is half of what it is in the white frame."""
+    exposure_ms = np.array([2, 10, np.nan])
+    np.testing.assert_allclose(number_values(frames(), exposure_ms), 0.002)
+    np.testing.assert_allclose(number_values(replace(frames(), exposure_ms=5.0), exposure_ms), 0.001)
 
 
 def test_lines_without_a_position_are_invalid() -> None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.envi_files import bands_of_header, load_envi_header, open_envi_cube
+from spectralzoom.storage.readers.band_facts import bands_of_fields
+from spectralzoom.storage.readers.envi_files import load_envi_header, open_envi_cube
 from spectralzoom.storage.readers.open_cubes import open_cube_source
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
@@ -166,13 +167,15 @@ def test_headers_of_real_instruments(real_data: Path) -> None:
         "emit_l1b__reference.hdr": (288, 365.80463, 2504.28),
     }
     for name, (count, first, last) in spans.items():
-        found = bands_of_header(read[name], name).wavelength_nm
-        assert (len(found), found[0], found[-1]) == pytest.approx((count, first, last))
+        assert count == (read[name].samples if "library" in name else read[name].bands)
+        found = bands_of_fields(read[name].fields, [None] * count, name).wavelength_nm
+        assert found is not None
+        assert (found[0], found[-1]) == pytest.approx((first, last))
     assert read["hdr_gdal__uint16_envi_bigendian.hdr"].dtype == np.dtype(">u2")
     assert read["headwall_mvx__darkReference.hdr"].settings["exposure (ms)"] == "100.0033437"
-    assert bands_of_header(read["plantcv__darkReference2.hdr"], "").notes == (
-        "wavelength is left out: 35 for 978 bands",
-    )
+    short = read["plantcv__darkReference2.hdr"]
+    notes = bands_of_fields(short.fields, [None] * short.bands, "").notes
+    assert notes == ("wavelength is left out: 35 for 978 bands",)
 
 
 @pytest.mark.parametrize(

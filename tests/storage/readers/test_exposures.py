@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,7 @@ def test_values_are_scaled_by_the_stated_exposures(tmp_path: Path, cube: Header,
     assert_true(recording)
     (note,) = [note for note in recording.notes if "values are scaled by the ratio" in note]
     assert note.startswith("the white frame scan.white.hdr was taken with ")
+    assert "(no unit)" in note or re.search("with 5 ms.*, the lines with 10 ms", note)
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,8 @@ COUNTS = np.int16([0, 101, -3, -9])
         (BYTES.view("u1"), {"_Unsigned": "false", "valid_min": np.int8(-100)}, [0, 100, NAN, -1]),
         (COUNTS, {"scale_factor": -0.01, "valid_range": np.int16([-5, 200])}, [0, -1.01, 0.03, NAN]),
         (COUNTS, {**SCALED, "valid_range": [-0.05, 1.0]}, [0, NAN, -0.03, NAN]),
+        (COUNTS, {"scale_factor": -0.01, "valid_range": [-0.5, 0.05]}, [0, NAN, 0.03, NAN]),
+        (np.float32(COUNTS), {**SCALED, "_FillValue": np.float32(-9)}, [0, 1.01, -0.03, NAN]),
         (
             COUNTS,
             {"scale_factor": np.int8(2), "add_offset": np.int16([1]), "_FillValue": np.int16(-9)},

@@ -94,7 +94,7 @@ def test_unsuitable_references_are_refused(tmp_path: Path, lines: NDArray[np.uin
     """A frame that does not fit the cube is refused, and so are two of a kind."""
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", lines[:1, :2], **NO_NM)
-    with pytest.raises(SceneError, match=r"dark frame is \(2, 3\) \(sample, band\), .* is \(4, 3\)"):
+    with pytest.raises(SceneError, match=r"dark frame .* is \(2, 3\) \(sample, band\), the cube \(4, 3\)"):
         open_cube_source(tmp_path)
     write_part(tmp_path, "darkReference_2", lines[:1], **NO_NM)
     with pytest.raises(SceneError, match=r"several dark frames .* name one with --dark"):

@@ -132,6 +132,12 @@ def test_chunks_beyond_their_header_are_refused(tmp_path: Path) -> None:
     assert int(peak_kb) < LIMIT_KB
 
 
+def test_a_part_of_a_large_chunk_is_checked(tmp_path: Path) -> None:
+    """HDF5 decodes all of a chunk for one number."""
+    with h5py.File(hdf5(tmp_path / "a.h5")) as file, pytest.raises(ValueError, match="bytes that its header declares"):
+        read_hdf5(file["cube"], np.s_[:1, :1, :1])
+
+
 @pytest.mark.filterwarnings("ignore:Numcodecs codecs are not in the Zarr version 3")
 @pytest.mark.parametrize("packer", PACKERS)
 @pytest.mark.parametrize("version", [2, 3])

@@ -10,6 +10,7 @@ import pytest
 import rasterio
 from PIL import Image
 
+from spectralzoom.storage.readers.labels import load_codes
 from spectralzoom.storage.readers.scene_files import load_scene_file
 
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
@@ -49,3 +50,13 @@ def test_masked_and_transparent_pixels_are_nan(tmp_path: Path, kind: str) -> Non
         assert (np.isnan(scene.values) == (~there & gap)[..., None]).all()
         hashes.add(scene.light_hash)
     assert len(hashes) == 2
+
+
+def test_a_mask_of_all_pixels_is_left_out(tmp_path: Path) -> None:
+    """All values and labels are kept, and a note says why."""
+    picture = np.moveaxis(VALUES[:3], 0, -1)
+    Image.fromarray(np.dstack([picture, np.zeros(picture.shape[:2], np.uint8)])).save(tmp_path / "a.png")
+    scene = load_scene_file(tmp_path / "a.png")
+    np.testing.assert_array_equal(scene.values, picture)
+    assert "every pixel is transparent or masked: the mask is left out" in scene.provenance
+    assert load_codes(tmp_path / "a.png").values.min() >= 0
