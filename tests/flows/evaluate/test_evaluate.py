@@ -162,7 +162,7 @@ def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
 
 
 def test_folds_with_and_without_context_are_judged_together(data: Path, tmp_path: Path):
-    """Whether a mixture has a context is chosen by the labels; the best plain classifier costs the same without it."""
+    """Labels choose a mixture with a context or without; the best plain classifier costs the same in both."""
     parts = {"parts": (("values", 0, 1.0),), "corrected": False}
     paths = tuple(tmp_path / f"{context}.safetensors" for context in (False, True))
     for context, path in enumerate(paths):
