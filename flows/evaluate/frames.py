@@ -86,7 +86,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     for one in found[1:]:
         # a fold may lack a class, or have another mixture
         configs = [
-            replace(of.described.config, untaught=(), parts=(), components=(0, 0), corrected=True)
+            replace(of.described.config, untaught=(), parts=(), components=(0, 0), context=False, corrected=True)
             for of in (one, first)
         ]
         alike = configs[0] == configs[1] and one.camera == first.camera
@@ -131,7 +131,7 @@ def observe_frame(
     captured = bool(weights.record.get(CAPTURED, True))
     seen = observe_scene(scene, camera, grid, weights.basis, rng, captured=captured)
     example = normalised(seen, weights.normalisation, reached)
-    labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
+    labels = judged_labels(scene, weights)
     assert labels is not None  # sort_frames
     return coarse_prediction_of_columns(weights, example.columns, grid), labels
 

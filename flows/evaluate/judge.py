@@ -65,7 +65,7 @@ def judge_frame(
         rows[policy, fraction] = Row(counts, len(drawn[0]), spent)
     if (part := weights.record.get(PLAIN)) is not None:
         drawn_alone = metrics.confusion(labels, plain_classes(weights, seen, part), config.classes)
-        alone = replace(config, parts=((*config.parts[part][:2], 1.0),), corrected=False)
+        alone = replace(config, parts=((*config.parts[part][:2], 1.0),), context=False, corrected=False)
         rows[ALONE] = Row(drawn_alone[None], 0, multiply_adds(alone, grid, 0, bands).total)
     return rows
 

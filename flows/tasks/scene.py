@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM, Settings
-from spectralzoom.models.weights.files import Description
+from spectralzoom.models.weights.files import Description, Weights
 from spectralzoom.pipeline.errors import NoSceneYet, SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
@@ -260,7 +260,7 @@ TRAINING_SCENE = {
 }
 
 
-def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
+def seen_in_training(scene: RasterScene, weights: Description | Weights) -> str | None:
     """Return which part of a scene the weights were trained on, a key of `TRAINING_SCENE`; None for no part.
 
     Files are identified by their content, not by name or by the bands that are read.
@@ -271,7 +271,7 @@ def seen_in_training(scene: RasterScene, weights: Description) -> str | None:
     return "all" if scene.labels is None or taught[scene.labels != UNLABELLED].all() else "other pixels"
 
 
-def _taught_pixels(scene: RasterScene, weights: Description) -> NDArray[np.bool_] | None:
+def _taught_pixels(scene: RasterScene, weights: Description | Weights) -> NDArray[np.bool_] | None:
     """Return the pixels (y, x) of a file whose labels the weights were trained on; None for another file."""
     known = weights.record.get("split", {}).get("taught", {})
     packed = next((known[one] for one in scene.content if one in known), None)
@@ -282,7 +282,7 @@ def _taught_pixels(scene: RasterScene, weights: Description) -> NDArray[np.bool_
     return np.unpackbits(bits, count=math.prod(scene.shape)).reshape(scene.shape).astype(bool)
 
 
-def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
+def judged_labels(scene: RasterScene, weights: Description | Weights) -> NDArray[np.uint8] | None:
     """Return labels in the order of the weights' classes; trained pixels are left out where there are others."""
     if scene.labels is None:
         return None

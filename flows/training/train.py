@@ -68,7 +68,6 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 
 CORRECTED_SCENES = 4  # labelled scenes, at least, whose classifiers a network corrects
-MIXTURE = "mixture"  # name in the tables
 
 
 def train_weights(
@@ -241,7 +240,8 @@ class Learner:
         tensors = start if begun is None else begun.segmenter.state_dict()
         model, summary = self._trained(self.config, tensors, self.request.flags.settings)
         if begun is not None:
-            model = self._better({"trained": model, "mean with --start": halfway(begun.segmenter, model)})[0]
+            mean, frames = halfway(begun.segmenter, model), self.scenes.validation.examples
+            model = max((model, mean), key=lambda one: figures.miou_of(self._weights(one), frames)) if frames else mean
         return Learned(self._weights(model), {"training": summary})
 
     def mixture(self) -> Learned:
@@ -255,12 +255,12 @@ class Learner:
         return Learned(self._weights(mixed.segmenter), found)
 
     def correction(self, mixed: Learned) -> Learned:
-        """Train networks that correct a mixture; return it itself unless they read the validation scenes better."""
+        """Train networks that correct a mixture; return the mixture unless they read the validation scenes better."""
         scenes, settings = self.scenes, self.request.flags.settings
         spent = mixed.found["training"]["processor_seconds" if self.device == PROCESSOR else "seconds"]
         minutes = settings.minutes - 2 * spent / 60  # in the end a mixture is fitted to all scenes
         if minutes <= 0 or len(scenes.joined.train.examples) < CORRECTED_SCENES:
-            return mixed
+            return Learned(mixed.weights, {})
         config = replace(mixed.weights.config, corrected=True)
         start = {**mixed.weights.segmenter.state_dict(), **(load_encoder() if config.deep else {})}
         scores: dict[float, float] = {}
@@ -289,10 +289,10 @@ class Learner:
         frames = self.scenes.validation.examples
         twice = figures.read_twice(weights, frames)
         found: dict[str, Any] = {"validation": figures.validate(twice, weights.config.classes)}
-        if twice and weights.config.corrected and _adds_nothing(found["validation"]):
-            found[CASCADE] = asdict(CascadeTable.of_overview())
-        elif twice and weights.config.corrected:
-            found[CASCADE] = asdict(CascadeTable.judged(twice, weights.config.classes))
+        if twice and weights.config.corrected:
+            useless = found["validation"]["all"]["miou"] <= found["validation"]["none"]["miou"]
+            losses = CascadeTable.of_overview() if useless else CascadeTable.judged(twice, weights.config.classes)
+            found[CASCADE] = asdict(losses)
         if frames:
             self.report("validating", 0.0, f"{len(frames)} scenes")
             found[CALIBRATION] = figures.judge_calibration(weights, frames, self.request.flags.settings.seed)
@@ -318,20 +318,9 @@ class Learner:
             device=self.device,
         )
 
-    def _better(self, models: Mapping[str, Segmenter]) -> tuple[Segmenter, dict[str, float]]:
-        """Return the model that reads the validation scenes best, else the last one; and the mIoU of each."""
-        frames = self.scenes.validation.examples
-        scores = {name: figures.miou_of(self._weights(one), frames) for name, one in models.items()} if frames else {}
-        return models[max(scores, key=lambda name: scores[name], default=list(models)[-1])], scores
-
     def _weights(self, model: Segmenter) -> Weights:
         common = self.scenes.common
         return Weights(model, common.basis, self.normalisation, common.names, common.colours).on(self.device)
-
-
-def _adds_nothing(validation: Mapping[str, Any]) -> bool:
-    """Return whether validation scenes are read no better in full than by the overview alone."""
-    return bool(validation["all"]["miou"] <= validation["none"]["miou"])
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
@@ -366,7 +355,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
                 one["name"],
                 f"{one['miou']:.1%}",
                 f"{one['accuracy']:.1%}",
-                "" if one["name"] == MIXTURE else f"{one['weight']:.2f}",
+                "" if one is record["candidates"][-1] else f"{one['weight']:.2f}",
                 f"{one['seconds']:.1f}",
             ]
             for one in record["candidates"]

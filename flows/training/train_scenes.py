@@ -42,7 +42,7 @@ class TrainRequest:
 
     @property
     def captured(self) -> bool:
-        """Whether scenes of files are captured by the simulated camera, in shorter exposures too."""
+        """Return whether the simulated camera captures scenes of files, in shorter exposures too."""
         return self.flags.min_exposure_ms < REFERENCE_MS
 
 
@@ -98,9 +98,9 @@ class Scenes:
 
     @property
     def split(self) -> dict[str, Any]:
-        """Return the record by which an evaluation tells scenes and pixels of the training."""
+        """Return the record by which an evaluation tells scenes and pixels that were taught."""
         taught = {name: pack_mask(mask) for name, mask in self.train.content.items()}
-        return {"train": self.train.keys, "taught": taught, "validation": self.validation.keys}
+        return {"train": self.train.keys, "taught": taught}
 
     def normalised(self, normalisation: Normalisation) -> Scenes:
         """Normalise the scenes; their basis spans their bands and reaches every column."""

@@ -25,7 +25,7 @@ from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memor
 from spectralzoom.models.network.segmenter import Segmenter
 from spectralzoom.models.network.sizes import AROUND_PX, PLANES, SegmenterConfig
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
-from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example, untaught_classes
+from spectralzoom.models.training.examples import BRIGHTNESS, CropSampler, Example
 from spectralzoom.models.training.objective import PHASES, batch_loss, class_weights
 from spectralzoom.models.weights.checksummed_files import load_checkpoint, save_checkpoint
 from spectralzoom.pipeline.errors import PipelineError
@@ -257,19 +257,18 @@ def linear_classifier(pixels: LabelledPixels, classes: int) -> dict[str, Tensor]
     """Fit a linear classifier; return it as tensors of the segmenter's ``spectral`` layer.
 
     Its logits are the means of those of linear discriminants with shrinkage and of a logistic regression. They are 0
-    for a class without a pixel, which the segmenter masks (`SegmenterConfig.untaught`), and with a single class.
+    for a class without a pixel, which the segmenter masks (`SegmenterConfig.untaught`).
     """
     weight, bias = np.zeros((classes, pixels.features.shape[1])), np.zeros(classes)
     known = np.unique(pixels.labels)
-    if len(known) > 1:
-        for classifier in LINEAR:
-            with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a class of one pixel
-                fitted = clone(classifier).fit(pixels.features, pixels.labels)
-            slope, offset = fitted.coef_, fitted.intercept_
-            if len(known) == 2:  # one function separates both
-                slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
-            weight[known] += slope / len(LINEAR)
-            bias[known] += offset / len(LINEAR)
+    for classifier in LINEAR:
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a class of one pixel
+            fitted = clone(classifier).fit(pixels.features, pixels.labels)
+        slope, offset = fitted.coef_, fitted.intercept_
+        if len(known) == 2:  # one function separates both
+            slope, offset = np.concatenate([0 * slope, slope]), np.concatenate([0 * offset, offset])
+        weight[known] += slope / len(LINEAR)
+        bias[known] += offset / len(LINEAR)
     return {
         "spectral.weight": torch.from_numpy(weight.astype(np.float32))[:, :, None, None],
         "spectral.bias": torch.from_numpy(bias.astype(np.float32)),
@@ -308,13 +307,10 @@ def train(
     ``start`` are named initial tensors; others are random. Where ``helps`` says no to the averaged weights at its one
     call, after `CHECKED` of the run, this ends. ``checkpoint`` is a file of the state, from which a killed
     run of the same settings and examples continues. ``device`` is one of `models.network.machine.choose_device`.
-    Classes of ``config`` without a labelled pixel are `SegmenterConfig.untaught` in the segmenter.
 
     Raises TrainingError: the loss or its gradient was not finite three steps in a row.
     """
     keep_freed_memory()
-    untaught = untaught_classes(examples, config.classes)
-    config = replace(config, untaught=untaught if len(untaught) < config.classes else ())
     trainer = Trainer(config, examples, gain_shift, settings, start, augmentation, device)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:

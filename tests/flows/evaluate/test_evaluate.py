@@ -29,7 +29,7 @@ from spectralzoom.pipeline.simulator.render import USUAL
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.flows.evaluate.conftest import Judged
-from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_field, write_weights
+from tests.flows.small_fields import FRAMES, NAMES, QUICK, scene_at, write_field, write_weights
 from tests.models.conftest import make_weights
 
 
@@ -159,6 +159,19 @@ def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
     save_weights(make_weights(1, classes=3, columns=3), again)
     with pytest.raises(SettingsError, match=r"differs from .* in camera, sizes or classes"):
         open_candidates((first, again))
+
+
+def test_folds_with_and_without_context_are_judged_together(data: Path, tmp_path: Path):
+    """Labels choose a mixture with a context or without; the best plain classifier costs the same in both."""
+    parts = {"parts": (("values", 0, 1.0),), "corrected": False}
+    paths = tuple(tmp_path / f"{context}.safetensors" for context in (False, True))
+    for context, path in enumerate(paths):
+        made = make_weights(classes=2, columns=3, context=bool(context), **parts)
+        save_weights(replace(made, class_names=NAMES, record={"plain": 0}), path)
+    assert len(evaluate_weights(str(data), EvaluateFlags(weights=paths, **QUICK))["seeds"]) == 2
+    briefs = [evaluate_weights(str(data), EvaluateFlags(weights=(path,), **QUICK))["brief"] for path in paths]
+    bare, with_context = ({name: one["multiply_adds_a_pixel"] for name, one in brief.items()} for brief in briefs)
+    assert with_context["plain"] == bare["plain"] == bare["weights"] < with_context["weights"]
 
 
 def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(

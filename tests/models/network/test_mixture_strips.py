@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.ndimage
 import torch
 
-from spectralzoom.models.network.mixture import STRIP_ROWS, Mixture, window_means
+from spectralzoom.models.network.mixture import STRIP_ROWS, Mixture
 from spectralzoom.models.network.sizes import AROUND, RELATIVE, VALUES, SegmenterConfig
 
 
@@ -25,13 +24,6 @@ def mixture() -> Mixture:
 def scene(rows: int, columns: int = 70) -> torch.Tensor:
     drawn = np.random.default_rng(2).normal(size=(1, 2, rows, columns)).cumsum(axis=2)
     return torch.from_numpy(drawn.astype(np.float32))
-
-
-@pytest.mark.parametrize("side", [1, 5, 61])
-def test_window_means_repeat_the_borders(side: int) -> None:
-    image = scene(40)
-    expected = scipy.ndimage.uniform_filter(image.numpy().astype(np.float64), (1, 1, side, side), mode="nearest")
-    np.testing.assert_allclose(window_means(image, side).numpy(), expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [1, STRIP_ROWS, 2 * STRIP_ROWS + 9])
