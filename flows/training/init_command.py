@@ -93,7 +93,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
             shutil.copyfile(path, path.with_name(path.name + ".old"))
         write_whole(path, _toml(draft, path.parent, kept))
     files, cube, nm = draft.files, draft.cube, draft.cube.bands.wavelength_nm
-    first = None if nm is not None else f"write the {cube.shape[2]} wavelengths into {path}, as its lines say"
+    first = None if nm is not None else f"write the {counted(cube.shape[2], 'wavelength')} into {path}, as its lines say"
     scene = str(files.images[0]) if place.is_dir() else source
     following = f"survey --scene {quote(scene)} --weights WEIGHTS.safetensors"
     if files.labels and not draft.classes:
@@ -143,7 +143,7 @@ def _value_lines(cube: CubeSource) -> Iterator[str]:
     elif "assumed" in cube.bands.origin:
         yield f"# wavelengths_nm = {nm.tolist()}   # assumed from the colours; remove the first # to change them"
     else:
-        yield f"# {bands} bands, {np.nanmin(nm):g}-{np.nanmax(nm):g} nm: {as_toml(cube.bands.origin)}"
+        yield f"# {counted(bands, 'band')}, {np.nanmin(nm):g}-{np.nanmax(nm):g} nm: {as_toml(cube.bands.origin)}"
     empty = set(empty_bands(cube, SceneSettings()))
     if empty - (left_out := {*cube.bad_bands, *cube.bands.unknown}) and len(empty) < bands:
         used = bands_text(sorted({*range(bands)} - left_out - empty))
@@ -181,7 +181,7 @@ def _missing(draft: SceneDraft) -> Iterator[str]:
     """Yield the missing or inconsistent properties."""
     yield from draft.files.lacking
     if draft.cube.bands.wavelength_nm is None:
-        yield f"the wavelengths of {draft.cube.shape[2]} bands"
+        yield f"the wavelengths of {counted(draft.cube.shape[2], 'band')}"
     if len(draft.classes) == 1:
         yield f"a second class: all labels are {draft.classes[0].name}"
 
@@ -190,7 +190,7 @@ def _show(record: dict[str, Any], console: Console) -> None:
     """Print the findings, what is missing, the file, the next command, and the assumptions."""
     height, width, bands = record["shape"]
     counts = f"{counted(record['images'], 'image')}, {record['labelled']} with labels"
-    lines = [f"{counts}; the first has {height} x {width} px, {bands} bands"]
+    lines = [f"{counts}; the first has {height} x {width} px, {counted(bands, 'band')}"]
     lines += [f"classes: {list_some([one['name'] for one in found], 8)}"] if (found := record["classes"]) else []
     lines += [f"{word}: {line}" for word, name in (("note", "notes"), ("missing", "unseen")) for line in record[name]]
     lines += [f"written: {record['file']}", *([f"first: {first}"] if (first := record["first"]) else [])]

@@ -22,6 +22,7 @@ STRIDE = 3  # px between the pixels that count
 PARTS = 8  # training scenes to leave out in turn; fewer scenes are cut into blocks
 DIFFERENCE = 0.05  # least standard deviation of the means of training scenes
 EDGES = np.geomspace(0.5, 1e9, 500)  # of the histogram of products; half a component is not told from 0
+DIGITS = 5  # decimals of the statistics in a description
 UNLIKE = 2.0  # times the largest distance of a training scene
 
 Floats = NDArray[np.floating]
@@ -51,7 +52,7 @@ class TrainingSpectra:
 
     @staticmethod
     def measured(scenes: Sequence[Floats], whitening: Floats) -> TrainingSpectra | None:
-        """Measure the training by its scenes of normalised columns (y, x, column); None if they are too small."""
+        """Measure the training by its scenes of normalised columns (y, x, column); None if too small or constant."""
         axes = np.linalg.eigh(np.asarray(whitening, np.float64))[1][:, :COMPONENTS]  # smallest gain: largest variance
         bare = TrainingSpectra(axes, np.zeros(axes.shape[1]), np.ones(axes.shape[1]))
         parts = [block[::STRIDE, ::STRIDE] for block in _blocks(scenes)]
@@ -66,10 +67,10 @@ class TrainingSpectra:
             rest = np.arange(len(parts)) != number
             others = TrainingSpectra(axes, np.average(means[rest], axis=0, weights=pixels[rest]), _spread(means[rest]))
             found.append(others.distances(others.of(part)))
-        mean, spectra = np.max(found, axis=0)
-        return TrainingSpectra(
-            axes, np.average(means, axis=0, weights=pixels), _spread(means), (float(mean), float(spectra))
-        )
+        mean, spectra = map(float, np.max(found, axis=0).round(DIGITS))
+        if not min(mean, spectra) > 0:
+            return None
+        return TrainingSpectra(axes, np.average(means, axis=0, weights=pixels), _spread(means), (mean, spectra))
 
     def of(self, columns: Floats, seen: NDArray[np.bool_] | None = None) -> SceneSpectra:
         """Return the statistics of some pixels (y, x, column), a third of the rows and columns, that were ``seen``."""
@@ -100,7 +101,7 @@ class TrainingSpectra:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the statistics for a description."""
-        return {name: np.round(value, 5).tolist() for name, value in asdict(self).items()}
+        return {name: np.round(value, DIGITS).tolist() for name, value in asdict(self).items()}
 
 
 def _spread(means: Floats) -> Floats:

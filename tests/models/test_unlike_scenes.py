@@ -82,7 +82,10 @@ def test_statistics_round_trip_as_plain_numbers() -> None:
         TrainingSpectra.read(content, COLUMNS + 1)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 40)])
-def test_a_training_on_few_pixels_has_no_statistics(shape: tuple[int, int]) -> None:
-    """Without eight blocks nothing says how far a scene may lie."""
-    assert TrainingSpectra.measured([np.zeros((*shape, COLUMNS))], np.eye(COLUMNS)) is None
+@pytest.mark.parametrize("shape", [(1, 1), (2, 40), (9, 9), (96, 96)])
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_a_training_without_limits_has_no_statistics(shape: tuple[int, int], size: float) -> None:
+    """Blocks are too few or have no neighbours, or their spectra are all one: weights of limit 0 are refused."""
+    columns = size * np.random.default_rng(5).normal(0, 1, (*shape, COLUMNS))
+    known = TrainingSpectra.measured([columns], np.eye(COLUMNS))
+    assert (known is None) == (size == 0 or shape != (96, 96))
