@@ -67,7 +67,9 @@ class Stage(Generic[P]):
         if not all(isinstance(ref, Ref) for ref in inputs):
             raise TypeError(f"{self.name}: arguments that are no stores must be keywords, to be part of the key")
         hints = get_type_hints(self.build, include_extras=True)
-        params = {name: one for name, one in call.kwargs.items() if _NOT_IN_THE_KEY not in get_args(hints[name])[1:]}
+        params = {
+            name: one for name, one in call.kwargs.items() if _NOT_IN_THE_KEY not in get_args(hints.get(name))[1:]
+        }
         request = Request(self, inputs, params, lambda out: self.build(out, *args, **facts))
         return task_in_flow(self.name, stores.name, partial(stores.get, request), *inputs, retries=self.retries)
 
