@@ -13,7 +13,7 @@ _FORMULA = re.compile(r"""'|[\s"]*[=+\-@\uff0b\uff0d\uff1d\uff20]|[\t\r\n]""")
 def csv_table(columns: Mapping[str, Sequence[object]]) -> str:
     """Return columns of equal length as CSV with a header.
 
-    Text is quoted, so that no separator cuts it. A text that begins with ``'`` or as a formula gets another ``'`` before
+    Text is quoted, so that no separator cuts it. If it begins with ``'`` or as a formula, another ``'`` comes before
     it. Floats have nine digits; NaN and None are empty.
     """
     rows = [list(columns), *zip(*columns.values(), strict=True)]
