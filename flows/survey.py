@@ -56,7 +56,7 @@ def survey(settings: SurveySettings) -> RunRef:
 
     Returns
     -------
-    The address of the published run. Of the last store, where ``until`` of the settings stops the survey.
+    The address of the published run, or of the last store if ``until`` of the settings stops the survey.
 
     Raises
     ------
