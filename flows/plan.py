@@ -91,11 +91,6 @@ class SurveyPlan:
         return asked and (self.chooses or self.field.raster is not None)
 
     @property
-    def is_judged(self) -> bool:
-        """Return whether the class map is evaluated: there are labels, and the settings ask for the accuracy."""
-        return self.field.scene.labelled and self.settings.accuracy
-
-    @property
     def part(self) -> bool:
         """Return whether the capture is a partial scan."""
         return self.settings.extent != EXTENT_WHOLE

@@ -66,16 +66,12 @@ class Stage(Generic[P]):
         inputs = [ref for ref in call.args[1:] if ref is not None]
         if not all(isinstance(ref, Ref) for ref in inputs):
             raise TypeError(f"{self.name}: arguments that are no stores must be keywords, to be part of the key")
-        params = {name: value for name, value in call.kwargs.items() if name not in unkeyed_names(self.build)}
+        hints = get_type_hints(self.build, include_extras=True)
+        params = {
+            name: one for name, one in call.kwargs.items() if _NOT_IN_THE_KEY not in get_args(hints.get(name))[1:]
+        }
         request = Request(self, inputs, params, lambda out: self.build(out, *args, **facts))
         return task_in_flow(self.name, stores.name, partial(stores.get, request), *inputs, retries=self.retries)
-
-
-@cache
-def unkeyed_names(build: Callable[..., None]) -> frozenset[str]:
-    """Return the arguments of a stage's function that are annotated `Unkeyed`."""
-    hints = get_type_hints(build, include_extras=True)
-    return frozenset(name for name, hint in hints.items() if _NOT_IN_THE_KEY in get_args(hint)[1:])
 
 
 def stage(

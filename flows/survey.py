@@ -56,7 +56,7 @@ def survey(settings: SurveySettings) -> RunRef:
 
     Returns
     -------
-    The address of the published run. Of the last store, where ``until`` of the settings stops the survey.
+    The address of the published run, or of the last store if ``until`` of the settings stops the survey.
 
     Raises
     ------
@@ -87,6 +87,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
     In a dry run, a store that is missing leaves open whether there is a second pass: then both are run.
     """
     field = plan.field
+    is_judged = field.scene.labelled and plan.settings.accuracy
     effects = _effects(stores, plan) if field.source.simulates else None
     first = None
     if field.raster is not None:
@@ -132,7 +133,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         first=first,
         second=second,
         ground=None if field.ground_grid is None else ground(stores, class_map, mosaic, ground_grid=field.ground_grid),
-        accuracy=_accuracy(stores, plan, mosaic, class_map, first) if plan.is_judged else None,
+        accuracy=_accuracy(stores, plan, mosaic, class_map, first) if is_judged else None,
     )
 
 

@@ -54,7 +54,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
         raise run.stopped
     published = Published(load_receipt(run.folder), run.folder)
     if summary:
-        show_published(published, settings.out, console, verbose=verbose)
+        print_summary(published.receipt, console, verbose=verbose)
+        console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)
     return published
 
 
@@ -96,9 +97,3 @@ def _prefect_server(out: str) -> Iterator[None]:
             atexit.register(remove, home)
         with quiet_environment(home), local_server(home):
             yield
-
-
-def show_published(published: Published, out: str, console: Console, *, verbose: bool = False) -> None:
-    """Print the score, the savings and the place of the report; with ``verbose`` all savings, stages and effects."""
-    print_summary(published.receipt, console, verbose=verbose)
-    console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)

@@ -71,8 +71,8 @@ def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
     Returns
     -------
     dict
-        The content of `spectralzoom plan --json`: ``field``, ``stages`` with their state, the ``estimate`` of seconds,
-        bytes, multiply-adds and mIoU, and the uniform ``scans`` that are taken and referred to.
+        The content of `spectralzoom plan --json`: ``field``, ``stages`` with their state, ``estimate`` and ``scans``.
+        The estimate has seconds, bytes, multiply-adds and mIoU. Scans are the uniform ones taken and referred to.
 
     Raises
     ------

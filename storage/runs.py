@@ -353,8 +353,8 @@ def _obstacle(uri: str, problem: str | None, is_kept: bool) -> str | None:
 def is_only_copy(known: Mapping[str, Mapping[str, Any]], uri: str, seen: tuple[str, ...] = ()) -> bool:
     """Return whether the archive alone cannot make a store again: lines and pixels that were not simulated.
 
-    So is a store that was made of such lines, if they were cleared away or are missing. Of a damaged or missing store
-    the runs that name it say whether its lines were simulated, and which they were.
+    So is a store that was made of such lines, if they were cleared away or are missing. The runs
+    that name a damaged or missing store say whether its lines were simulated, and which they were.
     """
     stage, store = uri.split("/")[1], known.get(uri)
     runs = [one for one in known.values() if uri in one[RESTS_ON] and one["settings"]]

@@ -10,8 +10,8 @@
 
 A folder is written under another name (``.part``), synced, and renamed; to delete it, it is renamed first. So a kill at
 any moment leaves either the whole store or a leftover that `Archive.reclaim` removes. Published files never change.
-Every opening of a store compares the sizes of its files, and the SHA-256 of all but the chunks of arrays, which
-have a checksum of their own.
+Every opening of a store compares the sizes of its files, and the SHA-256 of all but the chunks of arrays. Chunks have a
+checksum of their own.
 """
 
 from __future__ import annotations

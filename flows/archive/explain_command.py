@@ -24,7 +24,7 @@ SHORT_KEY = 12
 
 
 def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> int:
-    """Show the lineage of a product: its stages, their keys and inputs. Of a run also what would be made otherwise now.
+    """Show the lineage of a product: its stages, their keys and inputs. A run also shows what would change now.
 
     Parameters
     ----------

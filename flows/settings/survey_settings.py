@@ -180,8 +180,8 @@ class Settings:
     )
     until: Literal["capture", "mosaic"] | None = stated(
         None,
-        "Stop when this stage is stored: capture (all lines) or mosaic; the same survey without it goes on, also on"
-        " another machine with a copy of the archive",
+        "Stop when this stage is stored: capture (all lines) or mosaic; the same survey without it"
+        " continues, also on another machine with a copy of the archive",
         example="capture",
     )
     budget: Budget | None = stated(

@@ -10,16 +10,11 @@ import numpy as np
 _FORMULA = re.compile(r"""'|[\s"]*[=+\-@\uff0b\uff0d\uff1d\uff20]|[\t\r\n]""")
 
 
-def safe_text(text: str) -> str:
-    """Return a text that begins with ``'`` or as a formula behind another ``'``: without one it is itself."""
-    return f"'{text}" if _FORMULA.match(text) else text
-
-
 def csv_table(columns: Mapping[str, Sequence[object]]) -> str:
     """Return columns of equal length as CSV with a header.
 
-    Text is quoted, so that no separator cuts it, and safe as by `safe_text`. Floats have nine digits; NaN and None are
-    empty.
+    Text is quoted, so that no separator cuts it. If it begins with ``'`` or as a formula, another ``'`` comes before
+    it. Floats have nine digits; NaN and None are empty.
     """
     rows = [list(columns), *zip(*columns.values(), strict=True)]
     return "".join(",".join(map(_cell, row)) + "\n" for row in rows)
@@ -27,7 +22,8 @@ def csv_table(columns: Mapping[str, Sequence[object]]) -> str:
 
 def _cell(value: object) -> str:
     if isinstance(value, str):
-        return '"' + safe_text(value).replace('"', '""') + '"'
+        text = f"'{value}" if _FORMULA.match(value) else value
+        return '"' + text.replace('"', '""') + '"'
     if value is None or value != value:
         return ""
     return f"{value:.9g}" if isinstance(value, float | np.floating) else f"{value}"

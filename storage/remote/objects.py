@@ -54,9 +54,8 @@ class UnreachableError(ArchiveError):
 class Objects:
     """The objects below ``s3://bucket/prefix``; names are relative to it.
 
-    A request that fails in a way that may pass is tried again, in all for about 20 s: lost connections, answers cut
-    short or damaged, overload, conflicts of two writers. Every method raises UnreachableError where the bucket refuses
-    or does not answer.
+    A request is tried again, in all for about 20 s, after a lost connection, an answer cut short or damaged, overload,
+    or a conflict of two writers. Every method raises UnreachableError: the bucket refuses or does not answer.
     """
 
     def __init__(self, address: str | Path) -> None:

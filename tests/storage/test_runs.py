@@ -312,6 +312,17 @@ def test_gc_keeps_young_stores_and_their_inputs(archive: Archive) -> None:
             clear_up(archive, keep_days=days)
 
 
+def test_a_cleared_store_has_the_age_size_and_inputs_of_its_manifest(archive: Archive) -> None:
+    """It is young, and the raw lines that it names are missed."""
+    small = small_survey(archive, named=False)
+    archive.discard(small.map.uri)
+    archive.clear(small.mosaic)
+    assert clear_up(archive, keep_days=1).removals == []
+    assert archive.size_of(small.mosaic.uri) == manifest_path(small.mosaic.path).stat().st_size
+    archive.discard(small.raw.uri)
+    assert problems(archive) == [f"{small.raw.uri} is not there, but {small.mosaic.uri} was made of it"]
+
+
 def test_gc_removes_raw_lines_of_a_rig_only_on_request(archive: Archive) -> None:
     """A survey that broke off after its capture has lines that no run names and that cannot be captured again."""
     small = small_survey(archive, named=False, simulated=False)

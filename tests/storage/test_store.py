@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import fcntl
 import json
 import os
 import shutil
@@ -12,7 +13,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -302,6 +303,20 @@ def test_paths_that_are_no_archive_are_refused(tmp_path: Path) -> None:
 
 
 # --- locks ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_lock_removed_before_it_is_held_is_taken_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process cleans up between the opening and the locking of the file."""
+    path, flock, removals = tmp_path / "a.lock", fcntl.flock, iter([True])
+
+    def late(file: IO[str], kind: int) -> None:
+        if next(removals, False):
+            path.unlink()
+        flock(file, kind)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with locked(path) as first, locked(path, wait=False) as second:
+        assert (first, second) == (True, False)
 
 
 def test_a_lock_is_held_by_one_or_shared(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import rasterio
 import xarray
 from PIL import Image
+from rich.console import Console
 
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.publish.run_folder import Published
@@ -57,6 +59,16 @@ def test_the_date_of_a_file_is_kept_beside_the_day_of_processing(tmp_path: Path,
     with rasterio.open(next(tmp_path.rglob("*-north-*/class_map.tif"))) as file:
         assert file.tags()["ACQUISITIONDATETIME"] == "2022-07-08T10:11:12+00:00"
         assert file.tags()["processed"] == later.receipt["finished"]
+
+
+def test_a_file_without_a_date_gives_images_none(tmp_path: Path, weights: Path) -> None:
+    """The item has the time of the survey, and a note says so."""
+    run, console = survey(tmp_path, weights, ""), Console(file=io.StringIO(), width=200)
+    done = run_export(tmp_path / "archive", None, tmp_path / "out", console=console)
+    assert "its items have the day of the survey" in console.file.getvalue()
+    assert json.loads(Path(done["item"]).read_text())["properties"]["datetime"] == run.receipt["started"]
+    with rasterio.open(tmp_path / "out" / done["files"]["class_map"]) as file:
+        assert "ACQUISITIONDATETIME" not in file.tags()
 
 
 @pytest.mark.parametrize(
