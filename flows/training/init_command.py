@@ -93,7 +93,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
             shutil.copyfile(path, path.with_name(path.name + ".old"))
         write_whole(path, _toml(draft, path.parent, kept))
     files, cube, nm = draft.files, draft.cube, draft.cube.bands.wavelength_nm
-    first = None if nm is not None else f"write the {counted(cube.shape[2], 'wavelength')} into {path}, as its lines say"
+    first = None if nm is not None else f"write the {counted(cube.shape[2], 'wavelength')} into {path}, as it says"
     scene = str(files.images[0]) if place.is_dir() else source
     following = f"survey --scene {quote(scene)} --weights WEIGHTS.safetensors"
     if files.labels and not draft.classes:

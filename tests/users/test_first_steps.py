@@ -112,7 +112,7 @@ def test_init_names_the_wavelengths_that_its_next_command_needs(
     np.save(tmp_path / "field_labels.npy", CLASSES)
     told = json.loads(command_line("init", ".", "--json").out)
     toml = tmp_path / "scene.toml"
-    assert told["first"] == "write the 3 wavelengths into scene.toml, as its lines say"
+    assert told["first"] == "write the 3 wavelengths into scene.toml, as it says"
     line = "# wavelengths_nm = []" if way == "list" else '# wavelengths_file = "bands.txt"'
     assert line in toml.read_text()
     toml.write_text(toml.read_text().replace(line, line.removeprefix("# ").replace("[]", "[460, 550, 640]")))
