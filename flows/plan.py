@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.field import Field
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.survey_settings import NEVER, Settings
 from spectralzoom.flows.settings.values import EXTENT_PART, EXTENT_WHOLE
 from spectralzoom.flows.stages.rectify import tile_budget
 from spectralzoom.flows.stages.score import PatchGains, all_seen
@@ -85,10 +85,29 @@ class SurveyPlan:
         return not self.passes.plain or self.budget is not None or self.least_gain is not None
 
     @property
-    def controls(self) -> bool:
-        """Return whether the evaluation also judges the small network alone and the full one everywhere."""
-        asked = self.settings.controls and self.field.described.config.corrected
-        return asked and (self.chooses or self.field.raster is not None)
+    def control(self) -> SurveyPlan | None:
+        """Return the plan of the best uniform scan of the same seconds; None unless it is asked for and another plan.
+
+        Only a simulated field with labels can be captured again as it was.
+        """
+        scan = self.scans.best_in_time(self.passes.coarse_s + self.passes.fine_s)
+        scores = self.settings.controls and self.field.source.simulates and self.field.scene.labelled
+        if not scores or scan is None or (scan == self.scans.chosen and self.field.prior is None):
+            return None
+        settings = replace(
+            self.settings,
+            zoom=NEVER,
+            scan_step=scan.step,
+            scan_exposure_ms=scan.exposure_ms,
+            seconds=None,
+            budget=None,
+            coarse_exposure_ms=None,
+            extent=EXTENT_WHOLE,
+            max_age=None,
+            prior="none",
+            controls=False,
+        )
+        return plan_survey(replace(self.field, settings=settings, prior=None))
 
     @property
     def part(self) -> bool:
@@ -141,7 +160,7 @@ class SurveyPlan:
     @property
     def scan_record(self) -> ScanPerformance | None:
         """Return the scan performance table by which a second pass is chosen; None without one."""
-        content = self.field.described.record.get("scans")
+        content = self.field.described.scans(self.settings.law)
         if content is None or not self.passes.by_record or self.settings.policy != "gain":
             return None
         return ScanPerformance.read(content, self.field.scene.light_fraction)
@@ -157,7 +176,7 @@ class SurveyPlan:
         """Return the sweeps of a uniform scan, or of a first pass and of a second one in exposures that it may have."""
         if self.passes.plain:
             return tuple(self.passes.coarse)
-        content = self.field.described.record.get("scans")
+        content = self.field.described.scans(self.settings.law)
         exposures = [None]
         if content is not None and self.passes.by_record:
             record = ScanPerformance.read(content, self.field.scene.light_fraction)
@@ -253,7 +272,7 @@ def _extent(opened: Field) -> tuple[PassLayout, ExtentChoice | None, Settings, t
     masks = [one for one in (zones.left_out, opened.scene.missing) if one is not None]
     assert settings.seconds is not None
     layout, extent, note = choose_extent(
-        *(layout, opened.prior, opened.described, opened.model.path, settings.sky.fraction_of_clear),
+        *(layout, opened.prior, opened.described, opened.model.path, settings.law, settings.sky.fraction_of_clear),
         seconds=settings.seconds,
         max_age=settings.max_age,
         left_out=np.logical_or.reduce(masks) if masks else None,

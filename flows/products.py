@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from spectralzoom.flows.plan import SurveyPlan
+from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.effects import RECORD as EFFECTS
 from spectralzoom.flows.stages.evaluate import RECORD as ACCURACY
 from spectralzoom.flows.stages.ground import STORE as GROUND_MAP
@@ -67,3 +69,12 @@ class Products:
         yield "class_probabilities", self.class_map, PROBABILITIES
         yield "ground_map", self.ground, GROUND_MAP
         yield "accuracy", self.accuracy, ACCURACY
+
+
+@dataclass(frozen=True)
+class Control:
+    """The best uniform scan of the same seconds, which was simulated and judged beside a survey."""
+
+    plan: SurveyPlan
+    stores: Stores
+    products: Products

@@ -20,7 +20,7 @@ from prefect import flow
 
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
-from spectralzoom.flows.products import Pass, Products
+from spectralzoom.flows.products import Control, Pass, Products
 from spectralzoom.flows.publish.publishing import RunRef, clear_first_mosaic, clear_raw, publish
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import RIG
@@ -36,7 +36,7 @@ from spectralzoom.flows.stages.rectify import rectify, rectify_fine
 from spectralzoom.flows.stages.register import register_coarse, register_fine
 from spectralzoom.flows.stages.score import load_plan, score
 from spectralzoom.flows.stages.segment import segment
-from spectralzoom.flows.tasks.observer import current_observer, tidy_up
+from spectralzoom.flows.tasks.observer import Observer, current_observer, tidy_up
 from spectralzoom.flows.tasks.visit import settings_of_visit
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
@@ -77,7 +77,10 @@ def survey(settings: SurveySettings) -> RunRef:
         except SurveyStopped as stopped:
             return RunRef(stopped.uri, archive.root / stopped.uri, stopped=stopped)
         clear_first_mosaic(archive, plan, products)
-        run = publish(stores, plan, products, started=started, note=observer.note)
+        control = _control(archive, plan, observer)
+        run = publish(stores, plan, products, control, started=started, note=observer.note)
+        if control is not None:
+            clear_raw(control.stores, control.plan, control.products, run, note=observer.note)
         return clear_raw(stores, plan, products, run, note=observer.note)
 
 
@@ -133,8 +136,21 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         first=first,
         second=second,
         ground=None if field.ground_grid is None else ground(stores, class_map, mosaic, ground_grid=field.ground_grid),
-        accuracy=_accuracy(stores, plan, mosaic, class_map, first) if is_judged else None,
+        accuracy=_accuracy(stores, plan, class_map, first) if is_judged else None,
     )
+
+
+def _control(archive: Archive, plan: SurveyPlan, observer: Observer) -> Control | None:
+    """Simulate and judge the best uniform scan of the same seconds; None unless it is asked for."""
+    control = plan.control
+    if control is None:
+        return None
+
+    def watch(name: str, title: str, state: str, done: float) -> None:
+        observer.watch(f"control_{name}", f"control: {title}", state, done)
+
+    stores = Stores(archive, name=f"{plan.field.name}-control", watch=watch, log=observer.log, finish=tidy_up)
+    return Control(control, stores, run_stages(stores, control))
 
 
 def _raster_mosaic(stores: Stores, plan: SurveyPlan, raster: RasterPixels) -> Ref:
@@ -161,18 +177,15 @@ def _effects(stores: Stores, plan: SurveyPlan) -> Ref:
     )
 
 
-def _accuracy(stores: Stores, plan: SurveyPlan, mosaic: Ref, class_map: Ref, first: Pass | None) -> Ref:
+def _accuracy(stores: Stores, plan: SurveyPlan, class_map: Ref, first: Pass | None) -> Ref:
     """Return the figures of a map by the labels."""
     return evaluate(
         stores,
-        mosaic,
         class_map,
         None if first is None else first.seams,
-        gains=plan.gains,
         labels=plan.field.labels,
         along=plan.passes.along,
         pointing=plan.field.simulated.pointing,
-        controls=plan.controls,
     )
 
 

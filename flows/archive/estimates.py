@@ -113,7 +113,7 @@ def _score(plan: SurveyPlan) -> Estimate:
     if plan.part:
         return Estimate(None, "a part of the field is captured, the prior map shows the rest")
     if (scan := plan.scans.chosen) is not None:
-        scenes = int(plan.field.described.record["scans"]["scenes"])
+        scenes = int((plan.field.described.scans(plan.settings.law) or {})["scenes"])
         source = f"the weights' record of such scans, {counted(scenes, 'scene')}"
         if scan.spread is not None and scan.spread > MOST_ERROR:
             return Estimate(None, f"{source}; the scenes differ too much")

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 
 from spectralzoom.flows.plan import SurveyPlan
-from spectralzoom.flows.products import Products
+from spectralzoom.flows.products import Control, Products
 from spectralzoom.flows.publish.receipt_table import finding_rows, headline
 from spectralzoom.flows.publish.report import render_markdown
 from spectralzoom.flows.publish.run_folder import Published, publish_run
@@ -37,11 +37,13 @@ class RunRef:
     stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
 
 
-def publish(stores: Stores, plan: SurveyPlan, products: Products, *, started: datetime, note: Note) -> RunRef:
+def publish(
+    stores: Stores, plan: SurveyPlan, products: Products, control: Control | None, *, started: datetime, note: Note
+) -> RunRef:
     """Publish the run of a class map, with its accuracy where it was evaluated; in a flow as a task."""
 
     def work(*_: Ref) -> RunRef:
-        published = publish_run(stores, plan, products, started)
+        published = publish_run(stores, plan, products, control, started)
         fine = load_plan(products.attention)
         if not (plan.passes.plain or fine.sweeps):
             note(f"no second pass: {fine.reason}")

@@ -93,11 +93,13 @@ class Score(_Part):
     false_classes: dict[str, int] | None = None
 
 
-class Accuracy(Score):
-    """Accuracy against labels: of this map; with controls also by the overview alone, and with all patches in full."""
+class Control(Score):
+    """The best uniform scan of the same seconds, captured and read as the survey was, with its costs."""
 
-    none: Score | None = None
-    all: Score | None = None
+    scan: str
+    capture_s: float
+    kept: int  # bytes
+    multiply_adds: float
 
 
 class StageRow(_Part):
@@ -128,7 +130,8 @@ class ReceiptFields(_Part):
     stages: list[StageRow]
     savings: Savings
     data_bytes: DataBytes
-    accuracy: Accuracy | None = None
+    accuracy: Score | None = None  # against labels
+    control: Control | None = None  # the best uniform scan of the same seconds
     training_scene: Literal["all", "other pixels"] | None = None  # what of the scene the weights learned from
     effects: list[Facts] | None = None  # of a simulated source, with their bounds
     effects_total: Facts | None = None  # sum of the bounds beside the tolerance, and seconds saved

@@ -69,13 +69,12 @@ def format_reference(receipt: Mapping[str, Any]) -> str:
 
 def format_score(receipt: Mapping[str, Any]) -> str:
     """Return the score of the map in one or two sentences: against labels, else as its own probabilities expect."""
-    if (accuracy := shown_accuracy(receipt)) is not None:
+    if (accuracy := receipt.get("accuracy")) is not None:
         scene = f" on {TRAINING_SCENE[receipt['training_scene']]}" if "training_scene" in receipt else ""
         right = format_points(accuracy.get("overall_accuracy"))
         score = f"mIoU {format_points(accuracy['miou'])} of 100 against the labels{scene} ({right} % of pixels correct)"
-        if accuracy.get("none") and accuracy.get("all"):  # with controls
-            none, every = (format_points(accuracy[which]["miou"]) for which in ("none", "all"))
-            score += f"; the small network alone gives {none}, the full network on every patch {every}"
+        if control := receipt.get("control"):
+            score += f"; the best uniform scan of the same seconds gives {format_points(control['miou'])}"
         return f"{score}. {format_worst_class(accuracy)}".rstrip()
     expected = receipt.get("expected") or {}
     if predicted := format_prediction(expected.get("miou"), expected.get("error")):
@@ -85,14 +84,6 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     if receipt["settings"].get("accuracy") is False:
         return "The accuracy was left out; the same survey with --accuracy adds it in a new run."
     return "The score is not known: there are no labels."
-
-
-def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the accuracy; after a revisit without the maps to compare, which lack the prior map."""
-    accuracy = receipt.get("accuracy")
-    if accuracy is None or receipt.get("prior_map") is None:
-        return accuracy
-    return {name: value for name, value in accuracy.items() if name not in ("none", "all")}
 
 
 def headline(receipt: Receipt) -> str:

@@ -22,13 +22,7 @@ from markupsafe import Markup
 from spectralzoom.flows.publish.field_map import FieldMap
 from spectralzoom.flows.publish.quicklook import data_address
 from spectralzoom.flows.publish.receipt import Receipt
-from spectralzoom.flows.publish.receipt_table import (
-    finding_rows,
-    format_reference,
-    headline,
-    saving_rows,
-    shown_accuracy,
-)
+from spectralzoom.flows.publish.receipt_table import finding_rows, format_reference, headline, saving_rows
 from spectralzoom.flows.tasks.scores import error_matrix, format_false_classes
 from spectralzoom.flows.terminal.figures import format_percent, format_points
 from spectralzoom.pipeline.errors import visible
@@ -93,7 +87,7 @@ def _plain(value: object) -> object:
 def render_report(receipt: Receipt, quicklook: bytes, field: FieldMap) -> str:
     """Return the report as HTML; the same receipt, picture and map give the same bytes."""
     scene = split_variable(receipt["settings"]["scene"])[0].name
-    accuracy = shown_accuracy(receipt)
+    accuracy = receipt.get("accuracy")
     page = _environment(markdown=False).get_template("report.html")
     text = page.render(
         policy=policy(),
@@ -116,6 +110,7 @@ def render_report(receipt: Receipt, quicklook: bytes, field: FieldMap) -> str:
         reference=format_reference(receipt),
         findings=finding_rows(receipt),
         accuracy=accuracy,
+        control=receipt.get("control"),
         error_matrix=None if accuracy is None else error_matrix(accuracy),
         false_classes="" if accuracy is None else format_false_classes(accuracy),
     )

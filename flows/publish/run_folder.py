@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.plan import SurveyPlan
-from spectralzoom.flows.products import Products
+from spectralzoom.flows.products import Control, Products
 from spectralzoom.flows.publish.field_map import field_map
 from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, plots_csv
 from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
@@ -34,6 +34,7 @@ from spectralzoom.flows.tasks.scene import seen_in_training
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
+from spectralzoom.pipeline.planning.uniform_scans import format_scan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
 from spectralzoom.storage.runs import RECEIPT, moment_of
@@ -52,7 +53,9 @@ class Published:
     folder: Path
 
 
-def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: datetime) -> Published:
+def publish_run(
+    stores: Stores, plan: SurveyPlan, products: Products, control: Control | None, started: datetime
+) -> Published:
     """Publish the products of a survey as a run folder with receipt.json, quicklook.png and report.html."""
     shown = quicklook_data(plan, products)
     quicklook = draw_quicklook(shown)
@@ -61,7 +64,7 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
     def write(folder: Path, uri: str) -> Facts:
         """Write the files of the run into a folder, and return facts for its manifest."""
         nonlocal receipt
-        receipt = make_receipt(stores, plan, products, uri, started)
+        receipt = make_receipt(stores, plan, products, control, uri, started)
         page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
         (folder / "quicklook.png").write_bytes(quicklook)
         if "plots" in receipt:
@@ -71,11 +74,14 @@ def publish_run(stores: Stores, plan: SurveyPlan, products: Products, started: d
         return {"survey": receipt["survey"], "settings": receipt["settings"]}
 
     day = moment_of(plan.field.acquired)
-    folder = stores.archive.publish_run(plan.field.name, write, stores.refs, None if day is None else day.date())
+    inputs = [*stores.refs, *(() if control is None else control.stores.refs)]
+    folder = stores.archive.publish_run(plan.field.name, write, inputs, None if day is None else day.date())
     return Published(receipt, folder)
 
 
-def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str, started: datetime) -> Receipt:
+def make_receipt(
+    stores: Stores, plan: SurveyPlan, products: Products, control: Control | None, uri: str, started: datetime
+) -> Receipt:
     """Return the receipt of a run whose folder has the address ``uri``."""
     read = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)  # a plan assumes `SMOOTH` of them
     plan = replace(plan, costs=replace(plan.costs, bands=read))
@@ -109,6 +115,7 @@ def make_receipt(stores: Stores, plan: SurveyPlan, products: Products, uri: str,
         effects=effects.get("effects"),
         effects_total=effects.get("total"),
         products={**places, **{name: f"{uri}/{name}" for name in files}},
+        control=None if control is None else control_figures(control),
         scans={name: as_figures(scan) for name, scan in scans.items() if scan is not None},
         **find_out(plan, products),
     )
@@ -126,6 +133,21 @@ def versions() -> dict[str, str]:
 def in_seconds(moment: datetime) -> str:
     """Return a time in ISO 8601, UTC, to the second."""
     return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
+
+
+def control_figures(control: Control) -> dict[str, Any]:
+    """Return scan, score and costs of the control."""
+    plan, products = control.plan, control.products
+    read = read_in_full(products.attention, products.class_map)
+    components = len(open_mosaic(products.mosaic.path / "mosaic.zarr").components)
+    figures = {} if products.accuracy is None else load_accuracy(products.accuracy)
+    return {
+        "scan": format_scan(plan.step, plan.passes.coarse[0].exposure_ms or plan.field.camera.exposure_ms),
+        "capture_s": plan.passes.coarse_s,
+        "kept": count_bytes(control.stores, plan, products, load_plan(products.attention))["kept"],
+        "multiply_adds": replace(plan, costs=replace(plan.costs, bands=components)).work_done(read).total,
+        **{name: figures.get(name) for name in ("miou", "overall_accuracy", "per_class_iou")},
+    }
 
 
 def _stage_row(row: Row) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rig.device_settings import FAKE, SurveyRig
 from spectralzoom.pipeline.setting_fields import stated
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
-from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
+from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES, LAWS
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
 from spectralzoom.storage.parallel.pool import WorkerPool
 
@@ -140,7 +140,7 @@ class Settings:
     )
     scene: str = stated(
         "farm",
-        "Scene: farm or scouting (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others."
+        "Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others."
         " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
     )
     labels: str | None = stated(
@@ -251,7 +251,7 @@ class Settings:
         example=Tolerance().value,
     )
     accuracy: bool = stated(True, "Compute the accuracy if there are labels")
-    controls: bool = stated(False, "With the accuracy, also judge the small network alone and the full one everywhere")
+    controls: bool = stated(False, "Also simulate and judge the best uniform scan of the same seconds")
     engine: Literal["prefect", "plain"] = stated("prefect", "Workflow engine; plain runs without a server")
     memory: Memory = stated(4 * 1024**3, "Memory limit for tiles and regions", example="4GiB")
     scheduler: Scheduler = stated(
@@ -356,6 +356,11 @@ class Settings:
     def shape(self) -> tuple[int, int] | None:
         """Return (y, x) of the built-in scene [px]; None for its default."""
         return None if self.size is None else (self.size[1], self.size[0])
+
+    @property
+    def law(self) -> str:
+        """Return the law of the built-in scene; empty for other scenes."""
+        return LAWS.get(self.scene, "")
 
     @property
     def moment(self) -> tuple[int, float] | None:

@@ -1,7 +1,4 @@
-"""Evaluate a map by labels; with controls also maps of the small and of the full network alone.
-
-It does not count as cost of the survey.
-"""
+"""Evaluate a map by labels. It does not count as cost of the survey."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ from numpy.typing import NDArray
 from spectralzoom.flows.frame import FieldLabels
 from spectralzoom.flows.stage import Output, stage
 from spectralzoom.flows.stages.register import load_registration
-from spectralzoom.flows.stages.score import PatchGains
 from spectralzoom.models.evaluation.metrics import (
     agreement,
     average_accuracy,
@@ -23,7 +19,6 @@ from spectralzoom.models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from spectralzoom.models.policies.placement import mixed
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.geometry.scan import Axis
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
@@ -34,20 +29,11 @@ from spectralzoom.storage.whole_files import to_json
 RECORD = "accuracy.json"
 
 
-@stage("accuracy", version=20, made_by=("models/evaluation", "models/network", "models/reading"))
+@stage("accuracy", version=21, made_by=("models/evaluation",))
 def evaluate(
-    out: Output,
-    mosaic: Ref,
-    class_map: Ref,
-    seams: Ref | None,
-    *,
-    gains: PatchGains,
-    labels: FieldLabels,
-    along: Axis,
-    pointing: PointingErrors | None,
-    controls: bool,
+    out: Output, class_map: Ref, seams: Ref | None, *, labels: FieldLabels, along: Axis, pointing: PointingErrors | None
 ) -> None:
-    """Evaluate the map by the labels, and with controls readings by the overview and by the full network.
+    """Evaluate the map by the labels.
 
     ``seams`` is the registration of the first pass, whose reference has the error that ``pointing`` simulates.
     """
@@ -55,16 +41,10 @@ def evaluate(
     assert truth is not None
     truth = moved_labels(truth, map_offset(pointing, seams), along)
     drawn = load_class_map(class_map.path / "class_map.zarr")
-    names = gains.work.weights.load().class_names
+    names = drawn.legend.names
     judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), truth)  # only pixels with a class
     counts = confusion(judged, drawn.classes, len(names))
     result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-    if controls:
-        overview, full = gains.work.readings(mosaic, gains.capture, out.report)
-        fractions, grid = gains.zones.fractions, gains.frame.grid
-        kept = np.ones(len(grid.every_patch()), np.bool_) if fractions is None else fractions > 0
-        for name, reading in {"none": overview, "all": mixed(overview, full, kept, grid)}.items():
-            result[name] = map_figures(names, confusion(judged, reading, len(names)))
     (out.path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
 
 

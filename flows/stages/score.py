@@ -104,7 +104,7 @@ def score(
     else:
         scores = gains.by_policy(mosaic, lambda done: out.report(0.5 * done))
         if second_pass is not None:
-            found = second_pass.plan(scores)
+            found = second_pass.by_score(scores)
         else:
             assert budget is not None
             found = within_budget(scanned, scores, replace(budget, costs=replace(budget.costs, bands=components)))

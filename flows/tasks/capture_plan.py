@@ -212,7 +212,7 @@ def choose_uniform_scan(
     Raises WeightsError: the weights lack the table; BudgetError: no scan ends in time; SettingsError: the table
     starts at longer exposures than the camera's; PoseError: the field exceeds the mirror's range.
     """
-    content = weights.record.get("scans")
+    content = weights.scans(settings.law)
     if content is None:
         if layout.step is None and settings.plain:
             by_hand = "--scan-step" + ("" if settings.source == RECORDED else " and --scan-exposure-ms")
@@ -264,7 +264,7 @@ def lay_out_passes(
     Without settings or a table, every line is captured. Raises what `PassLayout.plan` raises.
     """
     chosen = scans.chosen
-    content = weights.record.get("scans")
+    content = weights.scans(settings.law)
     first = None
     may_pay = (
         settings.may_zoom

@@ -84,6 +84,7 @@ def choose_extent(
     prior: Prior,
     weights: Description,
     path: Path,
+    law: str,
     light_fraction: float,
     *,
     seconds: float,
@@ -96,7 +97,7 @@ def choose_extent(
     they lie outside of zones or have no data. Raises WeightsError: the weights have no scan performance table;
     BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
     """
-    content = weights.record.get("scans")
+    content = weights.scans(law)
     if content is None:
         raise WeightsError(
             f"the weights {path.name} have no record of uniform scans to choose a part of the field by: capture all of "

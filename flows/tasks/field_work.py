@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from spectralzoom.models.network.machine import PROCESSOR, give_back_freed_memory
 from spectralzoom.models.network.spectral import Capture, CaptureMap, LineSpec, patches_of
-from spectralzoom.models.policies.placement import classes_by
 from spectralzoom.models.policies.policies import GLANCING_POLICIES, class_errors, gain_of, score_patches
 from spectralzoom.models.reading.expected_errors import PatchExpectedErrors
 from spectralzoom.models.reading.inference import (
@@ -154,17 +153,6 @@ class ExpectedErrors(MosaicReader):
         return PatchExpectedErrors.of([(sure, np.zeros(sure.shape[:2]))], grid, len(weights.class_names))
 
 
-class Readings(MosaicReader):
-    """Worker that segments a region by the overview alone, and by the full network everywhere."""
-
-    def __call__(self, region: Region) -> NDArray[np.uint8]:
-        """Return (reading, y, x) classes of the kept part."""
-        weights = self.weights.load()
-        seen = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
-        kept = region.numbers_here(region.field.every_patch())
-        return np.stack([region.crop(classes_by(weights, seen, some)) for some in (kept[:0], kept[kept >= 0])])
-
-
 def coarse_region(weights: Weights, mosaic: Ref, region: Region, capture: LineSpec) -> CoarsePass:
     """Read a region of a stored mosaic, in blocks of rows, after the memory of the one before is given back.
 
@@ -237,15 +225,6 @@ class FieldWork:
         pixels = self.joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
         pixels = pixels.reshape(-1, *parts[0].wrong.shape)
         return PatchExpectedErrors(pixels, np.sum([part.wrong for part in parts], axis=0), np.zeros(len(pixels)))
-
-    def readings(self, mosaic: Ref, capture: LineSpec, report: Report) -> NDArray[np.uint8]:
-        """Return the class maps (2, y, x) by the overview, and by the full network everywhere. Raises as `score`."""
-        grid = self.regions[0].field
-        parts = self._of_regions(Readings(self.weights, mosaic, capture), mosaic, grid.every_patch(), report)
-        maps = np.empty((2, grid.height, grid.width), np.uint8)
-        for region, part in zip(self.regions, parts, strict=True):
-            maps[:, region.kept.rows, region.kept.columns] = part
-        return maps
 
     def _of_regions(
         self, worker: Callable[[Region], Any], mosaic: Ref, patch_index: NDArray[np.integer], report: Report

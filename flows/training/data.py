@@ -21,6 +21,7 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW, built_in_laws, built_in_scene
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.simulator.scenes.trial import TRIAL_LAW
 from spectralzoom.storage.readers.label_files import (
     MatchedFiles,
     classes_of_files,
@@ -45,9 +46,9 @@ FARM_SHAPE = (512, 640)  # of a scene [px]
 FARM_TRAIN_SEED, FARM_VALIDATION_SEED = 100_000, 200_000  # examples use small seeds
 FARM_TEST_SEED = 300_000  # of `evaluate`
 SEASON_DAYS = (96, 304)  # of training scenes: April to October
-SCOUTED_DAYS = (136, 200)  # of scouted fields
+SCOUTED_DAYS = (136, 200)  # of scouted fields and trials
 SEASON_HOURS = (9, 15)  # true solar time
-_SCOUTED = "scouting-"  # prefix of the names of scouted fields
+_PREFIXES = {FARM_LAW: "", SCOUTING_LAW: "scouting-", TRIAL_LAW: "trial-"}  # of the names of scenes
 _GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps that cover a circle evenly
 Report = Callable[[str, float, str], None]  # activity, fraction done, figure
 
@@ -178,8 +179,7 @@ class TrainingData:
         """Open one scene. Raises SceneError: an invalid file; EmptySceneError: no value anywhere."""
         if self.files is None:
             seed, day, hour = read_farm_name(name)
-            law = SCOUTING_LAW if name.startswith(_SCOUTED) else FARM_LAW
-            return built_in_scene(law, seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
+            return built_in_scene(law_of(name), seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
         return scene_of_file(self.files.load(name), self.camera)
 
 
@@ -194,8 +194,8 @@ def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: b
     names: list[str] = []
     for number, law in enumerate(laws):
         own = len(range(number, count, len(laws)))
-        prefix, season = ("", SEASON_DAYS) if law == FARM_LAW else (_SCOUTED, SCOUTED_DAYS)
-        names += [prefix + name for name in farm_days(first_seed, own, odd=odd, season=season)]
+        season = SEASON_DAYS if law == FARM_LAW else SCOUTED_DAYS
+        names += [_PREFIXES[law] + name for name in farm_days(first_seed, own, odd=odd, season=season)]
     return tuple(names)
 
 
@@ -219,8 +219,13 @@ def farm_days(
 
 def read_farm_name(name: str) -> tuple[int, int, float]:
     """Return seed, day and hour of a name of `farm_days`."""
-    seed, _, day, _, hour = name.removeprefix(_SCOUTED).split("-")
+    seed, _, day, _, hour = name.removeprefix(_PREFIXES[law_of(name)]).split("-")
     return int(seed), int(day), float(hour)
+
+
+def law_of(name: str) -> str:
+    """Return the law of a built-in scene by its name."""
+    return next((law for law, prefix in _PREFIXES.items() if prefix and name.startswith(prefix)), FARM_LAW)
 
 
 def open_training_data(

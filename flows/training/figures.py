@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,11 @@ from spectralzoom.models.policies.placement import ReadTwice
 from spectralzoom.models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from spectralzoom.models.training.examples import Example
-from spectralzoom.models.weights.files import Weights
+from spectralzoom.models.weights.files import BY_LAW, Weights
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.planning.coverage import frame_patches
 
+Judged = tuple[ScoredMap, metrics.Floats]  # a map of a scan, and the counts of its confidence
 VALIDATED_FRACTION = 0.35  # of the patches: that of surveys with K = 35 %
 
 
@@ -65,6 +66,7 @@ SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the dar
 def judge_scans(
     weights: Weights,
     examples: Sequence[Example],
+    laws: Sequence[str],
     augmentation: CaptureAugmentation | None,
     seed: int,
     report: Report = lambda what, done, figure: None,
@@ -73,46 +75,62 @@ def judge_scans(
 
     None without a scene, or without an ``augmentation``: the training then had the reference exposure alone. In the
     record ``miou`` and the IoU of each class are tables (step, exposure) of means over the scenes. ``spread`` is the
-    standard deviation of their mIoU, ``calibration_error`` that of all pixels together. Scans are simulated by the
-    augmentation of the training.
+    standard deviation of their mIoU, ``calibration_error`` that of all pixels together. Built-in scenes of several
+    ``laws``, one for each example, also have a table of each law. Scans are simulated by the augmentation of the
+    training.
     """
-    known = [example for example in examples if example.noise is not None]
+    known = [(example, law) for example, law in zip(examples, laws, strict=True) if example.noise is not None]
     if not known or augmentation is None:
         return None
-    steps = [step for step in STEPS if all(len(one.labels) % step == 0 for one in known)]
+    steps = [step for step in STEPS if all(len(one.labels) % step == 0 for one, _ in known)]
     usual = [fraction * REFERENCE_MS for fraction in SCAN_EXPOSURES]
     exposures = [*(ms for ms in usual if ms > augmentation.min_exposure_ms), augmentation.min_exposure_ms]
-    miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
-    of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
-    maps: dict[tuple[int, float], list[ScoredMap]] = {}
+    judged: dict[tuple[int, float], list[Judged]] = {}
     for i, step in enumerate(steps):
         for j, exposure_ms in enumerate(exposures):
             rng = np.random.default_rng([seed, 0x5CA, i, j])
-            judged = [_scanned(weights, one, augmentation, step, exposure_ms / REFERENCE_MS, rng) for one in known]
-            counts = [one.counts for one, _ in judged]
-            calibration[i, j] = metrics.calibration_error(np.sum([sure for _, sure in judged], axis=0))
-            own = [metrics.mean_iou(one) for one in counts]
-            miou[i, j] = np.nanmean(own)
-            spread[i, j] = np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
-            with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
-                of_classes[:, i, j] = np.nanmean([metrics.iou_per_class(one) for one in counts], axis=0)
-            maps[step, exposure_ms] = [one for one, _ in judged]
-            figure = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
-            report("judging scans", len(maps) / miou.size, figure)
-    record = {
-        "scenes": len(known),
+            light = exposure_ms / REFERENCE_MS
+            judged[step, exposure_ms] = [_scanned(weights, one, augmentation, step, light, rng) for one, _ in known]
+            miou = np.nanmean([metrics.mean_iou(one.counts) for one, _ in judged[step, exposure_ms]])
+            figure = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou:.1f}"
+            report("judging scans", len(judged) / len(steps) / len(exposures), figure)
+    names = weights.class_names
+    record = _scan_table(judged, names)
+    if len({law for _, law in known}) > 1:
+        own = {law: [number for number, (_, of) in enumerate(known) if of == law] for _, law in known}
+        record[BY_LAW] = {
+            law: _scan_table({scan: [found[one] for one in chosen] for scan, found in judged.items()}, names)
+            for law, chosen in own.items()
+        }
+    return record, MapScores.fitted({scan: [one for one, _ in found] for scan, found in judged.items()})
+
+
+def _scan_table(judged: Mapping[tuple[int, float], Sequence[Judged]], class_names: Sequence[str]) -> dict[str, Any]:
+    """Return the tables of scans by step and exposure, each judged on the same scenes."""
+    steps, exposures = list(dict.fromkeys(step for step, _ in judged)), list(dict.fromkeys(ms for _, ms in judged))
+    scenes = len(judged[steps[0], exposures[0]])
+    miou, spread, calibration = np.full((3, len(steps), len(exposures)), np.nan)
+    of_classes = np.zeros((len(class_names), len(steps), len(exposures)))
+    for (step, exposure_ms), found in judged.items():
+        at = steps.index(step), exposures.index(exposure_ms)
+        counts = [one.counts for one, _ in found]
+        calibration[at] = metrics.calibration_error(np.sum([sure for _, sure in found], axis=0))
+        own = [metrics.mean_iou(one) for one in counts]
+        miou[at] = np.nanmean(own)
+        spread[at] = np.nanstd(own, ddof=1) if scenes > 1 else np.nan
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of an absent class
+            of_classes[:, *at] = np.nanmean([metrics.iou_per_class(one) for one in counts], axis=0)
+    return {
+        "scenes": scenes,
         "steps": steps,
         "exposures_ms": exposures,
         "miou": miou.tolist(),
-        "spread": spread.tolist() if len(known) > 1 else None,
+        "spread": spread.tolist() if scenes > 1 else None,
         "calibration_error": calibration.tolist(),
         "per_class_iou": {
-            name: iou.tolist()
-            for name, iou in zip(weights.class_names, of_classes, strict=True)
-            if np.isfinite(iou).all()
+            name: iou.tolist() for name, iou in zip(class_names, of_classes, strict=True) if np.isfinite(iou).all()
         },
     }
-    return record, MapScores.fitted(maps)
 
 
 def _scanned(
@@ -122,7 +140,7 @@ def _scanned(
     step: int,
     light: float,
     rng: np.random.Generator,
-) -> tuple[ScoredMap, metrics.Floats]:
+) -> Judged:
     """Simulate a uniform scan of a scene and segment it in full; return counts of the map and its confidence."""
     assert example.noise is not None
     grid, labels = _parts(weights, example)

@@ -23,6 +23,7 @@ from spectralzoom.flows.training.data import (
     alike_note,
     check_out,
     filled,
+    law_of,
     open_training_data,
     read_farm_name,
     untaught_note,
@@ -52,6 +53,7 @@ from spectralzoom.models.weights.files import (
     CASCADE,
     CLASS_VALUES,
     PLAIN,
+    SCANS,
     TRAINED_ON,
     TrainedOn,
     Weights,
@@ -139,9 +141,12 @@ def _written(
     frames, kept = learner.scenes.validation.examples, whole or learned
     record = {**about, **kept.found, **learner.judged(weights)}
     seed = request.flags.settings.seed
-    scans = figures.judge_scans(with_record(weights, **record), frames, learner.augmentation, seed, learner.report)
+    laws = [law_of(name) if built_in_laws(request.dataset) else "" for name in learner.scenes.validation.keys]
+    scans = figures.judge_scans(
+        with_record(weights, **record), frames, laws, learner.augmentation, seed, learner.report
+    )
     if scans is not None:
-        record["scans"] = scans[0]
+        record[SCANS] = scans[0]
     save_weights(with_record(kept.weights.on(PROCESSOR), **record), request.out)
     if learner.spectra is not None:
         add_spectra(request.out, learner.spectra)

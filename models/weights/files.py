@@ -36,6 +36,8 @@ ENCODER = "spectralzoom-encoder/1"
 COLOURS = "class_colours"
 CAPTURED = "captured"  # of a record: scenes were captured by the simulated camera, not taken as they are
 PLAIN = "plain"  # of a record: number of the mixture's part that is the best classifier of single spectra
+SCANS = "scans"  # of a record: scores of uniform scans
+BY_LAW = "by_law"  # of these: scores on the built-in scenes of each law
 CASCADE = "cascade"  # of a record: loss of reading some patches in full
 CALIBRATION = "calibration"  # of a record: calibration error and temperature
 READER = "memory"  # entry in the description, prefix of tensor names
@@ -106,6 +108,11 @@ class Description:
     def untaught(self) -> tuple[str, ...]:
         """Return the names of the classes without a training pixel, which are never drawn."""
         return tuple(self.class_names[number] for number in self.config.untaught)
+
+    def scans(self, law: str = "") -> Mapping[str, Any] | None:
+        """Return the scores of uniform scans, on built-in scenes of a ``law`` if it was judged; None without any."""
+        content: Mapping[str, Any] | None = self.record.get(SCANS)
+        return None if content is None else content.get(BY_LAW, {}).get(law, content)
 
 
 @dataclass(frozen=True)

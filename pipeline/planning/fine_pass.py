@@ -7,7 +7,7 @@ numbers count the positions of the full scan, 1 px apart.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -25,6 +25,8 @@ from spectralzoom.pipeline.planning.uniform_scans import MIOU, ScanPerformance, 
 FIRST_STEP = 4  # positions of the full scan from line to line of the first pass
 FIRST_STEPS = (4, 8)  # allowed values
 LEAST_GAIN = 1e-3  # of mIoU; below it there is no second pass
+AHEAD = 3e-3  # of mIoU; runs that are expected to gain so much more than all of the lines are captured instead of them
+MOST_AGAIN = 0.6  # of the field; larger runs give way to lines of the whole field
 EXPOSURES = 7  # that are tried, equally spaced by logarithm
 
 
@@ -32,7 +34,7 @@ EXPOSURES = 7  # that are tried, equally spaced by logarithm
 class FinePlan:
     """Sweeps of the second pass, the patches that they show, and their capture time.
 
-    ``kind`` is "lines" for runs of lines, and "full" for the whole field. After a uniform scan it is "scan", and
+    ``kind`` is "lines" for runs of lines, and "full" for the whole field, which completes a uniform scan. After a uniform scan it is "scan", and
     "raster" if all pixels were given. ``reason`` says it in a sentence.
     """
 
@@ -103,53 +105,109 @@ class SecondPass:
         stop = np.minimum(-(-(found.stop + margin - 1) // apart) * apart + 1, lines)
         return replace(found, first=np.where(found.there, first, 0), stop=np.where(found.there, stop, 0))
 
-    def plan(self, gain: Floats, *, step: int = 1, exposure_ms: float | None = None) -> FinePlan:
+    def plan(
+        self, gain: Floats, *, step: int = 1, exposure_ms: float | None = None, seconds: float | None = None
+    ) -> FinePlan:
         """Return the runs of lines ``step`` px apart that have the highest sum of (patch,) ``gain`` in the time.
 
         NaN and negative gains count as 0. Lines have ``exposure_ms``, by default the usual exposure of new lines.
+        ``seconds`` are by default those that the first pass leaves.
         """
+        seconds = self.seconds if seconds is None else seconds
         exposure_ms = self.usual_ms if exposure_ms is None else exposure_ms
-
-        def sweeps_of(runs: Sequence[LineRun]) -> list[Sweep]:
-            found = [
-                replace(some_lines(self.swaths[number], first, stop), name=f"{self.swaths[number].name}-{first:05d}")
-                for number, first, stop in sorted(runs)  # in the order of their names
-            ]
-            return lines_between(found, self._between, step=step, exposure_ms=exposure_ms)
-
         exposed = self.camera if exposure_ms is None else replace(self.camera, exposure_ms=exposure_ms)
         times = RunTimes(
             exposed.frame_ms * 1e-3 * (1 / step - (1 / self._apart if self.interlaces else 0)),  # of the new lines
             self.cost.setup_seconds(exposed) * (math.log2(self._apart / step) if self.interlaces else 1),
-            lambda runs: self.cost.seconds(sweeps_of(runs), self.camera),
+            lambda runs: self.cost.seconds(self._sweeps(runs, step, exposure_ms), self.camera),
         )
-        chosen = choose_runs(self.rows, np.where(gain > 0, gain, 0.0), times, seconds=self.seconds, several=True)
-        sweeps = [] if chosen is None else sweeps_of(chosen.runs)
+        chosen = choose_runs(self.rows, np.where(gain > 0, gain, 0.0), times, seconds=seconds, several=True)
+        return self._plan_of(() if chosen is None else chosen.runs, gain, step, exposure_ms)
+
+    def whole(self, gain: Floats, *, step: int = 1, exposure_ms: float | None = None) -> FinePlan:
+        """Return the lines of the whole field that complete a uniform scan of ``step`` px, however long they take."""
+        shown = zip(self.rows.first, self.rows.stop, self.rows.there, strict=True)
+        runs = [
+            (number, int(first[there].min()), int(stop[there].max()))
+            for number, (first, stop, there) in enumerate(shown)
+            if there.any()
+        ]
+        return self._plan_of(runs, gain, step, self.usual_ms if exposure_ms is None else exposure_ms)
+
+    def _sweeps(self, runs: Sequence[LineRun], step: int, exposure_ms: float | None) -> list[Sweep]:
+        """Return the sweeps of runs of lines."""
+        found = [
+            replace(some_lines(self.swaths[number], first, stop), name=f"{self.swaths[number].name}-{first:05d}")
+            for number, first, stop in sorted(runs)  # in the order of their names
+        ]
+        return lines_between(found, self._between, step=step, exposure_ms=exposure_ms)
+
+    def _plan_of(self, runs: Sequence[LineRun], gain: Floats, step: int, exposure_ms: float | None) -> FinePlan:
+        """Return the plan of runs of lines; of those of a recording that it has."""
+        sweeps = self._sweeps(runs, step, exposure_ms)
         if self.recorded is not None:
             sweeps = self.recorded(sweeps)
-        if chosen is None or not sweeps:
+        if not sweeps:
             return no_pass("no run of lines with a gain fits the time")
-        patch_index = self.rows.patches(chosen.runs)
-        whole = len(patch_index) == np.count_nonzero(self.rows.row >= 0)
-        what = "the whole field" if whole else f"{len(patch_index)} patches"
+        patch_index = self.rows.patches(runs)
+        share = len(patch_index) / np.count_nonzero(self.rows.row >= 0)
+        what = "the whole field" if share == 1 else f"{100 * share:.2g} % of the field"
         taken_ms = sorted({exposing(self.camera, sweep).exposure_ms for sweep in sweeps})
         reason = f"captured again: {what}, {format_scan(step, *taken_ms)}"
-        seconds = self.cost.seconds(sweeps, self.camera)
-        return FinePlan(sweeps, patch_index, seconds, chosen.expected_gain, "full" if whole else "lines", reason)
+        gained = float(np.sum(gain[patch_index], where=gain[patch_index] > 0))
+        kind: Literal["full", "lines"] = "full" if share == 1 else "lines"
+        return FinePlan(sweeps, patch_index, self.cost.seconds(sweeps, self.camera), gained, kind, reason)
+
+    def by_score(self, gain: Floats) -> FinePlan:
+        """Return the runs with the highest sum of (patch,) ``gain``.
+
+        Where they are more than `MOST_AGAIN` of the field, every second line of the whole field is captured instead.
+        """
+        runs = self.plan(gain)
+        if runs.kind == "full" or len(runs.patch_index) <= MOST_AGAIN * np.count_nonzero(self.rows.row >= 0):
+            return runs
+        even = self.whole(gain, step=2)
+        return even if even.seconds <= self.seconds else runs
 
     def best(self, record: ScanPerformance, gain_of: Callable[[int, float], Floats]) -> FinePlan:
-        """Return the plan with the highest expected gain in mIoU, over line spacings and exposures.
+        """Return the runs of lines with the highest expected gain, or complete the uniform scan.
 
-        A recording offers its own exposures. ``gain_of`` returns the (patch,) gains of lines of a spacing, for the mean
-        exposure [ms] of old and new lines.
+        Runs take at most `MOST_AGAIN` of the time of the lines that complete the scan, and are expected to gain `AHEAD`
+        more. Line spacings and exposures are chosen for both; a recording offers its own exposures. ``gain_of`` returns
+        the (patch,) gains of lines of a spacing, for the mean exposure [ms] of old and new lines.
         """
+        found: list[FinePlan] = []
+        for step, exposure_ms, mean_ms in self._offered(record):
+            gain = gain_of(step, mean_ms)
+            whole = self.whole(gain, step=step, exposure_ms=exposure_ms)
+            limit_s = min(MOST_AGAIN * whole.seconds, self.seconds)
+            found += [whole, self.plan(gain, step=step, exposure_ms=exposure_ms, seconds=limit_s)]
+        found = [plan for plan in found if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
+        if not found:
+            return no_pass("no second pass in the time would score more than the first one")
+        runs, whole = (
+            max(some, key=lambda plan: (plan.expected_gain, -plan.seconds), default=no_pass(""))
+            for some in ([one for one in found if one.kind != "full"], [one for one in found if one.kind == "full"])
+        )
+        ahead = runs.expected_gain - whole.expected_gain
+        plan = runs if ahead >= AHEAD or not whole.sweeps else whole
+        if plan.expected_gain < LEAST_GAIN:
+            why = f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points"
+            return no_pass(why, plan.expected_gain) if plan.sweeps else plan
+        if not (runs.sweeps and whole.sweeps):
+            return plan
+        other = "the whole field in the same time" if plan is runs else "the best part of it"
+        more = f"expected gain {100 * abs(ahead):.1f} points {'above' if (plan is runs) == (ahead > 0) else 'below'}"
+        return replace(plan, reason=f"{plan.reason}; {more} that of {other}")
+
+    def _offered(self, record: ScanPerformance) -> Iterator[tuple[int, float, float]]:
+        """Yield line spacing and exposure of new lines, and the mean exposure of old and new ones."""
         first = self.first_pass[0]
         shortest, longest = record.offered_ms(self.camera)
         first_ms = exposing(self.camera, first).exposure_ms
         # Lines that score less than those of the first pass would replace better ones.
         known = first.step in record.steps
         least = record.expected(first.step, float(np.clip(first_ms, shortest, longest)))[MIOU] if known else 0.0
-        plans: list[FinePlan] = []
         for step in (step for step in record.steps if step < first.step):
             every = lines_between(self.full, self._between, step=step)
             last = longest_exposure(self.seconds, every, self.camera, self.cost, shortest, longest)
@@ -159,16 +217,7 @@ class SecondPass:
                 mean_ms = merged_ms((first_ms, exposure_ms), (of_first, 1 - of_first))
                 mean_ms = float(np.clip(mean_ms, shortest, longest))
                 if record.expected(step, mean_ms)[MIOU] >= least:
-                    plans.append(self.plan(gain_of(step, mean_ms), step=step, exposure_ms=exposure_ms))
-        plans = [plan for plan in plans if plan.seconds <= self.seconds]  # recorded lines may have longer exposures
-        plan = max(plans, key=lambda made: (made.expected_gain, -made.seconds), default=None)
-        if plan is None:
-            return no_pass("no second pass in the time would score more than the first one")
-        if not plan.sweeps or plan.expected_gain >= LEAST_GAIN:
-            return plan
-        return no_pass(
-            f"no second pass: its expected gain is {100 * plan.expected_gain:.2f} points", plan.expected_gain
-        )
+                    yield step, exposure_ms, mean_ms
 
     @property
     def _between(self) -> Sequence[Sweep]:

@@ -27,6 +27,7 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import FarmPlan, Pain
 from spectralzoom.pipeline.simulator.scenes.farm.fields import draw_weeds, field_weeds, paint_fields, plant_weeds
 from spectralzoom.pipeline.simulator.scenes.farm.land import Field, Points
 from spectralzoom.pipeline.simulator.scenes.scene import Drawn, RasterScene
+from spectralzoom.pipeline.simulator.scenes.trial import TRIAL_LAW, TRIAL_NAMES, trial_scene
 
 SCOUTING_LAW = "scouting@1"
 SCOUTING_NAMES = ("scouting", SCOUTING_LAW)
@@ -42,13 +43,17 @@ DENSE = 350.0  # weeds of a patch per 1000 px
 EVEN = 0.4  # vigour's sd over the farm's
 POOR = 4.2  # by how much vigour is less in poor growth
 LODGED = 0.5  # of a field in the end, at the middle of a patch's edge
-BUILT_IN_NAMES = (*farm.FARM_NAMES, *SCOUTING_NAMES)
-LAWS = dict.fromkeys(farm.FARM_NAMES, farm.FARM_LAW) | dict.fromkeys(SCOUTING_NAMES, SCOUTING_LAW)
+BUILT_IN_NAMES = (*farm.FARM_NAMES, *SCOUTING_NAMES, *TRIAL_NAMES)
+LAWS = {
+    name: law
+    for names, law in ((farm.FARM_NAMES, farm.FARM_LAW), (SCOUTING_NAMES, SCOUTING_LAW), (TRIAL_NAMES, TRIAL_LAW))
+    for name in names
+}
 
 
 def built_in_scene(name: str, seed: int, *args: Any, **moment: Any) -> RasterScene:
-    """Draw the built-in scene of a name; arguments and errors are those of `farm_scene` and `scouting_scene`."""
-    make = farm.farm_scene if LAWS[name] == farm.FARM_LAW else scouting_scene
+    """Draw the built-in scene of a name; arguments and errors are those of the function of its law."""
+    make = {farm.FARM_LAW: farm.farm_scene, SCOUTING_LAW: scouting_scene, TRIAL_LAW: trial_scene}[LAWS[name]]
     return make(seed, *args, **moment)
 
 

@@ -13,7 +13,14 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import CostModel
 from spectralzoom.pipeline.planning.coverage import full_sweeps, patches_shown
-from spectralzoom.pipeline.planning.fine_pass import FIRST_STEPS, LEAST_GAIN, SecondPass, every_nth, lines_between
+from spectralzoom.pipeline.planning.fine_pass import (
+    FIRST_STEPS,
+    LEAST_GAIN,
+    MOST_AGAIN,
+    SecondPass,
+    every_nth,
+    lines_between,
+)
 from spectralzoom.pipeline.planning.uniform_scans import MIOU, ScanPerformance
 
 CAMERA = LineCamera(samples=320)
@@ -167,3 +174,41 @@ def test_spacing_and_exposure_have_the_highest_gain(step: int) -> None:
     nothing = planner.best(RECORD, lambda spacing, mean_ms: np.full(drawn(2).size, 0.1 * LEAST_GAIN / drawn(2).size))
     assert (nothing.sweeps, nothing.kind) == ([], "lines")
     assert "no second pass" in nothing.reason
+
+
+def _gains(share: float) -> np.ndarray:
+    """Return gains of .1 in all, evenly on a share of the rows of patches."""
+    rows, columns = GRID.patch_shape
+    there = np.repeat(np.arange(rows) < share * rows, columns)
+    return np.where(there, 0.1 / there.sum(), 0.0)
+
+
+@pytest.mark.parametrize(("share", "kind"), [(1 / 16, "lines"), (1.0, "full")])
+def test_a_second_pass_zooms_where_the_gain_is_compact(share: float, kind: str) -> None:
+    """Else it completes the uniform scan; the reason has the figures of both."""
+    planner = second_pass(0.25 * FULL_S)
+
+    def gain_of(step: int, mean_ms: float) -> np.ndarray:
+        return 5 * _gains(share) * RECORD.expected(step, mean_ms)[MIOU]
+
+    plan = planner.best(RECORD, gain_of)
+    assert plan.kind == kind
+    assert "expected gain" in plan.reason
+    assert len(plan.patch_index) == (GRID.every_patch().size if kind == "full" else pytest.approx(80, abs=64))
+
+
+def test_runs_that_gain_little_more_complete_the_scan() -> None:
+    """Runs are .2 points ahead of the whole field, which is below the least difference."""
+    planner = second_pass(0.25 * FULL_S)
+    plan = planner.best(RECORD, lambda step, mean_ms: 0.02 * _gains(1 / 16) * RECORD.expected(step, mean_ms)[MIOU])
+    assert plan.kind == "full"
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.62, 1.0])
+def test_runs_of_most_of_the_field_give_way_to_even_lines(fraction: float) -> None:
+    """Without a table of scans, either at most the limit is captured again or the whole field."""
+    gain = np.random.default_rng(3).uniform(0.9, 1.1, GRID.every_patch().size)
+    plan = second_pass(fraction * FULL_S).by_score(gain)
+    assert len(plan.patch_index) <= MOST_AGAIN * gain.size or plan.kind == "full"
+    assert (plan.kind == "full") == (fraction > 0.3)
+    assert plan.seconds <= fraction * FULL_S
