@@ -140,8 +140,8 @@ class Settings:
     )
     scene: str = stated(
         "farm",
-        "Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others."
-        " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
+        "Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and"
+        " others. Pattern for repeated visits: {date:%Y-%m-%d}.tif",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"

@@ -34,8 +34,8 @@ EXPOSURES = 7  # that are tried, equally spaced by logarithm
 class FinePlan:
     """Sweeps of the second pass, the patches that they show, and their capture time.
 
-    ``kind`` is "lines" for runs of lines, and "full" for the whole field, which completes a uniform scan. After a uniform scan it is "scan", and
-    "raster" if all pixels were given. ``reason`` says it in a sentence.
+    ``kind`` is "lines" for runs of lines, and "full" for the whole field, which completes a uniform scan. Without a
+    second pass it is "scan", and "raster" if all pixels were given. ``reason`` says it in a sentence.
     """
 
     sweeps: list[Sweep]
