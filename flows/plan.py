@@ -27,6 +27,7 @@ from spectralzoom.flows.tasks.patch_budget import PatchBudget, ReadingCosts
 from spectralzoom.models.network.sizes import MultiplyAdds
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.placement import CascadeTable
+from spectralzoom.models.policies.policies import GLANCING_POLICIES
 from spectralzoom.models.reading.prior_map import EVERY_PX
 from spectralzoom.models.weights.files import CASCADE
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -184,13 +185,22 @@ class SurveyPlan:
         full = self.passes.full
         return (*self.passes.coarse, *(replace(sweep, exposure_ms=ms) for ms in exposures for sweep in full))
 
-    def work_done(self, patch_index: NDArray[np.integer]) -> MultiplyAdds:
-        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used."""
+    @property
+    def reads_overview(self) -> bool:
+        """Return whether the overview is read before the map is drawn: to score patches."""
+        return (not self.passes.plain or self.budget is not None) and self.settings.policy in GLANCING_POLICIES
+
+    def work_done(self, patch_index: NDArray[np.integer], changed: NDArray[np.integer] | None = None) -> MultiplyAdds:
+        """Count multiply-adds of the map with these patches at full resolution, and of the scores if used.
+
+        ``changed`` (patch,) are those of which a second pass shows a part, by default all.
+        """
         done = self.costs.of_map(patch_index)
         if self.least_gain is not None and self.passes.plain:  # while drawn, which reads the overview once
             done = replace(done, score=self.costs.score(self.settings.policy))
         elif self.chooses:
-            done = self.costs.with_scores(patch_index, self.settings.policy)
+            changed = None if self.passes.plain else self.field.grid.every_patch() if changed is None else changed
+            done = self.costs.with_scores(patch_index, self.settings.policy, changed)
         if self.field.reader is None:
             return done
         grid = self.field.grid

@@ -35,6 +35,7 @@ class Products:
     mosaic: Ref  # of all passes
     attention: Ref  # scores of the patches, and plan of the second pass
     class_map: Ref
+    overview: Ref | None = None  # by which patches were scored
     effects: Ref | None = None  # of a simulated source
     first: Pass | None = None
     second: Pass | None = None

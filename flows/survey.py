@@ -21,7 +21,7 @@ from prefect import flow
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.products import Control, Pass, Products
-from spectralzoom.flows.publish.publishing import RunRef, clear_first_mosaic, clear_raw, publish
+from spectralzoom.flows.publish.publishing import RunRef, clear_intermediate, clear_raw, publish
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import RIG
 from spectralzoom.flows.settings.values import KEEP_RAW
@@ -32,6 +32,7 @@ from spectralzoom.flows.stages.effects import choose_effects
 from spectralzoom.flows.stages.evaluate import evaluate
 from spectralzoom.flows.stages.ground import ground
 from spectralzoom.flows.stages.locate import locate
+from spectralzoom.flows.stages.overview import read_overview
 from spectralzoom.flows.stages.rectify import rectify, rectify_fine
 from spectralzoom.flows.stages.register import register_coarse, register_fine
 from spectralzoom.flows.stages.score import load_plan, score
@@ -76,7 +77,7 @@ def survey(settings: SurveySettings) -> RunRef:
             products = run_stages(stores, plan)
         except SurveyStopped as stopped:
             return RunRef(stopped.uri, archive.root / stopped.uri, stopped=stopped)
-        clear_first_mosaic(archive, plan, products)
+        clear_intermediate(archive, plan, products)
         control = _control(archive, plan, observer)
         run = publish(stores, plan, products, control, started=started, note=observer.note)
         if control is not None:
@@ -98,9 +99,11 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
     else:
         first = _first_pass(stores, plan, effects)
         mosaic = first.mosaic
+    overview = read_overview(stores, mosaic, work=plan.work, capture=plan.capture) if plan.reads_overview else None
     attention = score(
         stores,
         mosaic,
+        overview,
         gains=plan.gains,
         second_pass=plan.second_pass,
         scan_record=plan.scan_record,
@@ -120,6 +123,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
         stores,
         mosaic,
         attention,
+        overview,
         *(() if field.prior is None else field.prior.stores),
         gains=plan.gains,
         prior=field.prior,
@@ -131,6 +135,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
     return Products(
         mosaic=mosaic,
         attention=attention,
+        overview=overview,
         class_map=class_map,
         effects=effects,
         first=first,

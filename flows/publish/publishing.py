@@ -74,8 +74,10 @@ def clear_raw(stores: Stores, plan: SurveyPlan, products: Products, run: RunRef,
     return task_in_flow("clear_raw", stores.name, work, *raws) if raws and plan.settings.keep == KEEP_SIGNAL else run
 
 
-def clear_first_mosaic(archive: Archive, plan: SurveyPlan, products: Products) -> None:
-    """Clear the mosaic of the first pass, whose lines are in that of both passes."""
+def clear_intermediate(archive: Archive, plan: SurveyPlan, products: Products) -> None:
+    """Clear the overview, and the mosaic of the first pass, whose lines are in that of both passes."""
+    if products.overview is not None:
+        archive.clear(products.overview, wait=False)
     if products.first is None or products.second is None or plan.registers:  # fine sweeps are registered on it
         return
     first = products.first.mosaic

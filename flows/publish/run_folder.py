@@ -157,7 +157,7 @@ def _stage_row(row: Row) -> dict[str, Any]:
 
 def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[str, Any]:
     """Return the costs against the full scan, and against reading every patch; for a raster the latter alone."""
-    did, patches = plan.work_done(read), plan.field.kept_patches
+    did, patches = plan.work_done(read, fine.changed), plan.field.kept_patches
     work = SavingEntry(did.total, plan.costs.of_map(patches).total).as_dict()
     of_model: dict[str, Any] = {"multiply_adds": {**work, **asdict(did)}}
     if plan.field.described.config.corrected:  # there is a network that can read patches in full

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import FieldFrame
 from spectralzoom.flows.stage import Output, Report, stage
-from spectralzoom.flows.tasks.field_work import FieldWork
+from spectralzoom.flows.stages.overview import OVERVIEWS
+from spectralzoom.flows.tasks.field_work import NO_PATCHES, FieldWork
 from spectralzoom.flows.tasks.patch_budget import PatchBudget
 from spectralzoom.flows.tasks.zones import SurveyZones
 from spectralzoom.models.network.spectral import LineSpec
@@ -27,6 +29,7 @@ from spectralzoom.storage.arrays.mosaics import Attention, chosen_patches, open_
 from spectralzoom.storage.store import Ref, read_table, write_table
 
 SCORES = "attention.zarr"
+OF_PATCHES = ("patch_index", "changed")  # of a plan
 READING = SCORES  # also beside a class map, whose drawing chose the patches
 MADE_BY = ("models/network", "models/reading", "models/policies", "pipeline/planning")
 
@@ -57,10 +60,10 @@ class PatchGains:
             "capture": list(self.capture) if sees else None,
         }
 
-    def by_policy(self, mosaic: Ref, report: Report) -> Scores:
-        """Return the (patch,) expected gain by the policy."""
+    def by_policy(self, mosaic: Ref, overviews: Path | None, report: Report) -> Scores:
+        """Return the (patch,) expected gain by the policy; ``overviews`` of the mosaic are not computed again."""
         if self.policy in SEEING_POLICIES:
-            return self.within_zones(self.work.score(self.policy, mosaic, self.capture, report).ravel())
+            return self.within_zones(self.work.score(self.policy, mosaic, self.capture, report, overviews).ravel())
         nothing = np.empty((0, 0, 0), np.float32)
         unseen = CoarsePrediction(self.frame.grid, nothing, nothing)
         return self.within_zones(score_patches(self.policy, unseen, seed=self.seed, mask=self.mask))
@@ -80,10 +83,11 @@ class PatchGains:
         return patch_index if fractions is None else patch_index[fractions[patch_index] > 0]
 
 
-@stage("patch scores", version=22, made_by=MADE_BY)
+@stage("patch scores", version=23, made_by=MADE_BY)
 def score(
     out: Output,
     mosaic: Ref,
+    overview: Ref | None,
     *,
     gains: PatchGains,
     second_pass: SecondPass | None,
@@ -94,21 +98,26 @@ def score(
 ) -> None:
     """Score every patch by the coarse mosaic, and plan the sweeps with the highest total score in the time left.
 
-    Without a second pass, ``scanned`` is the plan, and ``budget`` limits its patches.
+    Without a second pass, ``scanned`` is the plan, and ``budget`` limits its patches. ``overview`` is that of the
+    mosaic, for policies that score by it.
     """
+    overviews = None if overview is None else overview.path / OVERVIEWS
     components = len(open_mosaic(mosaic.path / "mosaic.zarr").components)
     if second_pass is None and budget is None:
         scores, found = np.zeros(int(np.prod(gains.frame.grid.patch_shape))), scanned
     elif second_pass is not None and scan_record is not None:
-        scores, found = gain_by_record(gains, mosaic, second_pass, scan_record, lambda done: out.report(0.5 * done))
+        scores, found = gain_by_record(gains, mosaic, overviews, second_pass, scan_record, out.report)
     else:
-        scores = gains.by_policy(mosaic, lambda done: out.report(0.5 * done))
+        scores = gains.by_policy(mosaic, overviews, out.report)
         if second_pass is not None:
             found = second_pass.by_score(scores)
         else:
             assert budget is not None
             found = within_budget(scanned, scores, replace(budget, costs=replace(budget.costs, bands=components)))
-    found = replace(found, patch_index=gains.kept(found.patch_index))
+    changed = NO_PATCHES
+    if second_pass is not None:
+        changed = np.flatnonzero(patches_shown(found.sweeps, gains.frame.grid, second_pass.camera))
+    found = replace(found, patch_index=gains.kept(found.patch_index), changed=changed)
     read = found.patch_index
     if second_pass is not None and (least_gain is not None or found.kind == "full" or not found.sweeps):
         read = gains.kept(gains.frame.grid.every_patch())  # the segmentation chooses among them
@@ -118,7 +127,7 @@ def score(
     rank[read[np.argsort(-scores[read], kind="stable")]] = np.arange(len(read))
     shape = gains.frame.grid.patch_shape
     write_attention(out.path / SCORES, Attention(scores.reshape(shape), rank.reshape(shape), gains.policy))
-    write_table(out.path / "plan.json", asdict(found) | {"patch_index": found.patch_index.tolist()})
+    write_table(out.path / "plan.json", asdict(found) | {name: getattr(found, name).tolist() for name in OF_PATCHES})
 
 
 def within_budget(scanned: FinePlan, scores: Scores, budget: PatchBudget) -> FinePlan:
@@ -130,10 +139,15 @@ def within_budget(scanned: FinePlan, scores: Scores, budget: PatchBudget) -> Fin
 
 
 def gain_by_record(
-    gains: PatchGains, mosaic: Ref, second_pass: SecondPass, record: ScanPerformance, report: Report
+    gains: PatchGains,
+    mosaic: Ref,
+    overviews: Path | None,
+    second_pass: SecondPass,
+    record: ScanPerformance,
+    report: Report,
 ) -> tuple[Scores, FinePlan]:
     """Return the expected wrong pixels of the first pass, and the second pass of the highest expected gain."""
-    errors = gains.work.expected_errors(mosaic, gains.capture, report)
+    errors = gains.work.expected_errors(mosaic, gains.capture, report, overviews)
     class_names = gains.work.weights.load().class_names
 
     def gain_of(step: int, exposure_ms: float) -> Scores:
@@ -157,7 +171,8 @@ def all_seen(grid: SceneGrid, sweeps: Sequence[Sweep], camera: LineCamera, *, pa
 def load_plan(attention: Ref) -> FinePlan:
     """Read the plan of the second pass: sweeps, and the patches that they cover."""
     plan = read_table(attention.path / "plan.json")
-    return FinePlan([Sweep(**one) for one in plan.pop("sweeps")], np.array(plan.pop("patch_index"), np.intp), **plan)
+    plan |= {name: np.array(plan[name], np.intp) for name in OF_PATCHES}
+    return FinePlan([Sweep(**one) for one in plan.pop("sweeps")], **plan)
 
 
 def read_in_full(attention: Ref, class_map: Ref) -> NDArray[np.intp]:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from spectralzoom.flows.stage import Output, stage
-from spectralzoom.flows.stages.score import READING, PatchGains
+from spectralzoom.flows.stages.overview import OVERVIEWS
+from spectralzoom.flows.stages.score import READING, PatchGains, load_plan
 from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, FullReading, draw_field
 from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES, Prior
 from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
@@ -37,11 +38,12 @@ MADE_BY = (
 )
 
 
-@stage("class map", version=29, made_by=MADE_BY)
+@stage("class map", version=30, made_by=MADE_BY)
 def segment(
     out: Output,
     mosaic: Ref,
     attention: Ref,
+    overview: Ref | None,
     *earlier: Ref,
     gains: PatchGains,
     prior: Prior | None,
@@ -53,12 +55,14 @@ def segment(
     """Segment the mosaic region by region, at full resolution where patches were chosen; nodata pixels have no class.
 
     ``earlier`` are the stores of ``prior``. With ``least_gain``, patches are chosen here, by their expected gain.
+    ``overview`` is that of the first pass, or of the same mosaic: it is read again around new lines.
     Writes class map and class probabilities, and the figures of the prior map.
     """
     work = gains.work
     names = create_maps(out.path, gains, goes_on=prior is not None)
     drawing = Drawing(work.weights, mosaic, attention, gains.capture, prior, gains.zones.left_out, part, spectra)
-    drawn = draw_field(work, drawing, out.path, least_gain, out.report)
+    known = None if overview is None else (overview.path / OVERVIEWS, load_plan(attention).changed)
+    drawn = draw_field(work, drawing, out.path, least_gain, out.report, known)
     if prior is not None and drawn.comparison is not None:
         write_table(out.path / PRIOR_FIGURES, _prior_map_figures(prior, reader, names, drawn.comparison))
     if drawn.reading is not None:

@@ -28,7 +28,13 @@ from spectralzoom.flows.tasks.prior_maps import Prior
 from spectralzoom.models.evaluation.unlike_scenes import STRIDE, SceneSpectra, TrainingSpectra
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.policies import class_errors, gain_of
-from spectralzoom.models.reading.inference import CoarsePass, load_overview, read_coarse_prediction, segment
+from spectralzoom.models.reading.inference import (
+    CoarsePass,
+    CoarsePrediction,
+    load_overview,
+    read_coarse_prediction,
+    segment,
+)
 from spectralzoom.models.reading.prior_map import (
     ClassProbabilities,
     CurrentVisit,
@@ -73,6 +79,7 @@ class Drawing:
     part: bool = False  # whether the scan covers a part of the field; the rest is that of the prior map
     spectra: TrainingSpectra | None = None  # what those of the region are compared with
     choice: GainChoice | None = None  # of the patches that are read in full; None: all that ``attention`` ranks
+    overviews: Path | None = None  # folder with those of some regions, which are not computed again
 
     @property
     def chosen(self) -> NDArray[np.int64]:
@@ -85,10 +92,11 @@ class Drawing:
         mosaic = open_mosaic(self.mosaic.path / "mosaic.zarr")
         chosen = self.chosen
         seen = coarse_region(weights, self.mosaic, region, self.capture)
+        known = None if self.overviews is None else load_overview(overview_file(self.overviews, region), weights)
+        if self.choice is not None or known is not None:
+            seen = read_coarse_prediction(weights, seen, known)
         if self.choice is not None:
-            folder = self.choice.overviews
-            overview = None if folder is None else load_overview(overview_file(folder, region), weights)
-            seen = read_coarse_prediction(weights, seen, overview)
+            assert isinstance(seen, CoarsePrediction)
             gain = gain_of(class_errors(seen)[:, 0], self.choice.class_pixels)
             here = region.numbers_here(chosen)
             chosen = chosen[(here >= 0) & (gain[here] >= self.choice.least_gain)]
@@ -195,7 +203,6 @@ class GainChoice:
     """Choice of patches by their gain: by how frequent the classes are in the field, as its overviews say."""
 
     least_gain: float
-    overviews: Path | None  # folder with those of some regions, which are not computed again
     class_pixels: NDArray[np.float64]  # (class,) expected in those regions
 
 
@@ -231,11 +238,17 @@ class DrawnRegion:
 
 
 def draw_field(
-    field: FieldWork, work: Drawing, path: Path, least_gain: float | None, report: Callable[[float], None]
+    field: FieldWork,
+    work: Drawing,
+    path: Path,
+    least_gain: float | None,
+    report: Callable[[float], None],
+    known: tuple[Path, NDArray[np.intp]] | None = None,
 ) -> Drawn:
     """Draw class map and class probabilities into the stores that were created for them in the folder ``path``.
 
     With ``least_gain``, the full network reads the patches with that gain, among those that the attention ranks.
+    ``known`` are a folder with overviews, and the patches that changed since.
     Raises SettingsError: not even one region at a time fits the memory.
     """
     pool = field.pool_for(work.chosen, len(open_mosaic(work.mosaic.path / "mosaic.zarr").components))
@@ -248,15 +261,19 @@ def draw_field(
         return images.drawn
 
     begun = 0.0
-    with TemporaryDirectory(prefix="overviews-", dir=path) as folder:
+    with TemporaryDirectory(prefix="overviews-", dir=path) as temporary:
+        folder = Path(temporary)
+        if known is not None:
+            field.renew_overviews(work.mosaic, work.capture, folder, *known)
         if least_gain is not None:
             begun = 0.3
-            overviews = Path(folder) if pool.shares_memory else None
-            overview = Scoring(work.weights, work.mosaic, work.capture, GAIN, overviews)
-            some = field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)]
-            found = run_blocks(overview, some, pool, report=lambda done: report(begun * done))
+            some = replace(field, regions=field.regions[:: -(-len(field.regions) // MOST_OVERVIEWS)])
+            some.write_overviews(work.mosaic, work.capture, folder, lambda done: report(0.8 * begun * done))
+            scoring = Scoring(work.weights, work.mosaic, work.capture, folder, GAIN)
+            found = run_blocks(scoring, some.regions, pool, report=lambda done: report(begun * (0.8 + 0.2 * done)))
             class_pixels = np.sum([one[..., 1, :].sum(axis=(0, 1)) for one in found], axis=0)
-            work = replace(work, choice=GainChoice(least_gain, overviews, class_pixels))
+            work = replace(work, choice=GainChoice(least_gain, class_pixels))
+        work = replace(work, overviews=folder)
         parts: list[Drawn] = run_blocks(
             work, field.regions, pool, take=take, report=lambda done: report(begun + (1 - begun) * done)
         )

@@ -5,6 +5,7 @@ A worker gets references to stores, opens them, holds one region in memory, and 
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -23,6 +24,8 @@ from spectralzoom.models.reading.expected_errors import PatchExpectedErrors
 from spectralzoom.models.reading.inference import (
     CoarsePass,
     CoarsePrediction,
+    load_overview,
+    overview_values,
     read_coarse_pass,
     read_coarse_prediction,
     save_overview,
@@ -107,14 +110,28 @@ class MosaicReader:
     weights: WeightsFile
     mosaic: Ref
     capture: LineSpec  # of pixels for which the mosaic has none
+    overviews: Path | None = None  # folder with overviews of regions; None: nothing is known
+
+    def predicted(self, weights: Weights, region: Region) -> CoarsePrediction:
+        """Return the coarse prediction of a region, from its overview where that is known."""
+        seen = coarse_region(weights, self.mosaic, region, self.capture)
+        known = None if self.overviews is None else load_overview(overview_file(self.overviews, region), weights)
+        return read_coarse_prediction(weights, seen, known)
+
+
+class OverviewReader(MosaicReader):
+    """Worker that reads the overview of a region."""
+
+    def __call__(self, region: Region) -> NDArray[np.float32]:
+        """Return features and logits of the region."""
+        return overview_values(self.predicted(self.weights.load(), region))
 
 
 @dataclass(frozen=True)
 class Scoring(MosaicReader):
     """Worker that scores the patches of a region by the coarse prediction."""
 
-    policy: str
-    overviews: Path | None = None  # folder that keeps the overview; None: it is not kept
+    policy: str = GAIN
 
     def __call__(self, region: Region) -> NDArray[np.float64]:
         """Return the scores of the region's own patches, (patch_y, patch_x).
@@ -122,15 +139,11 @@ class Scoring(MosaicReader):
         For ``gain``, which depends on the whole field, their `class_errors`, (patch_y, patch_x, 2, class).
         """
         weights = self.weights.load()
-        scan_pass = coarse_region(weights, self.mosaic, region, self.capture)
         if self.policy in GLANCING_POLICIES:
-            coarse = read_coarse_prediction(weights, scan_pass)
+            coarse = self.predicted(weights, region)
         else:  # the policy needs only the coarse image
-            coarse = CoarsePrediction(
-                scan_pass.grid, scan_pass.columns, np.empty((0, 0, 0), np.float32), origin=scan_pass.origin
-            )
-        if self.overviews is not None and coarse.overview is not None:
-            save_overview(overview_file(self.overviews, region), coarse.overview)
+            seen = coarse_region(weights, self.mosaic, region, self.capture)
+            coarse = CoarsePrediction(seen.grid, seen.columns, np.empty((0, 0, 0), np.float32), origin=seen.origin)
         return region.crop_patches(class_errors(coarse) if self.policy == GAIN else score_patches(self.policy, coarse))
 
 
@@ -145,7 +158,7 @@ class ExpectedErrors(MosaicReader):
     def __call__(self, region: Region) -> PatchExpectedErrors:
         """Return the expected errors of the region's own patches."""
         weights = self.weights.load()
-        coarse = read_coarse_prediction(weights, coarse_region(weights, self.mosaic, region, self.capture))
+        coarse = self.predicted(weights, region)
         with np.errstate(divide="ignore"):
             sure = np.log(region.crop(coarse.probability)) / weights.temperature
         sure -= scipy.special.logsumexp(sure, axis=-1, keepdims=True)
@@ -204,22 +217,60 @@ class FieldWork:
         several = len(self.regions) > 1
         return {"weights": self.weights, "regions": [REGION_PX, HALO_PX] if several else None}
 
-    def score(self, policy: str, mosaic: Ref, capture: LineSpec, report: Report) -> NDArray[np.float64]:
+    def write_overviews(self, mosaic: Ref, capture: LineSpec, folder: Path, report: Report) -> None:
+        """Write the overviews of the regions that a folder lacks. Raises SettingsError: one does not fit the memory."""
+        pool = self.pool_for(NO_PATCHES, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
+
+        def take(region: Region, values: NDArray[np.float32]) -> None:
+            save_overview(overview_file(folder, region), values)
+
+        lacking = [region for region in self.regions if not overview_file(folder, region).exists()]
+        run_blocks(OverviewReader(self.weights, mosaic, capture), lacking, pool, take=take, report=report)
+
+    def renew_overviews(
+        self, mosaic: Ref, capture: LineSpec, folder: Path, before: Path, changed: NDArray[np.integer]
+    ) -> None:
+        """Write overviews of a mosaic into a folder: those of the folder ``before``, read again around new lines.
+
+        ``changed`` (patch,) are those of which the new lines show a part.
+        """
+        weights = self.weights.load()
+        parts = {region: region.part(changed, weights.config.halo_px) for region in self.regions}
+        for region in parts:
+            shutil.copyfile(overview_file(before, region), overview_file(folder, region))
+        region_of = {part: region for region, part in parts.items() if part is not None}
+
+        def take(part: Region, values: NDArray[np.float32]) -> None:
+            region = region_of[part]
+            file = overview_file(folder, region)
+            whole = np.load(file)
+            top, left = part.kept.top - region.read.top, part.kept.left - region.read.left
+            height, width = part.kept.shape
+            whole[..., top : top + height, left : left + width] = values[..., *part.kept_here]
+            save_overview(file, whole)
+
+        pool = self.pool_for(NO_PATCHES, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
+        run_blocks(OverviewReader(self.weights, mosaic, capture), [*region_of], pool, take=take)
+
+    def score(
+        self, policy: str, mosaic: Ref, capture: LineSpec, report: Report, overviews: Path | None = None
+    ) -> NDArray[np.float64]:
         """Return the scores of all patches of the padded grid, (patch_y, patch_x).
 
         Raises SettingsError: one region does not fit the memory.
         """
-        found = self.joined(
-            self._of_regions(Scoring(self.weights, mosaic, capture, policy), mosaic, NO_PATCHES, report)
-        )
+        work = Scoring(self.weights, mosaic, capture, overviews, policy)
+        found = self.joined(self._of_regions(work, mosaic, NO_PATCHES, report))
         return gain_of(found[..., 0, :], found[..., 1, :].sum(axis=(0, 1))) if policy == GAIN else found
 
-    def expected_errors(self, mosaic: Ref, capture: LineSpec, report: Report) -> PatchExpectedErrors:
+    def expected_errors(
+        self, mosaic: Ref, capture: LineSpec, report: Report, overviews: Path | None = None
+    ) -> PatchExpectedErrors:
         """Return the expected errors of the overview of a mosaic, by patch.
 
         Raises SettingsError: one region does not fit the memory.
         """
-        work = ExpectedErrors(self.weights, mosaic, capture)
+        work = ExpectedErrors(self.weights, mosaic, capture, overviews)
         parts: list[PatchExpectedErrors] = self._of_regions(work, mosaic, NO_PATCHES, report)
         shapes = [(*region.kept_patches.shape, *parts[0].wrong.shape) for region in self.regions]
         pixels = self.joined([part.pixels.reshape(shape) for part, shape in zip(parts, shapes, strict=True)])

@@ -42,14 +42,19 @@ class ReadingCosts:
         ]
         return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
 
-    def with_scores(self, patch_index: NDArray[np.integer], policy: str) -> MultiplyAdds:
+    def with_scores(
+        self, patch_index: NDArray[np.integer], policy: str, changed: NDArray[np.integer] | None = None
+    ) -> MultiplyAdds:
         """Count the map and the scores of all patches by the policy.
 
-        Stages share no results of the model, so each computes the overview: ``overview`` counts both.
+        The overview by which patches are scored is computed again around ``changed`` (patch,) patches.
         """
-        drawn = self.of_map(patch_index)
-        readings = 2 if policy in GLANCING_POLICIES else 1
-        return replace(drawn, overview=readings * drawn.overview, score=self.score(policy))
+        done = replace(self.of_map(patch_index), score=self.score(policy))
+        if changed is None or policy not in GLANCING_POLICIES:
+            return done
+        again = [region.part(changed, self.config.halo_px) for region in self._regions]
+        more = sum(multiply_adds(self.config, one.grid, 0, self.bands).overview for one in again if one is not None)
+        return replace(done, overview=done.overview + more)
 
     def score(self, policy: str) -> int:
         """Count the scores of all patches by the policy, without the overview."""

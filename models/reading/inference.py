@@ -171,12 +171,19 @@ def read_coarse_prediction(
         )
 
 
-def save_overview(path: Path, overview: Overview) -> None:
-    """Store features and logits of an overview."""
+def overview_values(seen: CoarsePrediction) -> NDArray[np.float32]:
+    """Return features and logits of the overview of a prediction, (1, feature, y, x)."""
     import torch
 
+    assert seen.overview is not None
+    values: NDArray[np.float32] = torch.cat([seen.overview.features, seen.overview.logits], dim=1).cpu().numpy()
+    return values
+
+
+def save_overview(path: Path, values: NDArray[np.float32]) -> None:
+    """Store features and logits of an overview."""
     content = io.BytesIO()  # an error that numpy has with a file does not say that the disk is full
-    np.save(content, torch.cat([overview.features, overview.logits], dim=1).cpu().numpy())
+    np.save(content, values)
     path.write_bytes(content.getbuffer())
 
 

@@ -98,6 +98,23 @@ class Region:
         inside = (row >= kept.top) & (row < kept.bottom) & (column >= kept.left) & (column < kept.right)
         return np.where(inside, (row - top) * self.grid.patch_shape[1] + column - left, -1)
 
+    def part(self, patch_index: NDArray[np.integer], halo: int) -> Region | None:
+        """Return the smallest region, of whole tokens, that keeps those of the field's patches that this one keeps.
+
+        ``halo`` [px] is read around it. None without such a patch.
+        """
+        here = patch_index[self.numbers_here(patch_index) >= 0]
+        if not here.size:
+            return None
+        step = math.lcm(self.field.patch, TOKEN_PX)
+        row, column = np.divmod(here, self.field.patch_shape[1])
+        cells = Box(
+            *(int(end) * self.field.patch for end in (row.min(), column.min(), row.max() + 1, column.max() + 1))
+        )
+        tokens = cells.over(step)
+        bottom, right = min(tokens.bottom * step, self.kept.bottom), min(tokens.right * step, self.kept.right)
+        return _with_halo(self.field, Box(tokens.top * step, tokens.left * step, bottom, right), halo)
+
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop a (y, x, ...) image of the box that is read to the box that is kept."""
         return image[self.kept_here]
@@ -126,25 +143,21 @@ def plan_regions(
     around a region inside the field, rounded up to whole tokens and patches.
     """
     step = math.lcm(field.patch, TOKEN_PX)
-    margin = -(-halo // step) * step
     down, across = (
         _cuts(size, math.lcm(step, unit), most)
         for size, unit, most in zip((field.height, field.width), shard, most_px, strict=True)
     )
-    return [
-        Region(
-            field,
-            kept=Box(top, left, bottom, right),
-            read=Box(
-                max(top - margin, 0),
-                max(left - margin, 0),
-                min(bottom + margin, field.height),
-                min(right + margin, field.width),
-            ),
-        )
-        for top, bottom in down
-        for left, right in across
-    ]
+    return [_with_halo(field, Box(top, left, bottom, right), halo) for top, bottom in down for left, right in across]
+
+
+def _with_halo(field: SceneGrid, kept: Box, halo: int) -> Region:
+    """Return the region of a box, read with a halo of whole tokens and patches inside the field."""
+    step = math.lcm(field.patch, TOKEN_PX)
+    margin = -(-halo // step) * step
+    low = max(kept.top - margin, 0), max(kept.left - margin, 0)
+    return Region(
+        field, kept, Box(*low, min(kept.bottom + margin, field.height), min(kept.right + margin, field.width))
+    )
 
 
 def _cuts(size: int, unit: int, most: int) -> list[tuple[int, int]]:

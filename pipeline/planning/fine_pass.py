@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -44,6 +44,9 @@ class FinePlan:
     expected_gain: float
     kind: Literal["lines", "full", "scan", "raster"] = "lines"
     reason: str = ""
+    changed: NDArray[np.intp] = field(
+        default_factory=lambda: np.empty(0, np.intp)
+    )  # patches of which lines show a part
 
     @property
     def lines(self) -> int:

@@ -36,7 +36,7 @@ ALL_PX = 96  # a halo that reaches over the whole field
 def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, flags_png: Flags) -> Surveyed:
     """Return a survey of scene.png that keeps the mosaic of the first pass, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
-    with mock.patch("spectralzoom.flows.survey.clear_first_mosaic"):
+    with mock.patch("spectralzoom.flows.survey.clear_intermediate"):
         survey_png(out)
     return plan_survey(open_field(load_settings(None, flags_png(out, budget="0.8")))), out / "stages"
 

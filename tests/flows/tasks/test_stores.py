@@ -14,7 +14,7 @@ import xarray as xr
 import zarr
 
 from spectralzoom.flows.products import Pass, Products
-from spectralzoom.flows.publish.publishing import clear_first_mosaic
+from spectralzoom.flows.publish.publishing import clear_intermediate
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.stages.condense import SignalChoice, components_of
@@ -70,9 +70,9 @@ def test_stores_of_another_run_are_not_cleared(tmp_path: Path, monkeypatch: pyte
         monkeypatch.undo()
         nothing = {"policy": "mask", "mask": str(tmp_path / "nothing.npy")}
         others.append(survey.fn(SurveySettings(**given, **nothing, keep="raw")).folder)
-        clear_first_mosaic(*survey_of)
+        clear_intermediate(*survey_of)
 
-    act_instead(monkeypatch, "clear_first_mosaic", meanwhile)
+    act_instead(monkeypatch, "clear_intermediate", meanwhile)
     one = read_run(survey.fn(SurveySettings(**given, policy="random")).folder)
     archive = Archive.open(tmp_path / "archive")
     assert "raw_fine" in one.products
