@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.publish.class_sentence import class_sentence
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.tasks.scene import TRAINING_SCENE
 from spectralzoom.flows.tasks.scores import format_prediction, format_worst_class
@@ -17,6 +18,7 @@ from spectralzoom.flows.terminal.figures import (
     format_area,
     format_bytes,
     format_count,
+    format_days,
     format_metres,
     format_percent,
     format_points,
@@ -95,21 +97,22 @@ def shown_accuracy(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return {name: value for name, value in accuracy.items() if name not in ("none", "all")}
 
 
-def headline(receipt: Receipt) -> str:
-    """Return the score and the capture time as plain sentences."""
+def headline(receipt: Receipt) -> list[str]:
+    """Return two paragraphs: the classes of the field; the score and the capture time."""
     sentences = [format_score(receipt)]
     if (capture := receipt["savings"].get("capture_s")) is not None:
         done, full = (format_seconds(capture[name]) for name in ("done", "full"))
         sentences.append(f"Capture time: {done} ({format_percent(capture['ratio'])} of the reference, {full}).")
-    return " ".join(sentences)
+    return [*filter(None, [class_sentence(receipt)]), " ".join(sentences)]
 
 
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
-    """Print score, leading savings, their reference, unlike spectra, saturation, lost lines, and a prior map's state.
+    """Print classes, score, leading savings, their reference, unlike spectra, saturation, lost lines, and a prior map.
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
-    console.print(escape(format_score(receipt)))
+    for sentence in filter(None, (class_sentence(receipt), format_score(receipt))):
+        console.print(escape(sentence))
     rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
     cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in rows]
     columns = ("", "this survey", "reference", "fraction")
@@ -175,13 +178,6 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     if unlike := found.get("unlike"):
         rows.insert(0, ("note", _unlike(**unlike)))
     return [(label, words) for label, words in rows if words]
-
-
-def format_days(days: float) -> str:
-    """Return how long ago a capture was."""
-    if days < 1:
-        return f"{24 * days:.1f} hours earlier"
-    return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
 
 
 def _unlike(mean: float, spectra: float) -> str:

@@ -28,14 +28,14 @@ from spectralzoom.flows.settings.values import KEEP_SIGNAL
 from spectralzoom.flows.stage import Row, Stores
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
-from spectralzoom.flows.stages.score import READING, load_plan, read_in_full
+from spectralzoom.flows.stages.score import READING, SCORES, load_plan, read_in_full
 from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.scene import seen_in_training
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
-from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
+from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic, patch_scores
 from spectralzoom.storage.runs import RECEIPT, moment_of
 from spectralzoom.storage.whole_files import to_json
 
@@ -151,18 +151,18 @@ def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[s
 
 def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
     """Return the data of the quicklook, with three bands."""
-    fine = load_plan(products.attention)
-    bands, caption = choose_bands(plan.field.scene.wavelength_nm)
+    field, fine = plan.field, load_plan(products.attention)
+    bands, caption = choose_bands(field.scene.wavelength_nm)
     found = load_class_map(products.class_map.path / "class_map.zarr")
     thin = thinned(found.classes)
-    chosen, choice = None, ""
-    if not plan.passes.plain or plan.chooses:
-        patches = fine.patch_index if not plan.passes.plain else read_in_full(products.attention, products.class_map)
-        what = "Read by the full network" if plan.passes.plain else "Captured again"
-        chosen = pixels_of_patches(plan.field.grid, patches)[thin]
-        choice = f"{what}: {len(patches)} {'patch' if len(patches) == 1 else 'patches'} by {plan.settings.policy}"
+    scale = field.zones.place.scale(field.camera.ifov_rad)
+
+    def chosen(patches: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return by_pixels(field.grid, np.isin(field.grid.every_patch(), patches))[thin]
+
+    reads = field.described.config.corrected
     return QuicklookData(
-        survey=plan.field.name,
+        survey=field.name,
         seed=plan.settings.seed,
         about=fine.reason,
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
@@ -171,18 +171,31 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
         class_names=found.legend.titles,
         class_colours=found.colours,
         confidence=np.ascontiguousarray(found.confidence[thin]),
-        chosen=chosen,
-        choice=choice,
-        truth=plan.field.labels.read(),
+        again=chosen(fine.patch_index) if fine.sweeps else None,
+        read=chosen(read_in_full(products.attention, products.class_map)) if reads else None,
+        gain=_expected_gain(plan, products, second_pass=bool(fine.sweeps), thin=thin),
+        truth=field.labels.read(),
         was=ProbabilityStore(products.class_map.path / "class_probabilities.zarr").old_class(),
+        pixel_m=scale.pixel_m if scale.footprint is None else None,
     )
 
 
-def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which (y, x) pixels of the scene lie in these patches."""
-    patches = np.zeros(grid.patch_shape, bool)
-    patches.ravel()[patch_index] = True
-    return patches.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)[: grid.height, : grid.width]
+def _expected_gain(
+    plan: SurveyPlan, products: Products, *, second_pass: bool, thin: tuple[slice, slice]
+) -> NDArray[np.float32] | None:
+    """Return the expected gain that chose the second pass, else the patches read in full; None if all are alike."""
+    store = products.class_map.path / READING
+    if second_pass or not store.exists():
+        store = products.attention.path / SCORES
+    gain = patch_scores(store).astype(np.float32)
+    known = gain[np.isfinite(gain)]
+    return by_pixels(plan.field.grid, gain.ravel())[thin] if known.size and np.ptp(known) else None
+
+
+def by_pixels(grid: SceneGrid, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of patches (patch,) at the pixels (y, x) of the scene."""
+    rows, columns = (np.arange(size) // grid.patch for size in (grid.height, grid.width))
+    return values.reshape(grid.patch_shape)[np.ix_(rows, columns)]
 
 
 def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: FinePlan) -> Facts:
