@@ -61,9 +61,7 @@ def _words(most: NDArray[np.bool_], *, compass: bool) -> str:
 
 def class_sentence(receipt: Mapping[str, Any]) -> str:
     """Return area and place of the rarest classes and of the largest one; after a prior map the largest changes."""
-    areas = receipt.get("areas")
-    if not areas:
-        return ""
+    areas = receipt["areas"]
     sizes: Mapping[str, float] = areas.get("ha") or areas["px"]
     total = sum(sizes.values())
     if not total:
@@ -83,7 +81,8 @@ def class_sentence(receipt: Mapping[str, Any]) -> str:
         changes = _net_changes(receipt, areas)
         named = [name for name, size in changes.items() if abs(size) >= LEAST_CHANGE * total][:CHANGED]
         if named:
-            signed = {name: f"{'+' if changes[name] > 0 else '-'}{words_of(abs(changes[name]))}" for name in named}
+            show = format_area if "ha" in areas else lambda size: format_percent(size / total)
+            signed = {name: f"{'+' if changes[name] > 0 else '-'}{show(abs(changes[name]))}" for name in named}
             return f"{since}: {'; '.join(f'{spaced(one)} {signed[one]}, now {state_of(one)}' for one in named)}."
         since += " no class has changed. "
     ordered = sorted((name for name in sizes if sizes[name]), key=lambda name: sizes[name])
@@ -95,7 +94,7 @@ def class_sentence(receipt: Mapping[str, Any]) -> str:
 
 
 def _net_changes(receipt: Mapping[str, Any], areas: Mapping[str, Any]) -> dict[str, float]:
-    """Return gain minus loss of each class that changed, [ha] or [px] as its area, the largest first."""
+    """Return gain minus loss of each class that changed, [ha] or [px] as its area; the largest first, gain before loss."""
     pairs = (receipt.get("ground") or {}).get("changes_ha")
     scale = 1.0
     if pairs is None:
@@ -105,4 +104,4 @@ def _net_changes(receipt: Mapping[str, Any], areas: Mapping[str, Any]) -> dict[s
     for size, *_, old, new in pairs:
         found[old] = found.get(old, 0.0) - scale * size
         found[new] = found.get(new, 0.0) + scale * size
-    return dict(sorted(found.items(), key=lambda one: -abs(one[1])))
+    return dict(sorted(found.items(), key=lambda one: (-abs(one[1]), -one[1])))

@@ -142,7 +142,7 @@ class ReceiptFields(_Part):
     prior_map: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan
     lines: Facts | None = None  # sweeps with lines lost, repeated, out of order or invalid
-    areas: dict[str, dict[str, Any]] | None = None  # px of each class; ha if a pixel's size is known; place of most
+    areas: dict[str, dict[str, Any]]  # px of each class; ha if a pixel's size is known; place of most
     ground: Facts | None = None  # with a pose or a placed scene: grid, what changed, what is old
     zones: Facts | None = None  # where zones leave something out: what is kept
     plots: list[Facts] | None = None  # where plots are given: ground, classes, confidence of each

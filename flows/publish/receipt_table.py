@@ -103,7 +103,7 @@ def headline(receipt: Receipt) -> list[str]:
     if (capture := receipt["savings"].get("capture_s")) is not None:
         done, full = (format_seconds(capture[name]) for name in ("done", "full"))
         sentences.append(f"Capture time: {done} ({format_percent(capture['ratio'])} of the reference, {full}).")
-    return [*filter(None, [class_sentence(receipt)]), " ".join(sentences)]
+    return [class_sentence(receipt), " ".join(sentences)]
 
 
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
@@ -111,7 +111,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
-    for sentence in filter(None, (class_sentence(receipt), format_score(receipt))):
+    for sentence in (class_sentence(receipt), format_score(receipt)):
         console.print(escape(sentence))
     rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
     cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in rows]
