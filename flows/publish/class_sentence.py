@@ -94,7 +94,7 @@ def class_sentence(receipt: Mapping[str, Any]) -> str:
 
 
 def _net_changes(receipt: Mapping[str, Any], areas: Mapping[str, Any]) -> dict[str, float]:
-    """Return gain minus loss of each class that changed, [ha] or [px] as its area; the largest first, gain before loss."""
+    """Return gain minus loss of each class that changed, [ha] or [px]; the largest first, and gain before loss."""
     pairs = (receipt.get("ground") or {}).get("changes_ha")
     scale = 1.0
     if pairs is None:

@@ -116,7 +116,10 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
     cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in rows]
     columns = ("", "this survey", "reference", "fraction")
-    console.print(table(columns, cells, whole=columns[1:]))
+    costs = table(columns, cells, whole=columns[1:])
+    costs.show_edge = False  # a blank line below
+    console.print()
+    console.print(costs)
     console.print(escape(format_reference(receipt)))
     shown = {part: receipt[part] for part in ("unlike", "signal", "lines", "prior_map") if receipt.get(part)}
     for name, words in finding_rows(shown):

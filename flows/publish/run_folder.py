@@ -35,7 +35,8 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
-from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic, patch_scores
+from spectralzoom.storage.arrays.layout import open_group, read_array
+from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
 from spectralzoom.storage.runs import RECEIPT, moment_of
 from spectralzoom.storage.whole_files import to_json
 
@@ -187,7 +188,7 @@ def _expected_gain(
     store = products.class_map.path / READING
     if second_pass or not store.exists():
         store = products.attention.path / SCORES
-    gain = patch_scores(store).astype(np.float32)
+    gain = read_array(open_group(store), "score").astype(np.float32)
     known = gain[np.isfinite(gain)]
     return by_pixels(plan.field.grid, gain.ravel())[thin] if known.size and np.ptp(known) else None
 

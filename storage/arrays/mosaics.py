@@ -224,11 +224,6 @@ def chosen_patches(path: Path) -> NDArray[np.int64]:
     return np.flatnonzero(layout.read_array(layout.open_group(path), "rank").ravel() >= 0)
 
 
-def patch_scores(path: Path) -> NDArray[np.float64]:
-    """Return the (patch_y, patch_x) scores of an attention store (IncompleteStoreError: missing or damaged)."""
-    return layout.read_array(layout.open_group(path), "score")
-
-
 def choose_bands(wavelength_nm: NDArray[np.floating]) -> tuple[tuple[int, int, int], str]:
     """Return the bands to show as red, green and blue, and a caption.
 
