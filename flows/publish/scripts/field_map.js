@@ -12,11 +12,11 @@ map.fitBounds(whole, { animate: false });
 document.getElementById("opacity").addEventListener("input", (event) => {
   for (const { title, opacity } of facts.layers.slice(1)) layers[title].setOpacity(opacity * event.target.value / 100);
 });
-// A scale bar of at most 120 px of the screen: the largest 1, 2 or 5 times a power of ten, in m or in px of the field.
+// A scale bar of at most 150 px of the screen: the largest 1, 2 or 5 times a power of ten, in m or in px of the field.
 const scale = L.control({ position: "bottomleft" }), bar = L.DomUtil.create("div", "scale");
 scale.onAdd = () => bar;
 function measure() {
-  const zoom = map.getZoomScale(map.getZoom(), 0), side = pixel ?? 1, most = 120 / zoom * side;
+  const zoom = map.getZoomScale(map.getZoom(), 0), side = pixel ?? 1, most = 150 / zoom * side;
   const power = 10 ** Math.floor(Math.log10(most)), length = power * [5, 2, 1].find((times) => times * power <= most);
   bar.style.width = `${length / side * zoom}px`;
   const [size, unit] = pixel === null ? [1, "px"] : length >= 1000 ? [1000, "km"] : length < 1 ? [0.01, "cm"] : [1, "m"];
