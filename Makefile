@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, survey-rig, test, lint, docs, notebooks, bench, paper, faults, defects, soak, lock.
+# SpectralZoom: setup, survey, survey-rig, picture, test, lint, docs, notebooks, bench, paper, faults, defects, soak, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check 
 # Ask the tools to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey survey-rig test lint docs notebooks bench paper faults defects soak lock
+.PHONY: setup survey survey-rig picture test lint docs notebooks bench paper faults defects soak lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -44,6 +44,11 @@ survey: $(BIN)/.ok
 # Runs a survey through a fake rig, and compares it with the simulated one.
 survey-rig: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/flows/tasks/test_survey_rig.py -k lines_of_the_simulation
+
+# Makes the first picture of README and pages: the quicklook of a field of eight swaths, captured in two passes.
+picture: $(BIN)/.ok
+	folder=$$(mktemp -d); $(BIN)/spectralzoom survey --scene scouting --seed 51 --size 5120x256 --interest 0.0625 --zoom always \
+		--seconds 14 --out $$folder && cp $$folder/runs/*/quicklook.png docs/pictures/survey.png; rm -rf $$folder
 
 # Property tests draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws new ones.
 # Tests start hundreds of processes, so they write bytecode even if the environment disables it.

@@ -72,7 +72,13 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
 
 def _kind_of(panels: QuicklookData) -> object:
     """Return the properties that decide how a picture is drawn, without the values that it shows."""
-    there = panels.truth is None, panels.chosen is None, panels.class_colours is None
+    there = (
+        panels.truth is None,
+        panels.again is None,
+        panels.read is None,
+        panels.gain is None,
+        panels.class_colours is None,
+    )
     holes = bool(np.isnan(panels.rectified).any())
     return "picture", panels.class_map.shape, panels.class_names, there, holes
 

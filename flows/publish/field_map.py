@@ -10,10 +10,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from spectralzoom.flows.publish.quicklook import QuicklookData, data_address, palette_of, thinned, webp
-from spectralzoom.flows.publish.receipt_table import format_days
+from spectralzoom.flows.publish.quicklook import (
+    AGAIN_RGB,
+    READ_RGB,
+    QuicklookData,
+    covered_title,
+    data_address,
+    palette_of,
+    span_title,
+    span_words,
+    stretched,
+    thinned,
+    webp,
+)
 from spectralzoom.flows.tasks.prior_maps import Prior
-from spectralzoom.flows.terminal.figures import format_percent, spaced
+from spectralzoom.flows.terminal.figures import format_days, format_percent, spaced
 from spectralzoom.pipeline.errors import visible
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import class_counts, load_class_map
@@ -21,7 +32,10 @@ from spectralzoom.storage.arrays.mosaics import develop
 
 QUALITY = 80  # of a photograph as WebP
 LEVELS = 50  # of a colour ramp; the next number is transparent
-DIFFERS_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
+DIFFERS_RGB = (196, 38, 46)
+NO_SECOND_PASS = "Captured again: nothing, there was no second pass"
+NO_FULL_NETWORK = "Read in full: nothing, the weights have no full network"
+NO_GAIN = "Expected gain: alike everywhere, or not computed"
 NO_CLASS = "no class, of the field:"  # other fractions of the legend are of the pixels that have one
 RIGHT_RGB, WRONG_RGB = (201, 211, 196), (196, 38, 46)  # of labelled pixels
 
@@ -38,17 +52,23 @@ class MapLayer:
 
 @dataclass(frozen=True)
 class FieldMap:
-    """Content of the map: size (width, height) [px], layers from the lowest up, classes with colour and fraction."""
+    """Content of the map: size (width, height) [px], layers from the lowest up, classes with colour and fraction.
+
+    ``ramps`` are the names of layers of values with those of their dark and bright end.
+    """
 
     size: tuple[int, int]
     layers: Sequence[MapLayer]
     classes: Sequence[dict[str, str]]
+    ramps: Sequence[dict[str, str]] = ()
+    pixel_m: float | None = None  # None: the scale bar is in pixels
 
     @property
     def data(self) -> dict[str, Any]:
         """Return the data for the page's script."""
         return {
             "size": list(self.size),
+            "pixel_m": self.pixel_m,
             "layers": [{**asdict(layer), "title": visible(layer.title)} for layer in self.layers],
         }
 
@@ -73,7 +93,8 @@ def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
     picture = Image.fromarray(np.rint(255 * develop(shown.rectified, shown.caption)).astype(np.uint8))
     layers = [MapLayer(shown.caption.capitalize(), data_address(webp(picture, quality=QUALITY)), shown=True)]
     layers.append(MapLayer("Class map", classes(shown.class_map), shown=True))
-    layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(shown.confidence)))
+    layers.append(MapLayer(span_title("Confidence", shown.confidence), _ramp_address(shown.confidence)))
+    layers += _choices(shown)
     if shown.truth is not None:
         layers.append(MapLayer("Truth", classes(shown.truth)))
         errors = error_address(shown.class_map[thin], shown.truth[thin])
@@ -83,8 +104,6 @@ def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
     if shown.was is not None:
         differs = over_address(shown.was[thin] != UNLABELLED, DIFFERS_RGB)
         layers.append(MapLayer("Captured and differing", differs, opacity=0.8))
-    if shown.chosen is not None:
-        layers.append(MapLayer(shown.choice, over_address(shown.chosen, PATCH_RGB), opacity=0.6))
     counts = class_counts(shown.class_map, len(shown.class_names))
     covered = np.append(counts / max(counts.sum(), 1), 1 - counts.sum() / max(shown.class_map.size, 1))
     rows = [
@@ -92,7 +111,28 @@ def field_map(shown: QuicklookData, prior: Prior | None) -> FieldMap:
         for name, fraction, colour in zip((*shown.class_names, NO_CLASS), covered, palette, strict=False)
         if fraction
     ]
-    return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows)
+    values = {"confidence": shown.confidence, **({} if shown.gain is None else {"expected gain": shown.gain})}
+    ends = {name: span_words(one) for name, one in values.items()}
+    ramps = [{"name": name, "low": low, "high": high} for name, (low, high) in ends.items()]
+    return FieldMap((shown.class_map.shape[1], shown.class_map.shape[0]), layers, rows, ramps, shown.pixel_m)
+
+
+def _choices(shown: QuicklookData) -> list[MapLayer]:
+    """Return the layers of expected gain, second pass and full network; one without data says so in its title."""
+    nothing = over_address(np.zeros((1, 1)))
+    gain = MapLayer(NO_GAIN, nothing)
+    if shown.gain is not None:
+        gain = MapLayer(span_title("Expected gain", shown.gain), _ramp_address(shown.gain))
+    found = [gain]
+    for name, where, colour, without in (
+        ("Read in full", shown.read, READ_RGB, NO_FULL_NETWORK),
+        ("Captured again", shown.again, AGAIN_RGB, NO_SECOND_PASS),
+    ):
+        layer = MapLayer(without, nothing)
+        if where is not None:
+            layer = MapLayer(covered_title(name, where), over_address(where, colour), opacity=0.6)
+        found.append(layer)
+    return found
 
 
 def error_address(class_map: NDArray[np.integer], labels: NDArray[np.integer]) -> str:
@@ -113,11 +153,11 @@ def layer_address(numbers: NDArray[np.integer], colours: ArrayLike) -> str:
 
 
 def _ramp_address(values: NDArray[np.floating]) -> str:
-    """Draw (y, x) values from 0 to 1 from dark to bright; unknown ones are transparent."""
+    """Draw (y, x) values over their own span from dark to bright; unknown ones are transparent."""
     from matplotlib import colormaps
 
     table = np.zeros((LEVELS + 2, 4), np.uint8)
     table[: LEVELS + 1] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, LEVELS + 1)))
     known = np.isfinite(values)
-    levels = np.rint(LEVELS * np.clip(np.where(known, values, 0), 0, 1))
+    levels = np.rint(LEVELS * np.where(known, stretched(values), 0))
     return layer_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)

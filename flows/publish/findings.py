@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Products
+from spectralzoom.flows.publish.class_sentence import main_places
 from spectralzoom.flows.stages.condense import SIGNAL_RECORD
 from spectralzoom.flows.stages.ground import STORE
 from spectralzoom.flows.stages.register import load_registration
@@ -27,7 +28,7 @@ from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
 from spectralzoom.pipeline.ground.zones import figures_of_plot
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, class_counts, load_class_map
-from spectralzoom.storage.arrays.ground_maps import GroundMap, load_ground_map
+from spectralzoom.storage.arrays.ground_maps import GroundMap, load_ground_map, open_image
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import open_mosaic
 from spectralzoom.storage.export.csv_tables import csv_table
@@ -55,7 +56,7 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
         "prior_map": prior,
         "extent": _extent(plan, fine) if plan.part else None,
         "pointing": _pointing(plan, products, fine),
-        "areas": _areas(plan, posed, drawn),
+        "areas": _areas(plan, products, posed, drawn),
         "ground": _ground(plan, products, posed, drawn, {} if prior is None else prior),
         **_zones(plan, drawn),
         **_map(plan, products.class_map, drawn),
@@ -150,14 +151,23 @@ def _corrections(ref: Ref) -> dict[str, Any]:
     }
 
 
-def _areas(plan: SurveyPlan, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
-    """Return pixels of each class, and hectares where a pixel's size is known: with a pose those on the ground."""
+def _areas(plan: SurveyPlan, products: Products, posed: GroundMap | None, drawn: ClassMap) -> dict[str, Any]:
+    """Return pixels of each class, its place, and hectares where a pixel's size is known.
+
+    With a pose, places and hectares are those of the map on the ground.
+    """
     pixels = class_counts(drawn.classes, len(drawn.names)).tolist()
     m2 = None if posed is not None else areas_by_number(plan.field.zones.place, drawn.classes, len(drawn.names))
     hectares = {} if m2 is None else dict(zip(drawn.names, (m2 / M2_PER_HECTARE).tolist(), strict=True))
-    if posed is not None:
+    geobox, classes = plan.field.scene.geobox, drawn.classes
+    if posed is not None and products.ground is not None:
+        geobox = posed.geobox
         hectares = {name: area["ha"] for name, area in posed.areas.items()}
-    return {"px": dict(zip(drawn.names, pixels, strict=True)), **({"ha": hectares} if hectares else {})}
+        stored = open_image(products.ground.path / STORE, "classes")
+        classes = drawn.legend.index(np.concatenate([rows for _, rows in stored.rows()]))
+    found = {"px": dict(zip(drawn.names, pixels, strict=True)), "ha": hectares}
+    found["place"] = main_places(classes, drawn.names, geobox)
+    return {name: figures for name, figures in found.items() if figures}
 
 
 def _ground(

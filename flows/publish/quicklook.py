@@ -1,11 +1,10 @@
-"""Draw the quicklook of a survey as one PNG (field, chosen patches, class map, labels), and parts of pictures."""
+"""Draw the quicklook of a survey as one PNG (field, second pass, class map, labels), and parts of pictures."""
 
 from __future__ import annotations
 
 import base64
 import io
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -37,33 +36,35 @@ STYLE: Any = {
     "savefig.facecolor": "#fbfaf7",
 }
 UNLABELLED_RGB = (219, 219, 214)
-TITLE_LETTERS, CAPTION_LETTERS = 7.5, 9.0  # to an inch of a line
+TITLE_LETTERS, CAPTION_LETTERS = 7.5, 8.5  # to an inch of a line
 LETTER_IN, MARK_IN = 0.15, 0.7  # of the legend
 MOST_LETTERS = 60  # of a class in the legend
-CHOSEN_RGB = (0.0, 0.8, 0.85)
+AGAIN_RGB, READ_RGB = (0, 190, 200), (240, 150, 20)  # captured again, read in full
 
 
 @dataclass(frozen=True)
 class QuicklookData:
-    """Data of the panels, as arrays. Pixels are scene pixels."""
+    """Data of the panels, as arrays. Pixels are scene pixels; (y, x) "thin" are those of `thinned`."""
 
     survey: str
     seed: int
     about: str  # how the field was captured
-    rectified: NDArray[np.floating]  # (y, x, 3) of the pixels `thinned`, NaN where nothing was captured
+    rectified: NDArray[np.floating]  # (y, x, 3) thin, NaN where nothing was captured
     caption: str  # of these three bands, by `choose_bands`
     class_map: NDArray[np.integer]  # (y, x), 255 unlabelled
     class_names: tuple[str, ...]
     class_colours: NDArray[np.integer]  # (class, 3) 0..255
-    confidence: NDArray[np.floating]  # (y, x) 0..1 of the pixels `thinned`, shown without labels
-    chosen: NDArray[np.bool_] | None = None  # (y, x) of the pixels `thinned` in chosen patches; None without a choice
-    choice: str = ""  # what the patches were chosen for
+    confidence: NDArray[np.floating]  # (y, x) thin, 0..1
+    again: NDArray[np.bool_] | None = None  # (y, x) thin, in the second pass; None without one
+    read: NDArray[np.bool_] | None = None  # (y, x) thin, read by the full network; None without one
+    gain: NDArray[np.floating] | None = None  # (y, x) thin, expected of the patch; None if it chose none
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     was: NDArray[np.integer] | None = None  # (y, x) previous class of captured pixels that differ, 255 elsewhere
+    pixel_m: float | None = None  # side of all pixels on the ground; None if it is unknown or varies
 
 
 def draw_quicklook(data: QuicklookData) -> bytes:
-    """Draw the four panels as a PNG of about 1800 x 1400 px."""
+    """Draw the panels, all of one size, as a PNG of about 1800 x 1400 px."""
     import matplotlib as mpl  # after its cache folder is placed
 
     with mpl.rc_context(STYLE):
@@ -71,67 +72,130 @@ def draw_quicklook(data: QuicklookData) -> bytes:
 
 
 _DPI = 100
-_FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked, or stand abreast
+_WIDTH_IN, _HEIGHT_IN, _LEAST_IN = 18.0, 11.0, 12.0  # of all panels together, at most; and of the page
+_GAP_IN, _LINE_IN = 0.15, 0.24  # between panels, and of a line of text
 
 
 def _compose(data: QuicklookData) -> Figure:
     from matplotlib.figure import Figure
 
     height, width = data.class_map.shape
-    tallness = height / width
-    rows, columns = (4, 1) if tallness < _FLAT else (1, 4) if tallness > _TALL else (2, 2)
-    page = min(18.0, 12.5 / tallness) if rows == columns else 18.0
-    panel = min(max(page * tallness / columns, 1.1), 12.0) + 0.55  # with its title
-    figure = Figure(figsize=(page, rows * panel + 1.6), dpi=_DPI, layout="constrained")
+    panels = _panels(data)
+    columns, page = _columns(len(panels), height / width)
+    rows = -(-len(panels) // columns)
+    cell = page / columns - _GAP_IN
+    high = min(cell * height / width, _HEIGHT_IN / rows)
     about = (data.survey, f"{width} × {height} px", data.about, f"seed\u00a0{data.seed}")  # noqa: RUF001
     title = fill("   ·   ".join(filter(None, about)), int(page * TITLE_LETTERS))
-    figure.suptitle(title, x=0.01, ha="left", size=15, weight="bold")
-    for axes, (words, image) in zip(figure.subplots(rows, columns).flat, _panels(data), strict=True):
-        axes.set_anchor("NW")
-        axes.set_title(fill(words, int(page / columns * CAPTION_LETTERS)), loc="left", size=12)
+    captions = [fill(f"{n}  {words}", int(cell * CAPTION_LETTERS)) for n, (words, _) in enumerate(panels, 1)]
+    above = (1 + max(one.count("\n") for one in captions)) * _LINE_IN + _GAP_IN
+    head = (1 + title.count("\n")) * _LINE_IN * 1.3
+    entries = _legend_entries(data)
+    abreast = min(len(entries), max(1, int(page / (LETTER_IN * max(len(name) for name, _ in entries) + MARK_IN))))
+    total = head + rows * (above + high) + (2 - len(entries) // -abreast) * _LINE_IN
+    figure = Figure(figsize=(page, total), dpi=_DPI)
+    figure.suptitle(title, x=0.01, y=1 - 0.08 / total, ha="left", va="top", size=15, weight="bold")
+    for number, (_, image) in enumerate(panels):
+        row, column = divmod(number, columns)
+        left, low = column * (cell + _GAP_IN) + _GAP_IN / 2, total - head - (row + 1) * (above + high)
+        axes = figure.add_axes((left / page, low / total, cell / page, high / total), anchor="NW")
+        axes.set_title(captions[number], loc="left", size=13)
         axes.set(xticks=[], yticks=[])
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         axes.imshow(image, extent=extent, cmap="viridis", vmin=0, vmax=1, interpolation="nearest")
-    _draw_legend(figure, data, page)
+    _draw_legend(figure, entries, abreast)
     return figure
 
 
-def _panels(data: QuicklookData) -> Iterator[tuple[str, NDArray[np.generic]]]:
-    """Yield title and image (y, x) or (y, x, 3) of the four panels."""
+def _columns(count: int, tallness: float) -> tuple[int, float]:
+    """Return the columns of panels that make them largest, and the width of the page [inch]."""
+
+    def width(columns: int) -> float:
+        return min(_WIDTH_IN / columns, _HEIGHT_IN / -(-count // columns) / tallness)
+
+    best = max(range(1, count + 1), key=lambda columns: (round(width(columns), 3), columns))
+    return best, max(_LEAST_IN, best * width(best))
+
+
+def _panels(data: QuicklookData) -> list[tuple[str, NDArray[np.generic]]]:
+    """Return title and image (y, x) or (y, x, 3) of the panels; those without data are left out."""
     rectified = develop(data.rectified, data.caption)
     palette, thin = palette_of(data.class_colours), thinned(data.class_map)
-    confidence = "Confidence of the model, dark 0 to bright 1", data.confidence
-    yield f"1  Field: {data.caption}", rectified
-    if data.chosen is None:
-        yield f"2  {confidence[0]}", confidence[1]
-    else:
-        grey = np.repeat(rectified.mean(axis=-1, keepdims=True), 3, axis=-1)
-        shown = np.where(data.chosen[..., None], (grey + np.array(CHOSEN_RGB)) / 2, grey)
-        yield f"2  {data.choice} (cyan)", shown
-    yield "3  Class map by the model", palette[data.class_map[thin]]
-    if data.truth is None:
-        yield f"4  {confidence[0]} (no labels given)", confidence[1]
-        return
-    labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
-    right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(int(np.count_nonzero(labelled)), 1)
-    words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
-    yield f"4  Labels: {words}", palette[data.truth[thin]]
+    panels: list[tuple[str, NDArray[np.generic]]] = [(f"Field: {data.caption}", rectified)]
+    if data.again is not None:
+        panels.append((covered_title("Captured again", data.again), _tinted(rectified, data.again, AGAIN_RGB)))
+    if data.gain is not None:
+        panels.append((span_title("Expected gain", data.gain), stretched(data.gain)))
+    if data.read is not None:
+        panels.append((covered_title("Read in full", data.read), _tinted(rectified, data.read, READ_RGB)))
+    panels.append(("Class map by the model", palette[data.class_map[thin]]))
+    if data.truth is not None:
+        labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
+        right = np.count_nonzero(labelled & (data.truth == data.class_map)) / max(int(np.count_nonzero(labelled)), 1)
+        words = f"labelled pixels correct: {100 * right:.1f} %" if labelled.any() else "no pixel is labelled"
+        panels.append((f"Labels: {words}", palette[data.truth[thin]]))
+    if data.truth is None or data.again is None:
+        panels.append((span_title("Confidence", data.confidence), stretched(data.confidence)))
+    return panels
 
 
-def _draw_legend(figure: Figure, data: QuicklookData, page: float) -> None:
+def _tinted(picture: NDArray[np.floating], where: NDArray[np.bool_], rgb: tuple[int, int, int]) -> NDArray[np.floating]:
+    grey = np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1)
+    return np.where(where[..., None], (grey + np.array(rgb) / 255) / 2, grey)
+
+
+def covered_title(name: str, where: NDArray[np.bool_]) -> str:
+    """Return the title of a picture of chosen pixels, with their fraction."""
+    return f"{name}: {'the whole field' if where.all() else format_percent(float(where.mean())) + ' of the field'}"
+
+
+def span_title(name: str, values: NDArray[np.floating]) -> str:
+    """Return the title of a picture of `stretched` values, with the values of its ends."""
+    low, high = span_words(values)
+    return f"{name}, dark {low} to bright {high}"
+
+
+def span_words(values: NDArray[np.floating]) -> tuple[str, str]:
+    """Return the ends of the span with two digits; a low end that is next to nothing is 0."""
+    low, high = span_of(values)
+    return "0" if abs(low) < 0.01 * high else f"{low:.2g}", f"{high:.2g}"
+
+
+def span_of(values: NDArray[np.floating]) -> tuple[float, float]:
+    """Return the 1st and 99th percentile of the known values; 0 and 1 without any."""
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, (1, 99)).tolist() if known.size else (0.0, 1.0)
+    return low, high
+
+
+def stretched(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return values as 0..1 over their own `span_of`; unknown ones stay NaN."""
+    low, high = span_of(values)
+    return np.asarray(np.clip((values - low) / ((high - low) or 1.0), 0, 1))
+
+
+def _legend_entries(data: QuicklookData) -> list[tuple[str, NDArray[np.integer]]]:
+    """Return name with fraction, and colour of each class that the map or the labels have."""
+    others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
+    counts = class_counts(data.class_map, len(data.class_names))
+    shown = np.sum([class_counts(image, len(data.class_names)) for image in others], axis=0)
+    words = zip(data.class_names, counts / max(int(counts.sum()), 1), data.class_colours, shown, strict=True)
+    entries = [
+        (f"{spaced(name)[:MOST_LETTERS]}  {format_percent(fraction)}", colour)
+        for name, fraction, colour, is_shown in words
+        if is_shown
+    ]
+    if any((image == UNLABELLED).any() for image in others):
+        entries.append(("unlabelled", np.array(UNLABELLED_RGB)))
+    return entries
+
+
+def _draw_legend(figure: Figure, entries: list[tuple[str, NDArray[np.integer]]], columns: int) -> None:
     from matplotlib.patches import Patch
 
-    counts = class_counts(data.class_map, len(data.class_names))
-    words = zip(data.class_names, map(format_percent, counts / max(int(counts.sum()), 1)), strict=True)
-    names = [f"{spaced(name)[:MOST_LETTERS]}  {fraction}" for name, fraction in words]
-    colours = [*np.asarray(data.class_colours)]
-    others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
-    if any((image == UNLABELLED).any() for image in others):
-        names.append("unlabelled")
-        colours.append(np.array(UNLABELLED_RGB))
-    marks = [Patch(facecolor=tuple(colour / 255), edgecolor="#555555", linewidth=0.6) for colour in colours]
-    columns = max(1, int(page / (LETTER_IN * max(map(len, names)) + MARK_IN)))
-    figure.legend(marks, names, loc="outside lower center", ncol=min(columns, len(names)), frameon=False, fontsize=13)
+    marks = [Patch(facecolor=tuple(colour / 255), edgecolor="#555555", linewidth=0.6) for _, colour in entries]
+    names = [name for name, _ in entries]
+    figure.legend(marks, names, loc="lower center", ncol=columns, frameon=False, fontsize=13)
 
 
 def thinned(image: NDArray[np.generic]) -> tuple[slice, slice]:

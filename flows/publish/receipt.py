@@ -62,6 +62,7 @@ class Savings(_Part):
     lines: Saving | None = None
     samples: Saving | None = None
     capture_s: CaptureSaving | None = None
+    pause_s: float | None = None  # computed between two passes, beside the capture; absent if some of it was found
     patches: Saving | None = None  # absent for weights without a network that reads patches in full
     multiply_adds: MultiplyAddsSaving
 
@@ -145,7 +146,7 @@ class ReceiptFields(_Part):
     prior_map: Facts | None = None  # what became of the prior map
     pointing: Facts | None = None  # where the mirror may look beside the plan
     lines: Facts | None = None  # sweeps with lines lost, repeated, out of order or invalid
-    areas: dict[str, dict[str, float]] | None = None  # px of each class; ha where something says how large a pixel is
+    areas: dict[str, dict[str, Any]]  # px of each class; ha if a pixel's size is known; place of most
     ground: Facts | None = None  # with a pose or a placed scene: grid, what changed, what is old
     zones: Facts | None = None  # where zones leave something out: what is kept
     plots: list[Facts] | None = None  # where plots are given: ground, classes, confidence of each

@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.publish.class_sentence import class_sentence
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.tasks.scene import TRAINING_SCENE
 from spectralzoom.flows.tasks.scores import format_prediction, format_worst_class
@@ -17,6 +18,7 @@ from spectralzoom.flows.terminal.figures import (
     format_area,
     format_bytes,
     format_count,
+    format_days,
     format_metres,
     format_percent,
     format_points,
@@ -31,40 +33,58 @@ from spectralzoom.pipeline.simulator.selection.choice import UNIT_NAMES
 BYTES = ("kept", "captured", "written")
 COST_LABELS: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
     "capture_s": ("capture time", format_seconds),
+    "pause_s": ("pause between passes", format_seconds),
     "multiply_adds": ("multiply-adds", format_count),
     "lines": ("lines", format_count),
     "samples": ("samples on the field", format_count),
     "patches": ("patches read in full", format_count),
     **{name: (f"bytes {name}", format_bytes) for name in BYTES},
 }
-LEADING = ("capture time", "bytes kept", "multiply-adds")  # of the rows, those printed at the end of a survey
+LEADING = (
+    "capture time",
+    "pause between passes",
+    "bytes kept",
+    "multiply-adds",
+)  # of the rows, those printed at the end of a survey
 MOST_NAMED = 4  # changes of class in a row
 SATURATED = "of the spectra have saturated bands; a shorter exposure avoids them"
 
 
 def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return costs and bytes of a run against the reference, one row each, with formatted figures."""
-    data = receipt["data_bytes"]
-    full = data["reference"]
-    of_data = {name: {"done": data[name], "full": full, "ratio": data[name] / full if full else None} for name in BYTES}
-    costs = {**receipt["savings"], **of_data}
-    rows = [
-        {"label": label, "done": show(one["done"]), "full": show(one["full"]), "ratio": one["ratio"]}
-        for name, (label, show) in COST_LABELS.items()
-        if (one := costs.get(name)) is not None
-    ]
+    """Return costs and bytes of a run against the reference, one row each, with formatted figures.
+
+    The reference is the cheapest uniform scan with nearly the best score, if the weights have a table of scans, else
+    the full scan. ``control`` is the uniform scan of the same seconds, if it was measured.
+    """
+    data, reference = receipt["data_bytes"], receipt.get("scans", {}).get("reference")
+    raw = data["reference"] if reference is None else reference["bytes_raw"]
+    full = {**dict.fromkeys(BYTES, raw), **({} if reference is None else {"capture_s": reference["seconds"]})}
+    done = {**receipt["savings"], **{name: {"done": data[name]} for name in BYTES}}
+    rows = []
+    for name, (label, show) in COST_LABELS.items():
+        if (one := done.get(name)) is None:
+            continue
+        one = one if isinstance(one, Mapping) else {"done": one}  # of a pause, which a uniform scan has not
+        most = full.get(name, one.get("full"))
+        row: dict[str, Any] = {"label": label, "done": show(one["done"]), "full": "" if most is None else show(most)}
+        control = receipt.get("control", {}).get(name)
+        row |= {"ratio": one["done"] / most if most else None, "control": "" if control is None else show(control)}
+        rows.append(row)
     return sorted(rows, key=lambda row: LEADING.index(row["label"]) if row["label"] in LEADING else len(LEADING))
 
 
 def format_reference(receipt: Mapping[str, Any]) -> str:
-    """Return a sentence on the reference, and on the cheapest good uniform scan where the weights have a record."""
+    """Return a sentence on the reference, and on the full scan where that is another one."""
     capture = receipt["savings"].get("capture_s", {})
-    lines = f"line at {receipt['settings']['camera']['exposure_ms']:g} ms, stored as captured" if capture else "pixel"
-    words = f"Reference: every {lines}{', every patch read in full' if 'patches' in receipt['savings'] else ''}."
+    read = ", every patch read in full" if "patches" in receipt["savings"] else ""
+    if not capture:
+        return f"Reference: every pixel{read}."
+    lines = f"every line at {receipt['settings']['camera']['exposure_ms']:g} ms"
     if capture.get("uniform") is None:
-        return words
-    scan = f"{format_seconds(capture['uniform'])} ({capture['uniform_scan']})"
-    return f"{words} A uniform scan with nearly the best score takes {scan}."
+        return f"Reference: {lines}, stored as captured{read}."
+    scan = f"the cheapest uniform scan with nearly the best score ({capture['uniform_scan']})"
+    longest = f"{lines[0].upper()}{lines[1:]} takes {format_seconds(capture['full'])}."
+    return f"Reference: {scan}, stored as captured{read}. {longest}"
 
 
 def format_score(receipt: Mapping[str, Any]) -> str:
@@ -86,25 +106,34 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     return "The score is not known: there are no labels."
 
 
-def headline(receipt: Receipt) -> str:
-    """Return the score and the capture time as plain sentences."""
+def headline(receipt: Receipt) -> list[str]:
+    """Return two paragraphs: the classes of the field; the score and the capture time."""
     sentences = [format_score(receipt)]
-    if (capture := receipt["savings"].get("capture_s")) is not None:
-        done, full = (format_seconds(capture[name]) for name in ("done", "full"))
-        sentences.append(f"Capture time: {done} ({format_percent(capture['ratio'])} of the reference, {full}).")
-    return " ".join(sentences)
+    if "capture_s" in receipt["savings"]:
+        row = next(row for row in saving_rows(receipt) if row["label"] == COST_LABELS["capture_s"][0])
+        sentences.append(
+            f"Capture time: {row['done']} ({format_percent(row['ratio'])} of the reference, {row['full']})."
+        )
+    return [class_sentence(receipt), " ".join(sentences)]
 
 
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
-    """Print score, leading savings, their reference, unlike spectra, saturation, lost lines, and a prior map's state.
+    """Print classes, score, leading savings, their reference, unlike spectra, saturation, lost lines, and a prior map.
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
-    console.print(escape(format_score(receipt)))
+    for sentence in (class_sentence(receipt), format_score(receipt)):
+        console.print(escape(sentence))
     rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
-    cells = [[row["label"], row["done"], row["full"], format_percent(row["ratio"])] for row in rows]
-    columns = ("", "this survey", "reference", "fraction")
-    console.print(table(columns, cells, whole=columns[1:]))
+    shown_in = {"this survey": "done", "uniform scan": "control", "reference": "full", "fraction": "ratio"}
+    if "control" not in receipt:
+        del shown_in["uniform scan"]
+    rows = [{**row, "ratio": format_percent(row["ratio"])} for row in rows]
+    cells = [[row["label"], *(row[name] for name in shown_in.values())] for row in rows]
+    costs = table(("", *shown_in), cells, whole=tuple(shown_in))
+    costs.show_edge = False  # a blank line below
+    console.print()
+    console.print(costs)
     console.print(escape(format_reference(receipt)))
     shown = {part: receipt[part] for part in ("unlike", "signal", "lines", "prior_map") if receipt.get(part)}
     for name, words in finding_rows(shown):
@@ -166,13 +195,6 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     if unlike := found.get("unlike"):
         rows.insert(0, ("note", _unlike(**unlike)))
     return [(label, words) for label, words in rows if words]
-
-
-def format_days(days: float) -> str:
-    """Return how long ago a capture was."""
-    if days < 1:
-        return f"{24 * days:.1f} hours earlier"
-    return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
 
 
 def _unlike(mean: float, spectra: float) -> str:

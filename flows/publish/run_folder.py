@@ -28,7 +28,7 @@ from spectralzoom.flows.settings.values import KEEP_SIGNAL
 from spectralzoom.flows.stage import Row, Stores
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
-from spectralzoom.flows.stages.score import READING, load_plan, read_in_full
+from spectralzoom.flows.stages.score import READING, SCORES, load_plan, read_in_full
 from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.scene import seen_in_training
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -36,12 +36,14 @@ from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntr
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.pipeline.planning.uniform_scans import format_scan
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
+from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
 from spectralzoom.storage.runs import RECEIPT, moment_of
 from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
 COSTS_OF_STAGE = ("wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
+BETWEEN_PASSES = ("condense_coarse", "register_coarse", "locate", "rectify", "read_overview", "score")  # stages
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 
@@ -108,7 +110,7 @@ def make_receipt(
         versions=versions(),
         settings={**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)},
         stages=[_stage_row(row) for row in stores.rows.values()],
-        savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)),
+        savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)) | _pause(stores, fine),
         data_bytes=count_bytes(stores, plan, products, fine),
         accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
         training_scene=seen_in_training(field.scene, field.described),
@@ -171,20 +173,27 @@ def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[s
     return {**{name: entry.as_dict() for name, entry in entries.items()}, "capture_s": capture, **of_model}
 
 
+def _pause(stores: Stores, fine: FinePlan) -> dict[str, float]:
+    """Return the seconds of the stages between the passes, if there is a second pass and all of them ran."""
+    spent = [row.wall_s for row in stores.rows.values() if row.name in BETWEEN_PASSES]
+    known = [one for one in spent if one is not None]
+    return {"pause_s": sum(known)} if fine.sweeps and len(known) == len(spent) else {}
+
+
 def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
     """Return the data of the quicklook, with three bands."""
-    fine = load_plan(products.attention)
-    bands, caption = choose_bands(plan.field.scene.wavelength_nm)
+    field, fine = plan.field, load_plan(products.attention)
+    bands, caption = choose_bands(field.scene.wavelength_nm)
     found = load_class_map(products.class_map.path / "class_map.zarr")
     thin = thinned(found.classes)
-    chosen, choice = None, ""
-    if not plan.passes.plain or plan.chooses:
-        patches = fine.patch_index if not plan.passes.plain else read_in_full(products.attention, products.class_map)
-        what = "Read by the full network" if plan.passes.plain else "Captured again"
-        chosen = pixels_of_patches(plan.field.grid, patches)[thin]
-        choice = f"{what}: {len(patches)} {'patch' if len(patches) == 1 else 'patches'} by {plan.settings.policy}"
+    scale = field.zones.place.scale(field.camera.ifov_rad)
+
+    def chosen(patches: NDArray[np.intp]) -> NDArray[np.bool_]:
+        return by_pixels(field.grid, np.isin(field.grid.every_patch(), patches))[thin]
+
+    reads = field.described.config.corrected
     return QuicklookData(
-        survey=plan.field.name,
+        survey=field.name,
         seed=plan.settings.seed,
         about=fine.reason,
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
@@ -193,18 +202,31 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
         class_names=found.legend.titles,
         class_colours=found.colours,
         confidence=np.ascontiguousarray(found.confidence[thin]),
-        chosen=chosen,
-        choice=choice,
-        truth=plan.field.labels.read(),
+        again=chosen(fine.patch_index) if fine.sweeps else None,
+        read=chosen(read_in_full(products.attention, products.class_map)) if reads else None,
+        gain=_expected_gain(plan, products, second_pass=bool(fine.sweeps), thin=thin),
+        truth=field.labels.read(),
         was=ProbabilityStore(products.class_map.path / "class_probabilities.zarr").old_class(),
+        pixel_m=scale.pixel_m if scale.footprint is None else None,
     )
 
 
-def pixels_of_patches(grid: SceneGrid, patch_index: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which (y, x) pixels of the scene lie in these patches."""
-    patches = np.zeros(grid.patch_shape, bool)
-    patches.ravel()[patch_index] = True
-    return patches.repeat(grid.patch, axis=0).repeat(grid.patch, axis=1)[: grid.height, : grid.width]
+def _expected_gain(
+    plan: SurveyPlan, products: Products, *, second_pass: bool, thin: tuple[slice, slice]
+) -> NDArray[np.float32] | None:
+    """Return the expected gain that chose the second pass, else the patches read in full; None if all are alike."""
+    store = products.class_map.path / READING
+    if second_pass or not store.exists():
+        store = products.attention.path / SCORES
+    gain = read_array(open_group(store), "score").astype(np.float32)
+    known = gain[np.isfinite(gain)]
+    return by_pixels(plan.field.grid, gain.ravel())[thin] if known.size and np.ptp(known) else None
+
+
+def by_pixels(grid: SceneGrid, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of patches (patch,) at the pixels (y, x) of the scene."""
+    rows, columns = (np.arange(size) // grid.patch for size in (grid.height, grid.width))
+    return values.reshape(grid.patch_shape)[np.ix_(rows, columns)]
 
 
 def count_bytes(stores: Stores, plan: SurveyPlan, products: Products, fine: FinePlan) -> Facts:

@@ -73,6 +73,13 @@ def format_metres(length: float) -> str:
     return f"{length / 0.001:.3g} mm"
 
 
+def format_days(days: float) -> str:
+    """Return how long ago a capture was."""
+    if days < 1:
+        return f"{24 * days:.1f} hours earlier"
+    return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
+
+
 def format_points(score: float | None) -> str:
     """Return a score of 0..1 in points of 100 with one decimal."""
     return f"{100 * score:.1f}" if _known(score) else DASH

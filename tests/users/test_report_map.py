@@ -45,7 +45,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shown = layer_address(numbers, np.array([[120, 80, 40], [20, 200, 60]], np.uint8))
     layers = [MapLayer("True colour", shown, shown=True), MapLayer("Class map", shown, shown=True)]
     layers.append(MapLayer("Truth", shown, opacity=0.5))
-    field = FieldMap((WIDTH, HEIGHT), layers, [{"name": f"crop{BAD}", "fraction": "50 %", "colour": "#14c83c"}])
+    classes = [{"name": f"crop{BAD}", "fraction": "50 %", "colour": "#14c83c"}]
+    ramps = [{"name": "confidence", "low": "0.6", "high": "1"}]
+    field = FieldMap((WIDTH, HEIGHT), layers, classes, ramps, pixel_m=0.25)
     receipt = make_receipt()
     receipt["survey"] = f"field{BAD}"
     file = io.BytesIO()
@@ -71,6 +73,25 @@ def test_layers_are_switched_on_and_off(opened: Tab) -> None:
     opened.run(f"{BOXES}.filter((one) => !one.checked).forEach((one) => one.click())")
     assert opened.run(SHOWN) == 3
     assert opened.run("document.querySelector('#map img[alt=Truth]').style.opacity") == "0.5"
+
+
+@needs_browser
+def test_the_slider_fades_the_layers_over_the_picture(opened: Tab) -> None:
+    """Each layer keeps its own opacity times that of the slider; the picture below stays."""
+    opened.run("Object.assign(document.getElementById('opacity'), {value: 40}).dispatchEvent(new Event('input'))")
+    assert opened.run("[...document.querySelectorAll('#map img')].map((one) => one.style.opacity)") == ["", "0.4"]
+
+
+@needs_browser
+def test_the_scale_bar_has_the_length_on_the_ground(opened: Tab) -> None:
+    """It is at most 150 px long, and a pixel of the field is 0.25 m."""
+    words, long, field = opened.run(
+        "[bar.textContent, bar.style.width, document.querySelector('#map img').getBoundingClientRect().width]"
+    )
+    assert float(words.removesuffix(" m")) == pytest.approx(
+        0.25 * WIDTH / field * float(long.removesuffix("px")), rel=0.02
+    )
+    assert float(long.removesuffix("px")) <= 150
 
 
 @needs_browser

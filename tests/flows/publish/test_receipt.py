@@ -75,6 +75,7 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         accuracy=accuracy if labels else None,
         effects=[row],
         effects_total=total,
+        areas={"px": {"soil": 1, "bare_weed": 0}},
         zones={},
     )
 
@@ -88,7 +89,7 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
     """Fields are in order, with accuracy or without; non-finite numbers become null, and JSON reads back equal."""
     receipt = make_receipt()
     before = "survey source scene seed started finished versions settings stages savings data_bytes accuracy effects"
-    assert " ".join(receipt) == f"{before} effects_total products"
+    assert " ".join(receipt) == f"{before} effects_total areas products"
     assert set(receipt["savings"]) == {*CAPTURE_COSTS, "patches", "multiply_adds"}
     assert "accuracy" not in make_receipt(labels=False)
     assert check_receipt(json.loads(to_json(receipt))) == receipt
@@ -126,7 +127,7 @@ def test_invalid_fields_are_named(path, wrong):
 def test_maps_without_the_prior_map_are_not_compared() -> None:
     """A visit with a prior map has no comparison on the page."""
     first = make_receipt()
-    for receipt in (first, first | {"prior_map": {"run": "earlier"}}):
+    for receipt in (first, first | {"prior_map": {"run": "earlier", "days": 7.0}}):
         text = page_of(receipt)
         told = [words in text for words in (">small network", ">full network on every")]
         assert told == 2 * [receipt is first]
@@ -140,9 +141,14 @@ def printed(receipt: Receipt, width: int = 100, *, verbose: bool = False) -> str
 
 
 def test_the_summary_of_a_survey_fits_the_terminal():
-    """At most 13 lines of 80 columns give score, seconds, bytes kept and multiply-adds against the reference."""
-    lines = printed(make_receipt(), 80).rstrip().splitlines()
-    assert len(lines) <= 13
+    """Before the report's path, 14 lines of 80 columns give classes, score and costs against the reference."""
+    receipt = make_receipt()
+    hectares = {"water": 0.00476, "track": 0.00764, "tree": 0.00935, "weed": 0.0102, "wheat_b": 0.118}
+    receipt["areas"] = {"ha": hectares, "place": dict.fromkeys(("water", "tree", "weed"), "at the top left")}
+    receipt["savings"]["capture_s"] |= {"uniform": 40.0, "uniform_scan": "every line, 17 ms"}
+    lines = printed(receipt, 80).rstrip().splitlines()
+    assert len(lines) <= 14
+    assert lines[0].startswith("Water 47.6 m² (3.2 % of the field), mostly at the top left; track 76.4 m²")
     assert max(map(len, lines)) <= 80
     told = ("capture time", "104 s", "209 s", "50 %", "bytes kept", "1.5 MB", "multiply-adds", "mIoU 75.0 of 100")
     for words in told:
@@ -176,14 +182,15 @@ def test_a_map_without_labels_has_its_own_estimate(found: dict, words: str):
     assert ("mIoU" in text) == ("Expected" in words)
 
 
-def test_headline_is_one_paragraph_with_the_figures():
-    """It has score, worst class and capture time; without labels it has no score."""
-    assert headline(make_receipt()) == (
+def test_headline_has_the_classes_and_the_figures():
+    """The second paragraph has score, worst class and capture time; without labels it has no score."""
+    assert headline(make_receipt()) == [
+        "Soil 100 % of the field.",
         "mIoU 75.0 of 100 against the labels (93.4 % of pixels correct); the small network alone gives 50.0, the full"
         " network on every patch 87.5. The map's worst class is bare weed with 60.0."
-        " Capture time: 104 s (50 % of the reference, 209 s)."
-    )
-    assert "labels (" not in headline(make_receipt(labels=False))
+        " Capture time: 104 s (50 % of the reference, 209 s).",
+    ]
+    assert "labels (" not in headline(make_receipt(labels=False))[1]
 
 
 def test_page_loads_nothing_from_elsewhere():
@@ -218,7 +225,15 @@ def test_page_has_the_figures_and_the_file_of_the_scene():
     for words in (*figures, "wheat 2 px", "2 of 3 classes are in the labels", "north.mat, source sim, seed 7"):
         assert words in page, words
     assert "9f86d081884c7d65" not in page
-    order = ('class="lead">mIoU 75.0', 'id="field"', 'id="savings"', 'id="accuracy"', 'id="files"')
+    order = (
+        'class="lead">Soil 100 %',
+        "mIoU 75.0",
+        "<figure>",
+        'id="field"',
+        'id="savings"',
+        'id="accuracy"',
+        'id="files"',
+    )
     places = [page.index(words) for words in order]
     assert places == sorted(places)
     receipt = make_receipt(labels=False)
