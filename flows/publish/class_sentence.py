@@ -13,8 +13,8 @@ from spectralzoom.flows.publish.quicklook import thinned
 from spectralzoom.flows.terminal.figures import format_area, format_days, format_percent, spaced
 
 MOST, MORE = 0.7, 0.2  # of a class in a part of the field, and above the fraction of all classes there
-RAREST = 4  # classes of a sentence besides the largest one
-LEAST_CLASS, LEAST_CHANGE = 0.005, 0.001  # of the field; smaller ones are likely errors of the map
+RAREST = 3  # classes of a sentence besides the largest one
+LEAST_CLASS, LEAST_CHANGE = 0.001, 0.001  # of the field; smaller ones are likely errors of the map
 CHANGED = 2  # classes of a sentence on changes
 
 

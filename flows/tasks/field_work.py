@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -234,20 +235,21 @@ class FieldWork:
 
         ``changed`` (patch,) are those of which the new lines show a part.
         """
-        weights = self.weights.load()
-        parts = {region: region.part(changed, weights.config.halo_px) for region in self.regions}
-        for region in parts:
+        halo = self.weights.load().config.halo_px
+        region_of = {part: region for region in self.regions for part in region.parts(changed, halo)}
+        for region in self.regions:
             shutil.copyfile(overview_file(before, region), overview_file(folder, region))
-        region_of = {part: region for region, part in parts.items() if part is not None}
+        lock = Lock()
 
         def take(part: Region, values: NDArray[np.float32]) -> None:
             region = region_of[part]
             file = overview_file(folder, region)
-            whole = np.load(file)
             top, left = part.kept.top - region.read.top, part.kept.left - region.read.left
             height, width = part.kept.shape
-            whole[..., top : top + height, left : left + width] = values[..., *part.kept_here]
-            save_overview(file, whole)
+            with lock:  # parts of one region
+                whole = np.load(file)
+                whole[..., top : top + height, left : left + width] = values[..., *part.kept_here]
+                save_overview(file, whole)
 
         pool = self.pool_for(NO_PATCHES, len(open_mosaic(mosaic.path / "mosaic.zarr").components))
         run_blocks(OverviewReader(self.weights, mosaic, capture), [*region_of], pool, take=take)

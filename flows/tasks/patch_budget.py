@@ -52,8 +52,8 @@ class ReadingCosts:
         done = replace(self.of_map(patch_index), score=self.score(policy))
         if changed is None or policy not in GLANCING_POLICIES:
             return done
-        again = [region.part(changed, self.config.halo_px) for region in self._regions]
-        more = sum(multiply_adds(self.config, one.grid, 0, self.bands).overview for one in again if one is not None)
+        again = [part for region in self._regions for part in region.parts(changed, self.config.halo_px)]
+        more = sum(multiply_adds(self.config, part.grid, 0, self.bands).overview for part in again)
         return replace(done, overview=done.overview + more)
 
     def score(self, policy: str) -> int:

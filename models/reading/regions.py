@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from spectralzoom.models.network.sizes import (
@@ -63,6 +64,11 @@ class Box:
         """Return the cells of ``step`` px that overlap it."""
         return Box(self.top // step, self.left // step, -(-self.bottom // step), -(-self.right // step))
 
+    def times(self, step: int, within: Box) -> Box:
+        """Return the pixels of cells of ``step`` px within another box."""
+        low = max(self.top * step, within.top), max(self.left * step, within.left)
+        return Box(*low, min(self.bottom * step, within.bottom), min(self.right * step, within.right))
+
 
 @dataclass(frozen=True)
 class Region:
@@ -98,22 +104,19 @@ class Region:
         inside = (row >= kept.top) & (row < kept.bottom) & (column >= kept.left) & (column < kept.right)
         return np.where(inside, (row - top) * self.grid.patch_shape[1] + column - left, -1)
 
-    def part(self, patch_index: NDArray[np.integer], halo: int) -> Region | None:
-        """Return the smallest region, of whole tokens, that keeps those of the field's patches that this one keeps.
+    def parts(self, patch_index: NDArray[np.integer], halo: int) -> list[Region]:
+        """Return regions of whole tokens round those of the field's patches that this region keeps.
 
-        ``halo`` [px] is read around it. None without such a patch.
+        Patches that touch are in one of them; ``halo`` [px] is read around each.
         """
-        here = patch_index[self.numbers_here(patch_index) >= 0]
-        if not here.size:
-            return None
         step = math.lcm(self.field.patch, TOKEN_PX)
-        row, column = np.divmod(here, self.field.patch_shape[1])
-        cells = Box(
-            *(int(end) * self.field.patch for end in (row.min(), column.min(), row.max() + 1, column.max() + 1))
-        )
-        tokens = cells.over(step)
-        bottom, right = min(tokens.bottom * step, self.kept.bottom), min(tokens.right * step, self.kept.right)
-        return _with_halo(self.field, Box(tokens.top * step, tokens.left * step, bottom, right), halo)
+        row, column = np.divmod(patch_index[self.numbers_here(patch_index) >= 0], self.field.patch_shape[1])
+        there = np.zeros([-(-side // step) for side in (self.kept.bottom, self.kept.right)], np.bool_)
+        there[row * self.field.patch // step, column * self.field.patch // step] = True
+        groups = scipy.ndimage.find_objects(scipy.ndimage.label(there, np.ones((3, 3)))[0])
+        ends = ((y.start, x.start, y.stop, x.stop) for y, x in groups)
+        boxes = (Box(top, left, bottom, right) for top, left, bottom, right in ends)
+        return [_with_halo(self.field, box.times(step, self.kept), halo) for box in boxes]
 
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Crop a (y, x, ...) image of the box that is read to the box that is kept."""

@@ -48,12 +48,12 @@ def test_places_are_those_of_the_picture_or_of_the_compass(affine: Affine | None
             "Soil 300 m² (0.8 % of the field); weed 0.12 ha (3.0 %), mostly in; tree 0.15 ha (3.8 %); "
             "largest: crop 3.7 ha (92 %).",
         ),
-        ({"px": {"bare_soil": 999, "weed": 1, "tree": 0}}, "Bare soil 100 % of the field."),
+        ({"px": {"bare_soil": 1999, "weed": 1, "tree": 0}}, "Bare soil 100 % of the field."),
         ({"px": {"crop": 0, "weed": 0}}, "No pixel has a class."),
     ],
 )
 def test_the_sentence_has_the_rarest_classes_and_the_largest(areas: dict, words: str) -> None:
-    """Classes of less than 0.5 % of the field are left out; without the size of a pixel there are no areas."""
+    """Classes of less than 0.1 % of the field are left out; without the size of a pixel there are no areas."""
     assert class_sentence({"areas": areas}) == words
 
 
