@@ -71,7 +71,7 @@ def weights_path(settings: Settings) -> Path:
         return Path(str(settings.weights))
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
-            f"--weights is missing: the weights that come with SpectralZoom know farm and scouting only;"
+            f"--weights is missing: the weights that come with SpectralZoom know farm, scouting and trial only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
     return shipped_weights()
