@@ -63,9 +63,14 @@ def survey(settings: SurveySettings) -> RunRef:
     PipelineError : what is wrong, what is allowed, and what to do.
     """
     started = datetime.now(UTC)
+    return carry_out(plan_survey(open_field(settings_of_visit(settings))), started)
+
+
+def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
+    """Run the stages of a planned survey and publish its run; returns and raises as `survey`."""
     observer = current_observer()
-    field = open_field(settings_of_visit(settings))
-    plan = plan_survey(replace(field, source=field.source.saying(observer.say)))
+    field = replace(plan.field, source=plan.field.source.saying(observer.say))
+    plan = replace(plan, field=field)
     archive = Archive.open(plan.settings.out)
     archive.reclaim()  # remove incomplete stores of killed runs
     for note in plan.notes:
