@@ -30,8 +30,10 @@ from spectralzoom.flows.tasks.local_server import (
     wait_until_recorded,
 )
 from spectralzoom.flows.tasks.observer import Observer, observed_by
+from spectralzoom.flows.tasks.scene import farm_refusal
 from spectralzoom.flows.terminal.progress import StageProgress
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
+from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked, remove
 
@@ -90,9 +92,10 @@ def _publish_stored(settings: Settings) -> RunRef | None:
     from spectralzoom.flows.survey import carry_out
 
     started = datetime.now(UTC)
+    if (refused := farm_refusal(settings)) is not None:
+        raise SettingsError(refused)
     plan, stores = dry_run(settings)
-    is_stored = plan.field.refused is None and all(row.state == "cached" for row in stores.rows.values())
-    if not is_stored or "PREFECT_API_URL" in os.environ:
+    if any(row.state != "cached" for row in stores.rows.values()) or "PREFECT_API_URL" in os.environ:
         return None
     if plan.field.raster is not None:  # notes on its unit need values and weights
         plan = plan_survey(open_field(settings))

@@ -141,6 +141,7 @@ class Settings:
     scene: str = stated(
         "farm",
         "Scene: farm or scouting (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others."
+        " A folder of tiles, or tiles/*.tif, is one run a tile on the command line."
         " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
     )
     labels: str | None = stated(
