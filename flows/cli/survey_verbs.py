@@ -67,8 +67,8 @@ class End:
 
 def _survey_one(name: str, requested: Settings, *, alone: bool, tiled: bool, verbose: bool) -> End:
     """Run one survey; an error is printed, and raised if the survey is alone."""
-    from spectralzoom.flows.survey_command import run_survey
     from spectralzoom.flows.cli.tiles import tile_row
+    from spectralzoom.flows.survey_command import run_survey
 
     started = time.perf_counter()
     try:
