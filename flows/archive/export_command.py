@@ -24,6 +24,7 @@ from spectralzoom.flows.archive.export_layers import (
     parse_doses,
     split_names,
 )
+from spectralzoom.flows.archive.export_mosaic import export_mosaic
 from spectralzoom.flows.archive.export_values import check_doses, spectral_layers, write_areas, write_polygons
 from spectralzoom.flows.archive.merged_maps import export_merged
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, Switch, check_outside
@@ -59,7 +60,8 @@ def export(
     Parameters
     ----------
     run
-        The run's name, a folder's below runs, or `latest`, as without one.
+        The run's name, a folder's below runs, or `latest`, as without one. The address of a mosaic below stages, from
+        `survey --until mosaic`, exports its bands and a picture for labelling.
     out
         Folder to export into; it may have other runs of the same archive.
     merge
@@ -67,7 +69,12 @@ def export(
     """
     if merge and (run is not None or products != NO_PRODUCTS):
         raise SettingsError("--merge takes the class maps of all scenes: leave out RUN and flags of products")
-    content = export_merged(archive, out, stderr) if merge else run_export(archive, run, out, stderr, products)
+    if merge:
+        content = export_merged(archive, out, stderr)
+    elif run is not None and run.startswith("stages/"):
+        content = export_mosaic(archive, run, out, stderr)
+    else:
+        content = run_export(archive, run, out, stderr, products)
     if as_json:
         print_json(content)
     return DONE

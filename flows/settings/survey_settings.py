@@ -321,6 +321,12 @@ class Settings:
         )
 
     @property
+    def ends_unread(self) -> bool:
+        """Return whether a survey without weights ends before a network reads its mosaic."""
+        without = self.weights is None and self.scene not in BUILT_IN_SCENES
+        return without and self.until is not None and self.plain
+
+    @property
     def as_taken(self) -> bool:
         """Return whether every line of a recording is used as it was taken: no scan or budget is requested."""
         others = (self.budget, *(getattr(self, name) for name in UNIFORM))
