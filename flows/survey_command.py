@@ -67,7 +67,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
     Inside another flow its tasks become tasks of that flow. Without a stage to make, only the run is published.
     """
-    from spectralzoom.flows.survey import survey  # Prefect takes a second
+    from spectralzoom.flows.survey import survey, survey_field  # Prefect takes a second
 
     asked = SurveySettings.of(settings)
     if not inside_flow() and (run := _publish_stored(settings)) is not None:
@@ -81,7 +81,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
                 return state.result()
         except ServerUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
-    return survey.fn(asked)
+    return survey_field(asked)
 
 
 def _publish_stored(settings: Settings) -> RunRef | None:

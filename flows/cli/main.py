@@ -44,6 +44,7 @@ def main(arguments: list[str] | None = None) -> None:
     # Sums that are split among threads round differently: results of one seed would depend on the number of cores.
     # numpy reads the variable when a verb first imports it.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    os.environ.setdefault("DO_NOT_TRACK", "1")  # Prefect reads it when imported: it sends nothing, and has no notice
     for name in ("stdin", "stdout", "stderr"):
         if (stream := getattr(sys, name)) is None:  # closed: its descriptor must not become that of a file
             setattr(sys, name, open(os.devnull, "r+"))  # noqa: PTH123, SIM115
