@@ -12,7 +12,14 @@ import sys
 
 from cyclopts import App, CycloptsError
 
-from spectralzoom.flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
+from spectralzoom.flows.terminal.processes import (
+    TERMINATED,
+    Terminated,
+    format_failure,
+    place_caches,
+    send_no_analytics,
+    terminable,
+)
 from spectralzoom.flows.terminal.progress import say, stderr
 from spectralzoom.pipeline.errors import SettingsError
 
@@ -44,7 +51,6 @@ def main(arguments: list[str] | None = None) -> None:
     # Sums that are split among threads round differently: results of one seed would depend on the number of cores.
     # numpy reads the variable when a verb first imports it.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    os.environ.setdefault("DO_NOT_TRACK", "1")  # Prefect reads it when imported: it sends nothing, and has no notice
     for name in ("stdin", "stdout", "stderr"):
         if (stream := getattr(sys, name)) is None:  # closed: its descriptor must not become that of a file
             setattr(sys, name, open(os.devnull, "r+"))  # noqa: PTH123, SIM115
@@ -58,6 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: list[str]) -> int:
     """Run the verb, print its error if there is one, and return the exit code."""
     try:
+        send_no_analytics()
         place_caches()  # before numba and matplotlib are imported
         app = build_app(listed={" ".join(arguments[:1]), " ".join(arguments[:2])}.isdisjoint(VERBS))
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
