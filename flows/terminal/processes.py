@@ -96,7 +96,7 @@ def writing(out: Path, flag: str = "--out") -> Iterator[None]:
 
 
 def send_no_analytics() -> None:
-    """Let Prefect send no usage data, and print no notice on them, when it is imported; a variable of the user stays."""
+    """Let Prefect send no usage data and print no notice on them; it reads the variable when it is imported."""
     os.environ.setdefault("DO_NOT_TRACK", "1")
 
 
