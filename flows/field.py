@@ -149,7 +149,11 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
-    model = SurveyModel.open(weights_path(settings), settings.device, planning=planning)
+    model = (
+        SurveyModel.unread()
+        if settings.ends_unread
+        else SurveyModel.open(weights_path(settings), settings.device, planning=planning)
+    )
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
@@ -157,13 +161,13 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     grid = SceneGrid(*scene.shape, model.described.config.patch)
     zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
-    outside = beyond_training(settings, scene, model.described, model.trained_on)
+    outside = beyond_training(settings, scene, model.described, model.trained_on) if model.reads else []
     if raster is not None and not planning:
         raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
-        outside += other_unit(raster, scene.wavelength_nm, model.load())
+        outside += other_unit(raster, scene.wavelength_nm, model.load()) if model.reads else []
     archive = Archive(Path(settings.out).absolute())
     name = settings.name or Path(scene.name).stem
-    label_notes = check_labels(scene, model.described)
+    label_notes = check_labels(scene, model.described) if model.reads else ()
     stated, known = moment_of(settings.visit), moment_of(scene.acquired)
     if stated is not None and known is not None and stated.date() != known.date():
         notes += (f"--visit {settings.visit} is kept, though the file says that it was acquired {scene.acquired}",)
@@ -211,7 +215,7 @@ def _scene_for(
         scene.raster.drawn()
         scene.light()
     basis = model.described.basis
-    if not basis.matrix(scene.wavelength_nm)[1].any():
+    if model.reads and not basis.matrix(scene.wavelength_nm)[1].any():
         raise WeightsError(
             f"the weights {model.path.name} are for {basis.low_nm:.0f}-{basis.high_nm:.0f} nm; the scene's bands lie at"
             f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"

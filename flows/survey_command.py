@@ -7,10 +7,12 @@ import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 
 from rich.console import Console
 from rich.markup import escape
 
+from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.publish.publishing import RunRef
@@ -28,8 +30,10 @@ from spectralzoom.flows.tasks.local_server import (
     wait_until_recorded,
 )
 from spectralzoom.flows.tasks.observer import Observer, observed_by
+from spectralzoom.flows.tasks.scene import farm_refusal
 from spectralzoom.flows.terminal.progress import StageProgress
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
+from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked, remove
 
@@ -41,7 +45,6 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
     """
     gc.collect()
     give_back_freed_memory()  # of a survey before
-    use_one_thread()
     keep_freed_memory()
     with StageProgress(console) as progress:
 
@@ -62,13 +65,15 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
 def _survey(settings: Settings, console: Console) -> RunRef:
     """Run the flow on a server of this process or at PREFECT_API_URL; without Prefect where that fails.
 
-    Inside another flow its tasks become tasks of that flow.
+    Inside another flow its tasks become tasks of that flow. Without a stage to make, only the run is published.
     """
-    from spectralzoom.flows.survey import survey  # Prefect takes a second
+    from spectralzoom.flows.survey import survey, survey_field  # Prefect takes a second
 
     asked = SurveySettings.of(settings)
+    if not inside_flow() and (run := _publish_stored(settings)) is not None:
+        return run
+    use_one_thread()
     if settings.engine != "plain" and not inside_flow():
-        plan_survey(open_field(settings, planning=True))  # errors of the settings before a server starts
         try:
             with _prefect_server(settings.out):
                 state = survey(asked, return_state=True)
@@ -76,7 +81,25 @@ def _survey(settings: Settings, console: Console) -> RunRef:
                 return state.result()
         except ServerUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
-    return survey.fn(asked)
+    return survey_field(asked)
+
+
+def _publish_stored(settings: Settings) -> RunRef | None:
+    """Publish a survey whose stages are all stored; None where one is to be made, or the server of the user records it.
+
+    Raises PipelineError: the settings are refused, before a server starts.
+    """
+    from spectralzoom.flows.survey import carry_out
+
+    started = datetime.now(UTC)
+    if (refused := farm_refusal(settings)) is not None:
+        raise SettingsError(refused)
+    plan, stores = dry_run(settings)
+    if any(row.state != "cached" for row in stores.rows.values()) or "PREFECT_API_URL" in os.environ:
+        return None
+    if plan.field.raster is not None:  # notes on its unit need values and weights
+        plan = plan_survey(open_field(settings))
+    return carry_out(plan, started)
 
 
 @contextmanager

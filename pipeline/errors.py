@@ -147,6 +147,7 @@ class SurveyStopped(Exception):  # noqa: N818 - no error: the settings stop a su
         super().__init__(
             f"stopped after {until}: stored in {archive}/{uri}; the same command without --until goes on, here or on "
             "another machine with a copy of this archive"
+            + (f". To label it: spectralzoom export {archive} {uri} -o FOLDER" if until == "mosaic" else "")
         )
         self.until, self.uri, self.archive = until, uri, archive
 

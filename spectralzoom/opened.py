@@ -18,6 +18,7 @@ from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import LATEST, Archive, damage
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
 
 
@@ -57,6 +58,29 @@ class OpenedArchive(Mapping[str, "OpenedRun"]):
     def latest(self) -> OpenedRun:
         """The run published last. Raises NoRunError without one."""
         return self[LATEST]
+
+    def compare(self, earlier: str, later: str) -> pandas.DataFrame:
+        """Return how much of each class of one run is which class of another one.
+
+        Parameters
+        ----------
+        earlier, later
+            Names of two runs on one grid.
+
+        Returns
+        -------
+        pandas.DataFrame
+            A row for each earlier class and a column for each later one. ``attrs["unit"]`` is ``ha`` if both runs know
+            the size of their pixels, else ``px``. Pixels without a class in one of both are left out.
+
+        Raises
+        ------
+        Error
+            There is no such run, or the grids differ.
+        """
+        from spectralzoom.class_figures import class_changes
+
+        return class_changes(self[earlier], self[later])
 
     def __getitem__(self, name: str) -> OpenedRun:
         if not isinstance(name, str):
@@ -134,6 +158,37 @@ class OpenedRun:
         from spectralzoom.spectra import open_lazy_mosaic
 
         return open_lazy_mosaic(self._place("mosaic"))
+
+    def index(self, name: str) -> xarray.DataArray:
+        """Return a spectral index of the mosaic by its name in Awesome Spectral Indices, (y, x) float32.
+
+        Parameters
+        ----------
+        name
+            Such as ``NDVI``, in any case.
+
+        Returns
+        -------
+        xarray.DataArray
+            NaN where a pixel has no value or is darker than 1 % of white. It is computed when it is used.
+
+        Raises
+        ------
+        Error
+            There is no such index, the mosaic lacks its bands, or its values are not the reflectance that it needs.
+        """
+        from spectralzoom.class_figures import index_map
+
+        return index_map(self._place("mosaic"), self.name, name)
+
+    def spectra(self) -> xarray.Dataset:
+        """Return ``mean`` and ``std`` of the spectra of each mapped class, (class_name, band), and its ``pixels``.
+
+        A class without a pixel has NaN. Pixels without a value in some band are left out.
+        """
+        from spectralzoom.class_figures import class_spectra
+
+        return class_spectra(self._place("mosaic"), self.class_map.values, self.class_map.attrs, self.class_names)
 
     @property
     def lines(self) -> dict[str, xarray.DataArray]:

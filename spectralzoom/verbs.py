@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 import spectralzoom.opened as opened
 from spectralzoom.flows.archive.plan_command import plan_content
 from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.terminal.processes import place_caches
+from spectralzoom.flows.terminal.processes import place_caches, send_no_analytics
 from spectralzoom.flows.terminal.progress import Listener, heard_by, on_stderr
 from spectralzoom.opened import OpenedRun
 from spectralzoom.pipeline.errors import SettingsError
@@ -180,7 +180,8 @@ def _plain(value: Any) -> Any:
 
 @contextmanager
 def _working(progress: Listener | None, *, quiet: bool = True) -> Iterator[Console]:
-    """Set up caches, progress and one BLAS thread as for a command, and yield a console."""
+    """Set up caches, progress, no analytics and one BLAS thread as for a command, and yield a console."""
+    send_no_analytics()
     place_caches()
     console = on_stderr()
     console.quiet = quiet

@@ -24,11 +24,13 @@ from spectralzoom.flows.archive.export_layers import (
     parse_doses,
     split_names,
 )
+from spectralzoom.flows.archive.export_mosaic import export_mosaic
 from spectralzoom.flows.archive.export_values import check_doses, spectral_layers, write_areas, write_polygons
-from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, check_outside
+from spectralzoom.flows.archive.merged_maps import export_merged
+from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, Switch, check_outside
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import print_json, stderr
-from spectralzoom.pipeline.errors import ArchiveError, PipelineError
+from spectralzoom.pipeline.errors import ArchiveError, PipelineError, SettingsError
 from spectralzoom.pipeline.products.indices import find_index
 from spectralzoom.storage.export.image_files import Layer, write_cog
 from spectralzoom.storage.store import Archive
@@ -50,6 +52,7 @@ def export(
     *,
     out: OutFile,
     products: ProductFlags = NO_PRODUCTS,
+    merge: Switch = False,
     as_json: AsJson = False,
 ) -> int:
     """Export a run: maps as GeoTIFF, areas and a STAC catalogue; on request polygons, doses, spectra and indices.
@@ -57,11 +60,21 @@ def export(
     Parameters
     ----------
     run
-        The run's name, a folder's below runs, or `latest`, as without one.
+        The run's name, a folder's below runs, or `latest`, as without one. The address of a mosaic below stages, from
+        `survey --until mosaic`, exports its bands and a picture for labelling.
     out
         Folder to export into; it may have other runs of the same archive.
+    merge
+        The class maps of the newest run of each georeferenced scene as one GeoTIFF, such as those of tiles.
     """
-    content = run_export(archive, run, out, stderr, products)
+    if merge and (run is not None or products != NO_PRODUCTS):
+        raise SettingsError("--merge takes the class maps of all scenes: leave out RUN and flags of products")
+    if merge:
+        content = export_merged(archive, out, stderr)
+    elif run is not None and run.startswith("stages/"):
+        content = export_mosaic(archive, run, out, stderr)
+    else:
+        content = run_export(archive, run, out, stderr, products)
     if as_json:
         print_json(content)
     return DONE

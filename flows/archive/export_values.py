@@ -20,7 +20,14 @@ from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
 from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE
 from spectralzoom.pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at
 from spectralzoom.pipeline.ground.view import GroundView, RigPose
-from spectralzoom.pipeline.products.indices import SpectralIndex, index_values, pick_bands, white_level
+from spectralzoom.pipeline.products.indices import (
+    SAMPLED,
+    SpectralIndex,
+    check_white,
+    index_values,
+    pick_bands,
+    white_level,
+)
 from spectralzoom.storage.arrays.band_order import sort_bands
 from spectralzoom.storage.arrays.class_maps import legend_of
 from spectralzoom.storage.arrays.georeference import grid_of, load_geobox
@@ -33,7 +40,6 @@ from spectralzoom.storage.whole_files import write_whole, written_aside
 
 BYTES_AT_ONCE = 1 << 27
 COLUMNS_AT_ONCE = 640
-SAMPLED = 4  # step in pixels for finding the white level
 GEOPACKAGE, SHAPEFILE = "application/geopackage+sqlite3", "application/vnd.shp"
 PARTS = (".shp", ".shx", ".dbf", ".cpg", ".prj")  # of a shapefile
 EQUAL_AREA = 6933  # EPSG code of a CRS in which areas are true all over the earth
@@ -138,12 +144,7 @@ def spectral_layers(run: ExportedRun, indices: Sequence[SpectralIndex], *, refle
     picked = [pick_bands(index, view.mosaic.wavelength_nm) for index in indices]
     white = white_level(view.mosaic.thinned(SAMPLED, range(len(view.mosaic.wavelength_nm))).reshape(-1))
     for index in indices:
-        if index.wants_reflectance and white != 1.0:
-            raise SettingsError(
-                f"{index.name} wants reflectance (0 to 1), and the values of run {run.id} reach {white:.3g}; choose "
-                "an index of ratios, such as NDVI or PRI, or write the factor to reflectance into the scene.toml "
-                "beside the scene (scale = 0.0001 if 10000 is white) and survey it again"
-            )
+        check_white(index, white, run.id)
     layers = [_reflectance(view, white)] if reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(indices, picked, strict=True)]
 

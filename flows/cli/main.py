@@ -12,7 +12,14 @@ import sys
 
 from cyclopts import App, CycloptsError
 
-from spectralzoom.flows.terminal.processes import TERMINATED, Terminated, format_failure, place_caches, terminable
+from spectralzoom.flows.terminal.processes import (
+    TERMINATED,
+    Terminated,
+    format_failure,
+    place_caches,
+    send_no_analytics,
+    terminable,
+)
 from spectralzoom.flows.terminal.progress import say, stderr
 from spectralzoom.pipeline.errors import SettingsError
 
@@ -57,6 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(arguments: list[str]) -> int:
     """Run the verb, print its error if there is one, and return the exit code."""
     try:
+        send_no_analytics()
         place_caches()  # before numba and matplotlib are imported
         app = build_app(listed={" ".join(arguments[:1]), " ".join(arguments[:2])}.isdisjoint(VERBS))
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)

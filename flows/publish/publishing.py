@@ -13,7 +13,8 @@ from pathlib import Path
 
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Control, Products
-from spectralzoom.flows.publish.receipt_table import finding_rows, headline
+from spectralzoom.flows.publish.receipt import load_receipt
+from spectralzoom.flows.publish.receipt_table import finding_rows, format_score, headline
 from spectralzoom.flows.publish.report import render_markdown
 from spectralzoom.flows.publish.run_folder import Published, publish_run
 from spectralzoom.flows.settings.values import KEEP_SIGNAL
@@ -35,6 +36,11 @@ class RunRef:
     uri: str  # relative to the archive
     folder: Path
     stopped: SurveyStopped | None = None  # at the store of this address, before a run was published
+
+
+def outcome(run: RunRef) -> str:
+    """Return the address and the score of a run in a sentence, or where the survey was stopped."""
+    return str(run.stopped) if run.stopped is not None else f"{run.uri}: {format_score(load_receipt(run.folder))}"
 
 
 def publish(

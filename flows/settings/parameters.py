@@ -94,9 +94,3 @@ class SurveySettings(BaseModel):
         made: SurveySettings = cls.model_construct(**changed)
         made._settings = settings
         return made
-
-    @property
-    def name_of_run(self) -> str:
-        """Return the field's name, or its scene's."""
-        requested = self.settings()
-        return requested.name or Path(requested.scene).stem

@@ -141,7 +141,8 @@ class Settings:
     scene: str = stated(
         "farm",
         "Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and"
-        " others. Pattern for repeated visits: {date:%Y-%m-%d}.tif",
+        " others. A folder of tiles, or tiles/*.tif, is one run a tile on the command line."
+        " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
     )
     labels: str | None = stated(
         None, "Label image on the scene's pixels (class colours or numbers); enables accuracy", example="labels.png"
@@ -318,6 +319,12 @@ class Settings:
         return self.is_map or (
             not self.zooms and (self.as_taken or any(getattr(self, name) is not None for name in UNIFORM))
         )
+
+    @property
+    def ends_unread(self) -> bool:
+        """Return whether a survey without weights ends before a network reads its mosaic."""
+        without = self.weights is None and self.scene not in BUILT_IN_SCENES
+        return without and self.until is not None and self.plain
 
     @property
     def as_taken(self) -> bool:

@@ -36,6 +36,7 @@ OF_SCHEDULES = (  # services that a single survey does not use
 )
 QUIET = {  # no requests to other machines, no output on the terminal; run logs go to the server
     "DO_NOT_SCAN_PATH": "1",
+    "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_UI_V2_ENABLED": "false",
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",

@@ -7,8 +7,11 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from spectralzoom.flows.stage import inside_flow
+from spectralzoom.flows.terminal.figures import format_seconds
+from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.models.network.machine import give_back_freed_memory
 from spectralzoom.storage.arrays.layout import consolidate_stores
 
@@ -53,6 +56,18 @@ def current_observer() -> Observer:
         log_to_run(text)
 
     return replace(terminal, note=note, log=log_to_run)
+
+
+def say_state(flow: Any, flow_run: Any, state: Any) -> None:
+    """Print a line where a run of a deployment starts, ends, fails or crashes, with its message and seconds."""
+    if flow_run.deployment_id is None:  # a survey by hand prints its own progress
+        return
+    if state.is_running():
+        show_text(f"{flow_run.name}: started")
+        return
+    began = flow_run.start_time or state.timestamp
+    seconds = format_seconds((state.timestamp - began).total_seconds())
+    show_text(f"{flow_run.name}: {state.name.lower()} after {seconds}. {state.message or ''}".rstrip())
 
 
 def log_to_run(text: str) -> None:

@@ -14,6 +14,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.flows.settings.load import time_of_visit
 from spectralzoom.flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
 from spectralzoom.flows.tasks.scene import FieldSource, unlit_scene
+from spectralzoom.flows.terminal.figures import known_number
 from spectralzoom.pipeline.capture.recorded import RecordedSource
 from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
 from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
@@ -22,6 +23,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.source import Source
 from spectralzoom.storage.readers.recordings import Recording, find_recorded_run, open_recording
 from spectralzoom.storage.readers.scene_files import load_field_labels
+from spectralzoom.storage.runs import Run
 from spectralzoom.storage.store import stage_key
 
 OFF_CENTRE_PX = 0.5  # least offset of a recorded field that is noted
@@ -75,6 +77,7 @@ class OpenedRecording:
             class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
             geobox=self.geobox,
             acquired=self.recording.acquired,
+            pixel_m=self.recording.pixel_m,
         )
         return scene, (*self.notes, *notes)
 
@@ -105,7 +108,9 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         if camera.exposure_ms != settings.camera.exposure_ms:
             raise SettingsError("camera.exposure_ms is for a camera, and recorded lines have their own: leave it out")
         recording = replace(recording, acquired=time_of_visit(run))
-        geobox = place if of_run == shape and settings.pose is None else None
+        if of_run == shape and settings.pose is None:
+            geobox = place
+            recording = replace(recording, pixel_m=_pixel_of(run))
     settings = replace(settings, camera=camera, size=shape[::-1])
     if settings.as_taken:
         step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
@@ -118,6 +123,12 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     return OpenedRecording(
         settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes), geobox
     )
+
+
+def _pixel_of(run: Run) -> float | None:
+    """Return the side of a pixel on the ground of a run without a pose; None where it knows none."""
+    known = (run.receipt.get("field") or {}).get("ground_pixel_m")
+    return None if run.settings.get("pose") is not None else known_number(known)
 
 
 def _field_shape(

@@ -55,6 +55,20 @@ class SurveyModel:
                 load_reader(path)
         return SurveyModel(path, described, load)
 
+    @staticmethod
+    def unread() -> SurveyModel:
+        """Return the patch size of the shipped weights alone, for a survey that ends before a network reads."""
+        path = shipped_weights()
+        described = describe_weights(path)
+        return SurveyModel(
+            path, Description(described.config, described.basis, (), {}), Once(lambda: load_weights(path))
+        )
+
+    @property
+    def reads(self) -> bool:
+        """Return whether the survey has weights of its own."""
+        return bool(self.described.class_names)
+
     @property
     def trained_on(self) -> TrainedOn | None:
         """Return the record of the training data; None where the weights have none."""
@@ -65,14 +79,15 @@ class SurveyModel:
 def weights_path(settings: Settings) -> Path:
     """Return the file of weights: that of the settings, or the shipped one for built-in scenes.
 
-    Raises SettingsError: there is none for another scene.
+    Raises SettingsError: there is none for another scene. A survey that `Settings.ends_unread` needs none.
     """
     if settings.weights not in (None, *BUILT_IN_SCENES):
         return Path(str(settings.weights))
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know farm, scouting and trial only;"
-            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors. In one pass,"
+            " --until mosaic needs none"
         )
     return shipped_weights()
 

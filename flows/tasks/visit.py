@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
@@ -35,6 +36,20 @@ def due_time() -> datetime | None:
     return datetime.fromisoformat(flow_run.expected_start_time.isoformat()).replace(microsecond=0)
 
 
+def name_of_flow_run() -> str:
+    """Return the name of the present flow run: ``survey``, the field, and the visit if it has a name or a due time."""
+    from prefect.runtime import flow_run
+
+    settings = flow_run.parameters["settings"].settings()
+    due = due_time()
+    visit = settings.visit or (None if due is None else _named(due))
+    return "-".join(["survey", settings.name or Path(settings.scene).stem, *([] if visit is None else [visit])])
+
+
+def _named(due: datetime) -> str:
+    return due.astimezone(UTC).isoformat().replace("+00:00", "Z")
+
+
 def at_due_time(settings: Settings, due: datetime) -> Settings:
     """Return the settings of a scheduled visit: it has the due time as its name and starts from the newest prior map.
 
@@ -44,7 +59,7 @@ def at_due_time(settings: Settings, due: datetime) -> Settings:
     acquired = open_cube_source(settings.scene).acquired if settings.is_map and settings.visit is None else None
     requested = replace(
         settings,
-        visit=settings.visit or acquired or due.astimezone(UTC).isoformat().replace("+00:00", "Z"),
+        visit=settings.visit or acquired or _named(due),
         prior="latest" if settings.prior == "auto" else settings.prior,
     )
     if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:

@@ -95,6 +95,11 @@ def writing(out: Path, flag: str = "--out") -> Iterator[None]:
         raise ArchiveError(f"cannot write to {out}: {error.strerror or error}; choose another {flag}") from error
 
 
+def send_no_analytics() -> None:
+    """Let Prefect send no usage data and print no notice on them; it reads the variable when it is imported."""
+    os.environ.setdefault("DO_NOT_TRACK", "1")
+
+
 NO_HOME = "/nonexistent"  # Debian's name for the home of users without one
 OF_LIBRARIES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib", "PREFECT_HOME": "prefect"}
 

@@ -18,6 +18,7 @@ from spectralzoom.pipeline.errors import SettingsError, WavelengthError
 
 Floats = NDArray[np.float32]
 
+SAMPLED = 4  # step in pixels for finding the white level
 DARK_FRACTION = 0.01  # of white: pixels with a darker mean of bands have no index
 LEAST_REFLECTANCE, MOST_REFLECTANCE = 0.02, 1.5  # of a cube of reflectance the 99th percentile lies between these
 LAMBDA = "lambda"  # prefix of a band's wavelength in a formula
@@ -150,6 +151,16 @@ def index_values(
     with np.errstate(all="ignore"):  # values that are not finite become NaN
         found = np.asarray(index.formula(planes | nm), np.float64)
     return np.asarray(np.where(usable & np.isfinite(found), found, np.nan).astype(np.float32))
+
+
+def check_white(index: SpectralIndex, white: float, run: str) -> None:
+    """Refuse an index that needs reflectance, of values with another white level (SettingsError)."""
+    if index.wants_reflectance and white != 1.0:
+        raise SettingsError(
+            f"{index.name} wants reflectance (0 to 1), and the values of run {run} reach {white:.3g}; choose "
+            "an index of ratios, such as NDVI or PRI, or write the factor to reflectance into the scene.toml "
+            "beside the scene (scale = 0.0001 if 10000 is white) and survey it again"
+        )
 
 
 def white_level(values: NDArray[np.floating]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,6 +14,7 @@ import rasterio.shutil
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from rasterio.errors import RasterioError
+from rasterio.merge import merge
 
 from spectralzoom.pipeline.errors import ArchiveError
 from spectralzoom.storage.arrays.class_maps import ClassNames
@@ -68,6 +69,25 @@ def write_cog(path: Path, image: Layer) -> None:
                 _write_categories(aside / sidecar, image.legend)
     except RasterioError as error:
         raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
+
+
+def merged_layer(layers: Sequence[Layer], scratch: Path) -> Layer:
+    """Return images on one grid as one, the first on top, kept in the folder ``scratch``; other facts of the first."""
+    files = [scratch / f"{number}.tif" for number in range(len(layers))]
+    for file, layer in zip(files, layers, strict=True):
+        _write_plain(file, layer)
+    merged = scratch / "merged.tif"
+    merge(files, dst_path=merged, method="first")
+    with rasterio.open(merged) as found:
+        geobox = GeoBox(found.shape, found.transform, found.crs)
+
+    def rows() -> Rows:
+        with rasterio.open(merged) as found:
+            for first in range(0, found.height, TILE):
+                block = ((first, min(first + TILE, found.height)), (0, found.width))
+                yield first, np.moveaxis(found.read(window=block), 0, -1)
+
+    return replace(layers[0], geobox=geobox, rows=rows)
 
 
 def _check_same(plain: Path, made: Path, path: Path) -> None:

@@ -26,7 +26,7 @@ from spectralzoom.storage.readers.band_facts import Bands
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
-ONE_FILE = "of georeferenced tiles make one file first: rio merge tiles/*.tif field.tif"
+ONE_FILE = "survey tiles one by one (spectralzoom survey), or make one file first: rio merge tiles/*.tif field.tif"
 SPARE_BYTES = 1 << 20  # that a file may claim whatever its size: numbers that are all alike take none
 _GROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 

@@ -156,6 +156,11 @@ def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -
     return found
 
 
+def is_headwall_folder(folder: Path) -> bool:
+    """Return whether a folder has parts of a Headwall camera's cube."""
+    return any(_PART.fullmatch(entry.name) for entry in folder.iterdir())
+
+
 def open_headwall_cube(folder: Path) -> CubeSource:
     """Open the parts of a folder as one cube, in the order of their frames.
 

@@ -40,6 +40,7 @@ class FileCube:
     along: Axis = "x"  # of the field, where the lines lie
     pointing: LinePointing | None = None
     notes: tuple[str, ...] = ()  # on the pointing
+    pixel_m: float | None = None  # side of a pixel on the ground, by positions in metres
 
     @cached_property
     def bad_bands(self) -> NDArray[np.bool_]:

@@ -61,6 +61,7 @@ class Recording:
     notes: tuple[str, ...]
     light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
     acquired: str | None = None  # when the first lines were captured, by files: a day or a moment in UTC, ISO 8601
+    pixel_m: float | None = None  # side of a pixel on the ground, by positions in metres
 
     def key(self) -> dict[str, Any]:
         """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
@@ -195,7 +196,8 @@ def _recording_of(
     light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
     unique = tuple(dict.fromkeys(notes))
     acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
-    return Recording(address, tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, unique, light, acquired)
+    of_bands = bands.wavelength_nm, bands.fwhm_nm
+    return Recording(address, tuple(sweeps), *of_bands, camera, unique, light, acquired, cubes[0].pixel_m)
 
 
 def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -> FileCube:
@@ -233,7 +235,7 @@ def _without_mirror(cube: FileCube, camera: LineCamera) -> tuple[LineCamera, Fil
         if not line_m:
             raise SceneError(f"the lines of {cube.name} do not move; give the positions of a scan")
         notes.append(f"{cube.name}: a pixel is taken to be as long as lines are apart, {line_m:g} m")
-        scan_px = scan_px / line_m
+        scan_px, cube = scan_px / line_m, replace(cube, pixel_m=line_m)
     scan_px = scan_px - (scan_px.min() + scan_px.max()) / 2
     camera = flat_camera(camera, float(np.abs(scan_px).max()))
     pointing = replace(pointing, position=scan_positions(0.0, scan_px, camera))

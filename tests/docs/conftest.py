@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import Survey, WeightsMaker, patchy_scene
-from tests.docs.instrument_files import write_instrument_files
+from tests.docs.instrument_files import write_drone_files, write_instrument_files
 from tests.prior_work import without_effects
 
 CAMERA = "[camera]\nsamples = 320\n"  # narrow, as most time of a small survey goes into samples outside of the field
@@ -54,6 +54,7 @@ def surveyed(
         (folder / f"{file}.toml").write_text(SETTINGS.format(name=name))
     (folder / "camera.toml").write_text(CAMERA)
     write_instrument_files(folder)
+    write_drone_files(folder)
     with without_effects():
         for given in ({"budget": "0.6"}, {"accuracy": False}):
             survey_png(folder / "archive", name="north", **{"camera.samples": 320}, **given)

@@ -1,4 +1,4 @@
-"""Write small files in the published layouts of NEON, PRISMA and PACE, for the page on products."""
+"""Write small files for the pages on products, in the layouts of NEON, PRISMA and PACE, and on drones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from affine import Affine
+
+from tests.conftest import patchy_scene
+from tests.users.test_georeference import NORTH_UP, write_geotiff
+from tests.users.test_recorded_sweeps import write_pushbroom
 
 PRISMA_FIELDS = "HDFEOS/SWATHS/PRS_L2D_HCO/Data Fields"
 
@@ -38,3 +43,16 @@ def write_instrument_files(folder: Path) -> None:
         values.attrs.update({"scale_factor": np.float32(2e-4), "add_offset": np.float32(0), "_FillValue": np.int16(-1)})
         for axis, name in enumerate(("number_of_lines", "pixels_per_line", "wavelength_3d")):
             values.dims[axis].label = name
+
+
+def write_drone_files(folder: Path) -> None:
+    """Write two georeferenced tiles into flight, and a strip of raw lines with its pointing into lines."""
+    (folder / "flight").mkdir()
+    for number in (1, 2):
+        write_geotiff(folder / f"flight/tile_{number}.tif", NORTH_UP * Affine.translation(70 * number, 0))
+    values = (patchy_scene((48, 40), 3, seed=5)[0] * 12 + 60).astype(np.uint16)
+    write_pushbroom(folder / "lines", values)
+    for file in sorted((folder / "lines").iterdir()):
+        file.rename(file.with_name(file.name.replace("scan", "strip")))
+    rows = [f"{0.05 * line:g},{0.02 * line + 0.01:g}" for line in range(48)]
+    (folder / "lines" / "strip.pointing.csv").write_text("\n".join(["position_m,time", *rows]) + "\n")

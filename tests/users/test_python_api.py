@@ -103,6 +103,56 @@ def test_mosaic_and_class_map_share_their_coordinates(run: OpenedRun) -> None:
     assert np.isfinite(joined.values[0, 0]).all()
 
 
+def test_an_index_of_the_mosaic_is_its_formula(run: OpenedRun) -> None:
+    """NGRDI is the difference of green and red over their sum; an index whose bands the cube lacks is an error."""
+    found = run.index("ngrdi")
+    mosaic = run.mosaic.astype(np.float64)
+    red, green = (mosaic.sel(wavelength=nm).values for nm in (640.0, 550.0))
+    assert (found.dims, found.dtype, found.name) == (("y", "x"), np.float32, "NGRDI")
+    np.testing.assert_allclose(found.values, (green - red) / (green + red), atol=1e-6)
+    with pytest.raises(spectralzoom.Error, match=r"NDVI wants .*, and the cube has no such band"):
+        run.index("NDVI")
+
+
+def test_spectra_of_classes_are_their_mean_and_deviation(run: OpenedRun) -> None:
+    """Bands are those of the mosaic; each class has its pixels."""
+    found = run.spectra()
+    classes, mosaic = run.class_map.values, run.mosaic.values.astype(np.float64)
+    assert tuple(found["class_name"].values) == run.class_names
+    np.testing.assert_array_equal(found["wavelength"], run.mosaic["wavelength"])
+    for number, name in enumerate(run.class_names):
+        of = mosaic[classes == number]
+        one = found.sel(class_name=name)
+        assert int(one["pixels"]) == len(of)
+        if len(of):
+            np.testing.assert_allclose(one["mean"], of.mean(axis=0), rtol=1e-6)
+            np.testing.assert_allclose(one["std"], of.std(axis=0), rtol=1e-4, atol=1e-6)
+
+
+def test_two_runs_are_compared_class_by_class(run: OpenedRun, asked: dict[str, object], scene_files: Path) -> None:
+    """Each pair of classes has its hectares on the ground; maps on two grids are refused."""
+    out = run.folder.parents[1]
+    with without_effects():
+        later = spectralzoom.survey(asked | {"policy": "random", "budget": 0.6}, out=out)
+        other = spectralzoom.survey(asked | {"pose": None, "source": "raster", "camera": {}, "budget": None}, out=out)
+        smaller = spectralzoom.survey(asked | {"pose": {**POSE, "tilt_deg": 30}}, out=out)
+    archive = spectralzoom.open(out)
+    changes = archive.compare(run.name, later.name)
+    before, after = (one.ground_map["classes"].values for one in (run, later))
+    assert (changes.attrs["unit"], tuple(changes.index), tuple(changes.columns)) == (
+        "ha",
+        run.class_names,
+        run.class_names,
+    )
+    pixels = np.bincount(before[before < 3] * np.intp(3) + after[before < 3], minlength=9).reshape(3, 3)
+    pixel_ha = abs(float(np.prod([run.ground_map[axis].diff(axis).values[0] for axis in ("y", "x")]))) / 1e4
+    np.testing.assert_allclose(changes.values, pixels * pixel_ha, rtol=2e-3)
+    counted = archive.compare(run.name, other.name)
+    assert (counted.attrs["unit"], int(counted.values.sum())) == ("px", run.class_map.size)
+    with pytest.raises(spectralzoom.Error, match="are on two grids; compare runs of one field"):
+        archive.compare(run.name, smaller.name)
+
+
 def test_the_ground_map_has_its_crs(run: OpenedRun) -> None:
     """The CRS follows rioxarray's convention, and the transform is that of the store."""
     drawn = run.ground_map

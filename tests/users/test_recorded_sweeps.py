@@ -279,6 +279,24 @@ def test_a_straight_scan_is_surveyed_as_a_recording(
     assert published.receipt["recording"]["lines_read"] == 96
 
 
+@pytest.mark.parametrize("column", ["position_m", "position_px"])
+def test_positions_in_metres_give_areas(tmp_path: Path, pushbroom: Pushbroom, weights: Path, column: str) -> None:
+    """A pixel is as long as lines are apart; positions in pixels give no metres."""
+    folder, values = pushbroom
+    known = column == "position_m"
+    table(folder, column, [f"{(0.05 if known else 1.0) * line!r}" for line in range(len(values))])
+    published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
+    receipt = published.receipt
+    again = survey_sweeps(tmp_path / "b", published.folder).receipt  # of the stored lines
+    assert again["field"]["ground_pixel_m"] == receipt["field"]["ground_pixel_m"]
+    assert receipt["field"]["ground_pixel_m"] == (pytest.approx(0.05) if known else None)
+    hectares = receipt["areas"].get("ha")
+    assert (hectares is not None) == known
+    if known:
+        assert receipt["field"]["hectares"] == pytest.approx(64 * 96 * 0.05**2 / 1e4)
+        assert sum(hectares.values()) == pytest.approx(sum(receipt["areas"]["px"].values()) * 0.05**2 / 1e4)
+
+
 def mosaic_of(archive: Path, published: Published) -> NDArray[np.floating]:
     """Return the values of a mosaic as means of 4 x 4 px, without its rim."""
     return block_means(open_mosaic(archive / published.receipt["products"]["mosaic"]).values(), 4)[2:20, 2:14]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -14,7 +15,7 @@ import pytest
 from PIL import Image
 
 from spectralzoom.storage.store import Archive
-from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead, class_map, problems
+from tests.flows.conftest import FEW_BANDS, CommandLine, act_instead, class_map, problems, stages
 
 NM = "460,500,550,600,620,640"
 RAN = "Report: "
@@ -185,8 +186,12 @@ def test_an_interrupted_survey_resumes(
     """Ctrl-C in a stage exits with 130 and one line; the same command then uses the stored lines."""
     monkeypatch.chdir(folder)
     words = survey_words("--budget 0.7 --effects none", str(tmp_path / "archive"))
+
+    def interrupted(*given: Any, **facts: Any) -> None:
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        act_instead(patch, "score", Mock(side_effect=KeyboardInterrupt))
+        act_instead(patch, "score", replace(stages()["score"], build=interrupted))
         ended = command_line(*words)
     assert (ended.code, ended.out) == (130, "")
     assert "interrupted; run the same command to resume" in ended.err

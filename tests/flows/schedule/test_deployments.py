@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -246,5 +247,11 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
         finally:
             process.kill()
     lines = (tmp_path / "said").read_text().splitlines()
-    assert [line.split()[0] for line in lines] == ["serving", "Prefect's", "stopped:"], lines
+    began, ended = (one for one in lines if one.startswith("survey-north-20"))
+    assert [line.split()[0] for line in lines if line not in (began, ended)] == ["serving", "Prefect's", "stopped:"]
+    assert began.endswith("Z: started")
+    wanted = rf"{began.removesuffix('started')}completed after [\d.]+ s\. {re.escape(run.state.message)}"
+    assert re.fullmatch(wanted, ended), ended
+    assert run.name == began.removesuffix(": started")
+    assert re.fullmatch(r"runs/\S+-north: The score is not known: .*", run.state.message)
     assert len(settings_of(tmp_path / "archive")) == 1

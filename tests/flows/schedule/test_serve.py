@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from spectralzoom.flows.cli.serve_command import load_fields, schedule_of, survey_deployment
+from spectralzoom.flows.tasks.observer import say_state
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked
 
@@ -70,6 +78,36 @@ def test_serve_without_a_server_is_refused(
     ended = command_line("serve", field_file(), "--every", "30m", *words)
     ended.refused(2, message.replace(" ", r"\s+"))
     assert "serving" not in ended.err
+
+
+@pytest.mark.parametrize(("deployment", "line"), [("id", "north: failed after 90 s. no such file\n"), (None, "")])
+def test_a_failed_run_of_a_deployment_is_a_line(deployment: str | None, line: str, capfd: Any) -> None:
+    """It has name, seconds and message; a survey by hand prints its own."""
+    from prefect.states import Failed
+
+    state = Failed(message="no such file")
+    run = Mock(deployment_id=deployment, start_time=state.timestamp - timedelta(seconds=90))
+    run.name = "north"
+    say_state(None, run, state)
+    assert capfd.readouterr().err == line
+
+
+def test_prefect_asks_for_no_usage_data(tmp_path: Path) -> None:
+    """At a terminal, the first command prints no notice."""
+    terminal, inside = pty.openpty()
+    kept = {name: text for name, text in os.environ.items() if name not in ("DO_NOT_TRACK", "CI", "GITHUB_ACTIONS")}
+    words = [sys.executable, "-m", "spectralzoom.flows.cli.main", "serve", "--help"]
+    streams = {"stdin": inside, "stdout": inside, "stderr": inside}
+    with subprocess.Popen(words, **streams, env={**kept, "PREFECT_HOME": str(tmp_path), "COLUMNS": "80"}) as process:
+        os.close(inside)
+        said = b""
+        with suppress(OSError):  # Linux: the other end is closed
+            while part := os.read(terminal, 1 << 16):
+                said += part
+        assert process.wait(60) == 0
+    os.close(terminal)
+    assert b"Survey fields on a schedule" in said
+    assert b"usage data" not in said
 
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:

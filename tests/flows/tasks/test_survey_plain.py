@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import re
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -152,6 +154,26 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any,
     assert [finding.problem for finding in verify_everything(archive)] == [None] * (len(STAGES) + 2)
     cleared = ("spool/*", "stages/capture/*/*.zarr", "stages/rectify/*")  # raw lines, mosaic of the first pass
     assert {path.suffix for some in cleared for path in tmp_path.glob(some)} == {".cleared"}
+
+
+IMPORTED = """
+import sys
+from spectralzoom.flows.cli.main import main
+try:
+    main(sys.argv[1:])
+finally:
+    print(*sorted({"torch", "prefect.server"} & sys.modules.keys()))
+"""
+
+
+def test_a_survey_that_finds_every_store_starts_neither_server_nor_network(command_line: Any, tmp_path: Path) -> None:
+    """It publishes another run with Prefect as the engine, and imports neither torch nor the server of Prefect."""
+    asked = ["survey", "--scene", "farm", "--size", "64x64", "--bands", FEW_BANDS, "--out", str(tmp_path)]
+    assert command_line(*asked, "--engine", "plain").code == 0
+    done = subprocess.run([sys.executable, "-c", IMPORTED, *asked], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
+    assert len(Archive.open(tmp_path).runs()) == 2
+    assert not (tmp_path / ".prefect").exists()
 
 
 @pytest.mark.usefixtures("no_effects")

@@ -7,15 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import rasterio
 
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import SurveyStopped
+from spectralzoom.storage.arrays.mosaics import open_mosaic
+from spectralzoom.storage.readers.scene_files import open_scene_file
 from spectralzoom.storage.store import Archive
-from tests.conftest import QUIET
+from tests.conftest import QUIET, patchy_scene
 from tests.flows.conftest import CommandLine
+from tests.users.test_recorded_sweeps import write_pushbroom
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 UNIFORM = {"scan_step": "2", "scan_exposure_ms": "10"}
@@ -52,6 +57,33 @@ def test_a_stopped_survey_goes_on(tmp_path: Path, scan: dict[str, str], engine: 
     assert {ref.uri: ref.path.stat().st_mtime_ns for ref in archive.refs("capture")} == before
     whole = run_survey(replace(asked, out=str(tmp_path / "b")), QUIET)
     assert published.receipt["products"]["class_map"] == whole.receipt["products"]["class_map"]
+
+
+@pytest.mark.parametrize("source", ["recorded", "raster"])
+def test_a_mosaic_for_labelling_needs_no_weights(command_line: CommandLine, tmp_path: Path, source: str) -> None:
+    """The message has the command that exports all bands and a picture, with the pixels of the mosaic."""
+    values = (patchy_scene((96, 64), 3, 3)[0] * 12 + 60).astype(np.uint16)
+    field = write_pushbroom(tmp_path / "drone", values) / "scan.hdr"
+    asked = ("--sweeps", str(field)) if source == "recorded" else ("--scene", str(field))
+    ended = command_line("survey", *asked, "--engine", "plain", "--until", "mosaic", "--out", tmp_path / "a")
+    assert ended.code == 0, ended.err
+    advice = ended.err.replace("\n", " ").rpartition("To label it: spectralzoom ")[2].split()
+    assert "farm.safetensors" not in ended.err
+    exported = command_line(*advice[:-1], tmp_path / "out")
+    assert exported.code == 0, exported.err
+    bands, picture = map(rasterio.open, map(str, sorted((tmp_path / "out").rglob("*.tif"))))
+    assert (bands.count, picture.count, bands.shape, picture.shape) == (3, 3, (96, 64), (96, 64))
+    assert [bands.tags(band)["wavelength"] for band in (1, 2, 3)] == ["460", "550", "640"]
+    (store,) = (tmp_path / "a" / "stages").glob("*/*/mosaic.zarr")
+    np.testing.assert_array_equal(bands.read(1), open_mosaic(store).values(slice(None), slice(None), [2])[..., 0])
+    assert open_scene_file(bands.name).shape == (96, 64)
+
+
+def test_a_map_of_own_sweeps_needs_weights(command_line: CommandLine, tmp_path: Path) -> None:
+    """The message says how to train some, and that a mosaic needs none."""
+    field = write_pushbroom(tmp_path / "drone", np.full((8, 8, 3), 900, np.uint16)) / "scan.hdr"
+    ended = command_line("survey", "--sweeps", str(field), "--engine", "plain", "--out", tmp_path / "a")
+    ended.refused(2, "--weights is missing.*--until mosaic needs none")
 
 
 def test_the_command_says_what_is_stored(command_line: CommandLine, tmp_path: Path) -> None:
