@@ -62,7 +62,6 @@ class Savings(_Part):
     lines: Saving | None = None
     samples: Saving | None = None
     capture_s: CaptureSaving | None = None
-    pause_s: float | None = None  # computed between two passes, beside the capture; absent if some of it was found
     patches: Saving | None = None  # absent for weights without a network that reads patches in full
     multiply_adds: MultiplyAddsSaving
 

@@ -46,6 +46,7 @@ LEADING = (
     "bytes kept",
     "multiply-adds",
 )  # of the rows, those printed at the end of a survey
+BETWEEN_PASSES = ("condense_coarse", "register_coarse", "locate", "rectify", "read_overview", "score")  # stages
 MOST_NAMED = 4  # changes of class in a row
 SATURATED = "of the spectra have saturated bands; a shorter exposure avoids them"
 
@@ -60,17 +61,25 @@ def saving_rows(receipt: Mapping[str, Any]) -> list[dict[str, Any]]:
     raw = data["reference"] if reference is None else reference["bytes_raw"]
     full = {**dict.fromkeys(BYTES, raw), **({} if reference is None else {"capture_s": reference["seconds"]})}
     done = {**receipt["savings"], **{name: {"done": data[name]} for name in BYTES}}
+    if (pause_s := pause_seconds(receipt)) is not None:
+        done["pause_s"] = {"done": pause_s}
     rows = []
     for name, (label, show) in COST_LABELS.items():
         if (one := done.get(name)) is None:
             continue
-        one = one if isinstance(one, Mapping) else {"done": one}  # of a pause, which a uniform scan has not
         most = full.get(name, one.get("full"))
         row: dict[str, Any] = {"label": label, "done": show(one["done"]), "full": "" if most is None else show(most)}
         control = receipt.get("control", {}).get(name)
         row |= {"ratio": one["done"] / most if most else None, "control": "" if control is None else show(control)}
         rows.append(row)
     return sorted(rows, key=lambda row: LEADING.index(row["label"]) if row["label"] in LEADING else len(LEADING))
+
+
+def pause_seconds(receipt: Mapping[str, Any]) -> float | None:
+    """Return the wall time of the stages between two passes; None for one pass, or if some were found."""
+    spent = {one["name"]: one["wall_s"] for one in receipt["stages"]}
+    between = [wall_s for name, wall_s in spent.items() if name in BETWEEN_PASSES]
+    return sum(between) if "capture_fine" in spent and None not in between else None
 
 
 def format_reference(receipt: Mapping[str, Any]) -> str:

@@ -43,7 +43,6 @@ from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"
 COSTS_OF_STAGE = ("wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
-BETWEEN_PASSES = ("condense_coarse", "register_coarse", "locate", "rectify", "read_overview", "score")  # stages
 LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 
@@ -110,7 +109,7 @@ def make_receipt(
         versions=versions(),
         settings={**anchor_paths(plan.settings.to_dict(), Path.cwd()), "notes": list(plan.notes)},
         stages=[_stage_row(row) for row in stores.rows.values()],
-        savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)) | _pause(stores, fine),
+        savings=_savings(plan, fine, read_in_full(products.attention, products.class_map)),
         data_bytes=count_bytes(stores, plan, products, fine),
         accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
         training_scene=seen_in_training(field.scene, field.described),
@@ -171,13 +170,6 @@ def _savings(plan: SurveyPlan, fine: FinePlan, read: NDArray[np.intp]) -> dict[s
     if (uniform := plan.scans.reference) is not None:  # the cheapest scan with nearly the best score
         capture |= {"uniform": uniform.seconds, "uniform_scan": uniform.summary}
     return {**{name: entry.as_dict() for name, entry in entries.items()}, "capture_s": capture, **of_model}
-
-
-def _pause(stores: Stores, fine: FinePlan) -> dict[str, float]:
-    """Return the seconds of the stages between the passes, if there is a second pass and all of them ran."""
-    spent = [row.wall_s for row in stores.rows.values() if row.name in BETWEEN_PASSES]
-    known = [one for one in spent if one is not None]
-    return {"pause_s": sum(known)} if fine.sweeps and len(known) == len(spent) else {}
 
 
 def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
