@@ -150,11 +150,12 @@ class Fit:
 def pixel_weights(labels: Labels) -> Floats:
     """Return the weight of each pixel, 1 in the mean: a class counts by the root of its number of pixels.
 
-    mIoU counts each class once, so that a class of a few pixels decides as much as one of hundreds. Equal weights of
-    classes would leave the choice to a few pixels.
+    mIoU counts each class once. Equal weights of pixels would lose small classes. Equal weights of classes would leave
+    the choice to a few pixels.
     """
-    weights = 1 / np.sqrt(np.maximum(np.bincount(labels), 1))[labels]
-    return weights / weights.mean()
+    weights: Floats = 1 / np.sqrt(np.maximum(np.bincount(labels), 1))[labels]
+    weights /= weights.mean()
+    return weights
 
 
 def _of_classes(slope: Floats, offset: Floats, known: NDArray[np.intp], classes: int) -> tuple[Floats, Floats]:
