@@ -124,8 +124,10 @@ class Fit:
     def of(cls, candidate: Candidate, features: Floats, labels: Labels) -> Fit:
         """Fit a candidate to (pixel, feature) values."""
         middle, spread = features.mean(axis=0), np.maximum(features.std(axis=0), 1e-6)
+        model = candidate.make()
+        weighted = {"sample_weight": pixel_weights(labels)} if isinstance(model, LogisticRegression) else {}
         with warnings.catch_warnings(action="ignore", category=UserWarning):  # not converged; a class of one pixel
-            return cls(candidate.make().fit((features - middle) / spread, labels), middle, spread)
+            return cls(model.fit((features - middle) / spread, labels, **weighted), middle, spread)
 
     def predict(self, features: Floats, classes: int) -> Floats:
         """Return probabilities (pixel, class)."""
@@ -143,6 +145,17 @@ class Fit:
             last = _of_classes(self.fitted.coefs_[1].T, self.fitted.intercepts_[1], known, classes)
             _write(part.last, *last)
         _write(part.first, slope / self.spread, offset - slope @ (self.middle / self.spread))
+
+
+def pixel_weights(labels: Labels) -> Floats:
+    """Return the weight of each pixel, 1 in the mean: a class counts by the root of its number of pixels.
+
+    mIoU counts each class once. Equal weights of pixels would lose small classes. Equal weights of classes would leave
+    the choice to a few pixels.
+    """
+    weights: Floats = 1 / np.sqrt(np.maximum(np.bincount(labels), 1))[labels]
+    weights /= weights.mean()
+    return weights
 
 
 def _of_classes(slope: Floats, offset: Floats, known: NDArray[np.intp], classes: int) -> tuple[Floats, Floats]:
@@ -346,9 +359,9 @@ def _in_context(
 
 
 def _likelihood(total: Floats, labels: Labels) -> float:
-    """Return the mean logarithm of the probability of a pixel's own class, of (pixel, class) in proportion."""
+    """Return the weighted mean logarithm of the probability of a pixel's own class, of (pixel, class) in proportion."""
     of_labels = total[np.arange(len(total)), labels] / total.sum(axis=1)
-    return float(np.log(np.maximum(of_labels, LEAST_CHANCE)).mean())
+    return float((pixel_weights(labels) * np.log(np.maximum(of_labels, LEAST_CHANCE))).mean())
 
 
 def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught) -> tuple[dict[str, int], Floats]:

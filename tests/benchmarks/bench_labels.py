@@ -2,8 +2,8 @@
 
 Ours runs through `train_weights` on files, and reads every patch of the test scenes. The peers are linear
 discriminants, a logistic regression and 100 extra trees of single spectra, with the settings of scikit-learn.
-Whichever of them the test labels favour is the one compared. The method was chosen on splits of seeds 0 to 2. The seeds
-here were named afterwards and used once.
+Whichever of them the test labels favour is the one compared. The method was chosen on splits of seeds 0 to 29. The
+seeds here were named afterwards and used once. Indian Pines has one disjoint split, which the choice used too.
 `bench_labels.py SET ...` runs some of the sets. Set OMP_NUM_THREADS=1.
 """
 
@@ -41,15 +41,15 @@ from spectralzoom.models.weights.files import load_weights
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
-SEEDS = 11, 12, 13  # of splits; nothing was chosen by them
-TRAININGS = 0, 1, 2  # seeds of the training, for a split that is given
+SEEDS = 51, 52, 53  # of splits; nothing was chosen by them
+TRAININGS = 3, 4, 5  # seeds of the training, for a split that is given
 MASK_CLASSES = (2, 3, 5, 6, 8, 10, 11, 12, 14, 1, 4, 7, 9, 13, 15, 16)  # Indian Pines: classes by the mask's numbers
 WATER_BANDS = (*range(104, 109), *range(150, 164), 220)  # Indian Pines: bands that its file lacks, counted from 1
 UNMIXED = {"Jasper": "JasperRidge2_R198", "Samson": "Samson"}  # files
 PEER_PIXELS = 40_000  # to fit to, at most
 OTHER = np.uint8(UNLABELLED)
 MEAN, WORST = 5.0, -1.8  # goals of the differences [points]
-PINES_OVERALL = 87.9, 87.0, 86.8  # goals by seed [%]
+PINES_OVERALL = 87.9, 87.0, 86.8  # goals of the three [%]
 TILES_MIOU = 33.8  # goal of all 20 tiles together
 FRAMES_MIOU, FRAMES_S = 74.3, 180  # goals of 12 frames: mean over the splits, and processor time
 TILES_S = 40  # goal for 12 tiles of 32 px
@@ -129,7 +129,7 @@ def _of_pines() -> list[Row]:
     short = ours(_small_tiles())
     return [
         Row(
-            "Indian Pines, disjoint, seeds 0 to 2: overall",
+            "Indian Pines, disjoint, three trainings: overall",
             f"{overall}",
             f"{PINES_OVERALL}",
             all(found >= goal for found, goal in zip(overall, PINES_OVERALL, strict=True)),

@@ -26,6 +26,7 @@ from spectralzoom.models.training.mixture import (
     Mixed,
     fit_mixture,
     folds_of,
+    pixel_weights,
 )
 from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.errors import SceneError
@@ -188,6 +189,28 @@ def test_as_few_pixels_as_classes_are_refused() -> None:
     values, labels = _scenes(1, 3)[0]
     with pytest.raises(SceneError, match="3 labelled pixels of 3 classes are too few"):
         _fitted([(values, _few(labels, 1))], 3)
+
+
+@given(counts=st.lists(st.integers(1, 400), min_size=1, max_size=6), seed=SEEDS)
+def test_a_class_counts_by_the_root_of_its_pixels(counts: list[int], seed: int) -> None:
+    """The weights of a class sum in proportion to the root of its count; equal counts change nothing."""
+    labels = np.random.default_rng(seed).permutation(np.repeat(2 * np.arange(len(counts)), counts)).astype(np.uint8)
+    weights = pixel_weights(labels)
+    assert weights.mean() == pytest.approx(1)
+    shares = np.bincount(labels, weights)[::2] / len(labels)
+    np.testing.assert_allclose(shares, np.sqrt(counts) / np.sqrt(counts).sum())
+
+
+@pytest.mark.parametrize("name", [one for one in KINDS if "LR" in one])
+def test_a_class_of_four_pixels_is_found(name: str) -> None:
+    """Weights by roots find most of a class of four pixels beside one of 400; equal pixels lose most of it."""
+    rng = np.random.default_rng(5)
+    labels, truth = np.repeat(np.uint8([0, 1]), [400, 4]), np.repeat(np.uint8([0, 1]), 1000)
+    features, seen = (rng.normal(0, 1, (len(one), 4)) + 1.3 * one[:, None] for one in (labels, truth))
+    right = Fit.of(KINDS[name], features, labels).predict(seen, 2).argmax(axis=1) == truth
+    plain = KINDS[name].make().fit(features, labels).predict(seen) == truth
+    assert plain[truth == 1].mean() < 0.5 < right[truth == 1].mean()
+    assert right[truth == 0].mean() > 0.9
 
 
 def test_textures_are_told_by_their_surroundings() -> None:
