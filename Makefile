@@ -37,7 +37,7 @@ $(BIN)/.ok: pyproject.toml constraints.txt | $(BIN)/.pip $(if $(filter-out setup
 		--out $$small/archive > $$small/log 2>&1 || { cat $$small/log; exit 1; }; rm -rf $$small
 	touch $@
 
-# Surveys the built-in farm, and again a week later with the first map as prior map; or by other settings and flags.
+# Surveys the built-in trial, and again a week later with the first map as prior map; or by other settings and flags.
 survey: $(BIN)/.ok
 	$(BIN)/spectralzoom survey $(SURVEY) --out $(ARCHIVE)
 
@@ -45,10 +45,9 @@ survey: $(BIN)/.ok
 survey-rig: $(BIN)/.ok-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/flows/tasks/test_survey_rig.py -k lines_of_the_simulation
 
-# Makes the first picture of README and pages: the quicklook of a field of eight swaths, captured in two passes.
+# Makes the first picture of README and pages: the quicklook of the first visit of `make survey`.
 picture: $(BIN)/.ok
-	folder=$$(mktemp -d); $(BIN)/spectralzoom survey --scene scouting --seed 51 --size 5120x256 --interest 0.0625 --zoom always \
-		--seconds 14 --out $$folder && cp $$folder/runs/*/quicklook.png docs/pictures/survey.png; rm -rf $$folder
+	folder=$$(mktemp -d); $(BIN)/spectralzoom survey $(firstword $(SURVEY)) --out $$folder && cp $$folder/runs/*/quicklook.png docs/pictures/survey.png; rm -rf $$folder
 
 # Property tests draw the same cases each time; PYTEST_ARGS="-n 3 --hypothesis-profile=anew" draws new ones.
 # Tests start hundreds of processes, so they write bytecode even if the environment disables it.

@@ -24,7 +24,7 @@ from tests.receipts import comparable, receipts
 GOING_ON = "terminated; run the same command to resume"
 SYNCED: dict[str, Any] = {"place": "spectralzoom.storage.store:sync", "call": 60}  # before which it is stopped
 PLACES = {  # function, its call before which a survey with a map is stopped, and the signal
-    "in the controls": ("spectralzoom.flows.stages.evaluate:mixed", 1, signal.SIGTERM),
+    "in the evaluation": ("spectralzoom.flows.stages.evaluate:confusion", 1, signal.SIGTERM),
     "before the publication": ("spectralzoom.flows.publish.publishing:publish_run", 1, signal.SIGKILL),
     "in the publication": ("spectralzoom.storage.store:Archive.manifest_hashes", 2, signal.SIGKILL),
 }

@@ -17,7 +17,7 @@ from typing import Any
 from spectralzoom.storage.store import Archive
 from tests.faults.fault_table import Row, reported_wrong
 from tests.faults.nursery import Ended, Nursery
-from tests.faults.small_survey import Subject, prepare, problems, words
+from tests.faults.small_survey import UNDISTURBED, Subject, prepare, problems, words
 from tests.storage.small_archive import small_survey
 
 STORES = 60
@@ -101,8 +101,10 @@ def vanish_at_calls(subject: Subject, folder: Path, count: int, seed: int) -> Va
 
 
 def kept_stores(subject: Subject) -> list[str]:
-    """Return the addresses of the stores of the undisturbed survey."""
-    return sorted(subject.truth)
+    """Return the addresses of the stores of the undisturbed survey, and of the manifests of cleared ones."""
+    archive = subject.folder / UNDISTURBED
+    cleared = (path.relative_to(archive).as_posix() for path in archive.glob("stages/*/*.cleared"))
+    return sorted({*subject.truth, *cleared})
 
 
 def _count(out: Path) -> int:

@@ -192,8 +192,8 @@ def test_a_budget_is_a_fraction_of_the_recorded_seconds(tmp_path: Path, survey_p
     quick = {"cost.reload_s": 0, "cost.capture_start_s": 0, "cost.slew_s": 0}
     asked = {"keep": "raw", "labels": None, "scan_step": "1", "scan_exposure_ms": "10", **NARROW, **quick}
     run = survey_png(tmp_path / "sim", budget=None, **asked)
-    receipt = survey_sweeps(tmp_path / "a", run.folder, weights=str(weights), budget=0.9).receipt
-    given_s = 0.9 * run.receipt["savings"]["capture_s"]["done"]
+    receipt = survey_sweeps(tmp_path / "a", run.folder, weights=str(weights), budget=0.6).receipt
+    given_s = 0.6 * run.receipt["savings"]["capture_s"]["done"]
     assert 0.8 * given_s < receipt["recording"]["passes_s"] <= given_s
     assert receipt["plan"]["reason"].endswith("every line, 10 ms")
 

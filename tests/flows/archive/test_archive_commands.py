@@ -62,7 +62,7 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
     assert format_bytes(first["own_bytes"]) in out
-    assert f"2 runs, 17 stores, {format_bytes(content['bytes'])}, {format_bytes(shared)} shared by several runs" in out
+    assert f"2 runs, 18 stores, {format_bytes(content['bytes'])}, {format_bytes(shared)} shared by several runs" in out
     assert max(map(len, out.splitlines())) <= 80
 
 
@@ -87,7 +87,7 @@ def test_explain_shows_lineage(two_budgets: Path, capsys: pytest.CaptureFixture[
     content = _json(capsys, lambda: explain(two_budgets, "class_map", as_json=True))
     (top,) = content["lineage"]
     assert (top["stage"], top["called"]) == ("segment", ["segment"])
-    assert [one["stage"] for one in top["inputs"]] == ["rectify_fine", "score"]
+    assert [one["stage"] for one in top["inputs"]] == ["rectify_fine", "score", "overview"]
     explain(two_budgets, "class_map")
     out = capsys.readouterr().out
     assert "segment" in out
@@ -152,7 +152,7 @@ def test_a_damaged_store_is_named_removed_and_made_again(archive: Path, capsys: 
     (archive / "stages" / "notes.txt").unlink()
     run_survey(asked_again(read_run(archive / one["run"]), archive, None), QUIET)
     assert verify(archive) == DONE
-    assert "20 stores and runs are as published, out of 20" in capsys.readouterr().out
+    assert "21 stores and runs are as published, out of 21" in capsys.readouterr().out
 
 
 def test_missing_stores_and_empty_receipts_count_as_damaged(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -113,7 +113,7 @@ def test_a_plan_has_only_changed_stages_to_run(
     assert [other[name].state for name in ("locate", "rectify", "score")] == ["cached", "to run", "to run"]
     be_version(monkeypatch, "rectify_fine", 99)
     planned = _plan(settings, archive)
-    assert [planned[name].state for name in ("rectify", "score", "rectify_fine")] == ["cached", "cached", "to run"]
+    assert [planned[name].state for name in ("locate", "score", "rectify_fine")] == ["cached", "cached", "to run"]
 
 
 def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

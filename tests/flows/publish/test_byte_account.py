@@ -53,8 +53,8 @@ def test_the_account_of_a_survey_matches_its_folders(
 ) -> None:
     """Kept and written bytes are those of files, captured bytes those of lines; nothing is moved.
 
-    Raw lines and a first pass's mosaic, which are cleared, count as written and not as kept. The folder of the run does
-    not count.
+    Raw lines, the overview and a first pass's mosaic, which are cleared, count as written and not as kept. The folder of
+    the run does not count.
     """
     root = tmp_path / "archive"
     published = survey_png(root, accuracy=accuracy, keep=keep, budget=budget)
@@ -65,7 +65,9 @@ def test_the_account_of_a_survey_matches_its_folders(
     assert account["kept"] == walked(root / "stages") - walked(*cleared)
     assert sum(spooled) > 0
     assert account["written"] >= account["kept"] + sum(spooled)
-    assert keep == "signal" or account["written"] == account["kept"] + sum(spooled)
+    (overview,) = (json.loads(path.read_text())["files"] for path in root.glob("stages/overview/*.cleared"))
+    gone = sum(size for size, _ in overview.values())
+    assert keep == "signal" or account["written"] == account["kept"] + sum(spooled) + gone
     assert account["reference"] >= 96 * 128 * 3 * 2  # a line has all samples of the camera
     assert 0 < account["captured"] < sum(spooled)  # a spool has values, times and checksums of the lines
     assert account["captured"] > 0.9 * sum(spooled)

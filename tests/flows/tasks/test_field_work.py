@@ -123,7 +123,7 @@ def test_pickled_work_contains_its_weights(surveyed: Surveyed, tmp_path: Path) -
     plan, stages = surveyed
     copy = tmp_path / "w.safetensors"
     copy.write_bytes(plan.work.weights.path.read_bytes())
-    scoring = Scoring(replace(plan.work.weights, path=copy), _mosaics(stages)[0], plan.capture, "entropy")
+    scoring = Scoring(replace(plan.work.weights, path=copy), _mosaics(stages)[0], plan.capture, policy="entropy")
     sent = pickle.dumps((scoring, plan.work.regions[0]))
     assert len(sent) < copy.stat().st_size + 2000
     expected = scoring(plan.work.regions[0])

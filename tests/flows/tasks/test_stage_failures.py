@@ -28,7 +28,7 @@ from tests.flows.conftest import Ended, act_instead, class_map, newest_run, prob
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 OF_THIS = [  # of a survey in two passes without pointing errors
-    *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "score"),
+    *("choose_effects", "capture_coarse", "condense_coarse", "locate", "rectify", "read_overview", "score"),
     *("capture_fine", "condense_fine", "rectify_fine", "segment", "evaluate"),
 ]
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
