@@ -53,8 +53,8 @@ def test_the_account_of_a_survey_matches_its_folders(
 ) -> None:
     """Kept and written bytes are those of files, captured bytes those of lines; nothing is moved.
 
-    Raw lines, the overview and a first pass's mosaic, which are cleared, count as written and not as kept. The folder of
-    the run does not count.
+    Raw lines, the overview and the mosaic of a first pass, which are cleared, count as written and not as kept. The
+    folder of the run does not count.
     """
     root = tmp_path / "archive"
     published = survey_png(root, accuracy=accuracy, keep=keep, budget=budget)
