@@ -24,7 +24,7 @@ from spectralzoom.pipeline.geometry.scan import CostModel, Floats, Sweep, exposi
 from spectralzoom.pipeline.planning.coverage import lines_showing, some_lines
 
 LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in fractions of the total gain: all runs pay, or none
-HALVINGS = 48  # of the logarithm of the interval between them
+HALVINGS = 24  # of the logarithm of the interval between them
 LineRun = tuple[int, int, int]  # number of the sweep, its first line, and the one after its last
 
 

@@ -35,7 +35,7 @@ OTHER_SEEDS = (81, 82, 83)
 OTHER_SECONDS = (15, 25, 60)
 OTHERS = ("farm", "scouting")
 EIGHT_SWATHS = {"size": "640x512", "camera.samples": "80"}
-PAUSE = ("condense_coarse", "locate", "rectify", "score")  # stages between the passes
+PAUSE = ("condense_coarse", "locate", "rectify", "read_overview", "score")  # stages between the passes
 LARGE = "1280x1024"  # of the field whose pause is measured
 
 
