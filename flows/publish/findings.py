@@ -50,7 +50,7 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
         kept = plan.reading_figures(read_in_full(products.attention, products.class_map))
     return {
         "field": field_figures(plan, fine),
-        "plan": {"kind": fine.kind, "reason": fine.reason, "lines": fine.lines, "seconds": fine.seconds},
+        "plan": _plan(plan, fine),
         "recording": _recording(plan, fine),
         "kept": kept,
         "prior_map": prior,
@@ -95,6 +95,17 @@ def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
         "lines": lines if captured else None,
         "hectares_per_hour": kept.hectares_per_hour(seconds) if captured and not plan.part else None,
     }
+
+
+def _plan(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any]:
+    """Return kind, reason and costs of the second pass, and in words where it captured a part of the field again."""
+    facts = {"kind": fine.kind, "reason": fine.reason, "lines": fine.lines, "seconds": fine.seconds}
+    if fine.kind != "lines" or not fine.sweeps:
+        return facts
+    again = np.ones(plan.field.grid.patch_shape, np.uint8)
+    again.ravel()[fine.patch_index] = 0
+    geobox = plan.field.scene.geobox  # patches lie as pixels do
+    return {**facts, "place": main_places(again, ("again", "once"), geobox).get("again", "")}
 
 
 def _recording(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any] | None:

@@ -83,17 +83,15 @@ def pause_seconds(receipt: Mapping[str, Any]) -> float | None:
 
 
 def format_reference(receipt: Mapping[str, Any]) -> str:
-    """Return a sentence on the reference, and on the full scan where that is another one."""
+    """Return a sentence on the reference: the cheapest uniform scan with nearly the best score, or the full scan."""
     capture = receipt["savings"].get("capture_s", {})
-    read = ", every patch read in full" if "patches" in receipt["savings"] else ""
+    read = " and read in full" if "patches" in receipt["savings"] else ""
     if not capture:
-        return f"Reference: every pixel{read}."
-    lines = f"every line at {receipt['settings']['camera']['exposure_ms']:g} ms"
+        return f"Reference: every pixel, stored{read}."
     if capture.get("uniform") is None:
+        lines = f"every line at {receipt['settings']['camera']['exposure_ms']:g} ms"
         return f"Reference: {lines}, stored as captured{read}."
-    scan = f"the cheapest uniform scan with nearly the best score ({capture['uniform_scan']})"
-    longest = f"{lines[0].upper()}{lines[1:]} takes {format_seconds(capture['full'])}."
-    return f"Reference: {scan}, stored as captured{read}. {longest}"
+    return f"Reference: the cheapest good uniform scan ({capture['uniform_scan']}), stored as captured{read}."
 
 
 def format_score(receipt: Mapping[str, Any]) -> str:
@@ -115,9 +113,19 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     return "The score is not known: there are no labels."
 
 
+def format_second_pass(receipt: Mapping[str, Any]) -> str:
+    """Return a sentence on what was captured again, where and why; empty without a second pass."""
+    plan = receipt.get("plan", {})
+    if not plan.get("lines"):
+        return ""
+    what, _, why = plan["reason"].partition("; ")
+    place = f", mostly {plan['place']}" if plan.get("place") else ""
+    return f"{what[0].upper()}{what[1:]}{place}{f'; {why}' if why else ''}."
+
+
 def headline(receipt: Receipt) -> list[str]:
     """Return two paragraphs: the classes of the field; the score and the capture time."""
-    sentences = [format_score(receipt)]
+    sentences = [format_score(receipt), *filter(None, [format_second_pass(receipt)])]
     if "capture_s" in receipt["savings"]:
         row = next(row for row in saving_rows(receipt) if row["label"] == COST_LABELS["capture_s"][0])
         sentences.append(
@@ -131,7 +139,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
-    for sentence in (class_sentence(receipt), format_score(receipt)):
+    for sentence in filter(None, (class_sentence(receipt), format_score(receipt), format_second_pass(receipt))):
         console.print(escape(sentence))
     rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
     shown_in = {"this survey": "done", "uniform scan": "control", "reference": "full", "fraction": "ratio"}
