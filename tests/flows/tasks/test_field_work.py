@@ -14,10 +14,10 @@ from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
-from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile
+from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile, overview_file
 from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.flows.tasks.prior_maps import Prior
-from spectralzoom.models.network.sizes import CELL_PX
+from spectralzoom.models.network.sizes import CELL_PX, TOKEN_PX
 from spectralzoom.models.reading.regions import plan_regions
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -182,3 +182,31 @@ def test_a_prior_map_has_no_seams_between_regions(surveyed: Surveyed) -> None:
         here = region.read.over(CELL_PX)
         found = prior_map_of(before, region, plan.field.weights).coarse
         np.testing.assert_array_equal(found, whole[here.rows, here.columns])
+
+
+def test_overviews_are_read_again_around_changed_patches(surveyed: Surveyed, tmp_path: Path) -> None:
+    """With all patches changed they are those of the second mosaic, with none those of the first one."""
+    plan, stages = surveyed
+    first, second = _mosaics(stages)
+    work = _work(plan, WorkerPool(workers=2), plan.field.described.config.halo_px)
+    every = plan.field.grid.every_patch()
+    folders = {name: tmp_path / name for name in ("first", "second", "all", "none", "some")}
+    for folder in folders.values():
+        folder.mkdir()
+    work.write_overviews(first, plan.capture, folders["first"], lambda done: None)
+    work.write_overviews(second, plan.capture, folders["second"], lambda done: None)
+    for name, changed in (("all", every), ("none", every[:0]), ("some", every[:1])):
+        work.renew_overviews(second, plan.capture, folders[name], folders["first"], changed)
+    kept = {name: _kept(work, folder) for name, folder in folders.items()}
+    np.testing.assert_array_equal(kept["all"], kept["second"])
+    np.testing.assert_array_equal(kept["none"], kept["first"])
+    renewed = (kept["some"] != kept["first"]).any(axis=0)
+    assert renewed[0, 0]
+    assert not renewed[TOKEN_PX:].any()
+    assert not renewed[:, TOKEN_PX:].any()
+
+
+def _kept(work: FieldWork, folder: Path) -> np.ndarray:
+    """Return the overviews (feature, y, x) of a field that is cut from top to bottom."""
+    parts = [np.load(overview_file(folder, region))[0][:, *region.kept_here] for region in work.regions]
+    return np.concatenate(parts, axis=1)

@@ -109,6 +109,20 @@ def test_all_maps_of_a_receipt_have_iou_for_the_classes_of_the_labels(farm: Done
     assert not truth & set(accuracy["false_classes"])
 
 
+def test_the_control_is_a_survey_by_the_uniform_scan(farm: Done, tmp_path: Path) -> None:
+    """It scores as a survey of that scan, takes no more seconds than both passes, and its raw lines are cleared."""
+    control = farm.receipt["control"]
+    assert control["capture_s"] <= farm.receipt["field"]["camera_s"]["full_scan"] * 0.9 + 1e-9
+    step, exposure_ms = re.fullmatch(r"every (?:(\d)\w\w )?line, ([\d.]+) ms", control["scan"]).groups()
+    scan = {"scan_step": step or "1", "scan_exposure_ms": exposure_ms, "size": f"{FARM[1]}x{FARM[0]}"}
+    flags = {**scan, "bands": FEW_BANDS, "seed": "1", "engine": "plain", "out": str(tmp_path)}
+    uniform = run_survey(load_settings(None, flags), QUIET).receipt
+    assert uniform["accuracy"]["miou"] == control["miou"]
+    assert uniform["savings"]["multiply_adds"]["done"] == control["multiply_adds"]
+    assert uniform["savings"]["capture_s"]["done"] == control["capture_s"]
+    assert not [*farm.archive.glob("stages/capture/*/*.zarr")]
+
+
 def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
     """Ratios are done over full and the capture keeps its budget; scores of chosen patches fall with their rank."""
     savings = farm.receipt["savings"]
