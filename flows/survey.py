@@ -1,33 +1,22 @@
-"""The survey as a Prefect flow: from raw sweeps to a class map and its receipt.
+"""The stages of a survey in their order: from raw sweeps to a class map and its receipt.
 
-    from spectralzoom.flows.settings.parameters import SurveySettings
-    from spectralzoom.flows.survey import survey
-
-    if __name__ == "__main__":  # Prefect imports the program of a served flow again for every run
-        survey(SurveySettings(scene="farm", seconds=25))                          # once, now
-        survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})   # every day at six
-
-Each stage is a task that takes and returns addresses of stores, not arrays. Existing stores are not computed again, so
-that a stopped survey resumes. `survey_field` runs the same stages without a server.
-
-No ``from __future__ import annotations`` here: Prefect reads the signatures.
+Each stage takes and returns addresses of stores, not arrays. Existing stores are not computed again, so that a stopped
+survey resumes. `flows.prefect_flow` makes an ordinary Prefect flow of it, in which each stage is a task.
 """
+
+from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import cast
-
-from prefect import flow
-from prefect.states import Completed
 
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.products import Control, Pass, Products
-from spectralzoom.flows.publish.publishing import RunRef, clear_intermediate, clear_raw, outcome, publish
+from spectralzoom.flows.publish.publishing import RunRef, clear_intermediate, clear_raw, publish
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import RIG
 from spectralzoom.flows.settings.values import KEEP_RAW
-from spectralzoom.flows.stage import Stores, inside_flow
+from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse, capture_fine
 from spectralzoom.flows.stages.condense import condense_coarse, condense_fine, condense_raster
 from spectralzoom.flows.stages.effects import choose_effects
@@ -39,55 +28,26 @@ from spectralzoom.flows.stages.rectify import rectify, rectify_fine
 from spectralzoom.flows.stages.register import register_coarse, register_fine
 from spectralzoom.flows.stages.score import load_plan, score
 from spectralzoom.flows.stages.segment import segment
-from spectralzoom.flows.tasks.observer import Observer, current_observer, say_state, tidy_up
-from spectralzoom.flows.tasks.visit import name_of_flow_run, settings_of_visit
+from spectralzoom.flows.tasks.observer import Observer, current_observer, tidy_up
+from spectralzoom.flows.tasks.visit import settings_of_visit
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.storage.readers.scene_files import RasterPixels
 from spectralzoom.storage.store import Archive, Ref
 
 
-@flow(
-    name="survey",
-    flow_run_name=name_of_flow_run,
-    validate_parameters=True,
-    persist_result=False,
-    on_running=[say_state],
-    on_completion=[say_state],
-    on_failure=[say_state],
-    on_crashed=[say_state],
-)
-def survey(settings: SurveySettings) -> RunRef:
-    """Survey a field: capture, rectify, score, capture again, segment, evaluate and publish.
-
-    Parameters
-    ----------
-    settings
-        Settings of the survey; all have defaults. A run of a deployment is a visit named by its due time, with the
-        newest prior map of the field.
-
-    Returns
-    -------
-    The address of the published run, or of the last store if ``until`` of the settings stops the survey.
-
-    Raises
-    ------
-    PipelineError : what is wrong, what is allowed, and what to do.
-    """
-    run = survey_field(settings)
-    if not inside_flow():
-        return run
-    return cast(RunRef, Completed(message=outcome(run), data=run))  # Prefect returns its data to the caller
-
-
 def survey_field(settings: SurveySettings) -> RunRef:
-    """Survey a field without Prefect, or with its tasks in the present flow; returns and raises as `survey`."""
+    """Survey a field; inside a Prefect flow the stages are its tasks.
+
+    Returns the address of the published run, or of the last store if ``until`` of the settings stops the survey.
+    Raises PipelineError: what is wrong, what is allowed, and what to do.
+    """
     started = datetime.now(UTC)
     return carry_out(plan_survey(open_field(settings_of_visit(settings))), started)
 
 
 def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
-    """Run the stages of a planned survey and publish its run; returns and raises as `survey`."""
+    """Run the stages of a planned survey and publish its run; returns and raises as `survey_field`."""
     observer = current_observer()
     field = replace(plan.field, source=plan.field.source.saying(observer.say))
     plan = replace(plan, field=field)

@@ -22,6 +22,7 @@ from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.stage import inside_flow
+from spectralzoom.flows.survey import carry_out, survey_field
 from spectralzoom.flows.tasks.local_server import (
     ServerUnavailable,
     check_answers,
@@ -67,13 +68,13 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
     Inside another flow its tasks become tasks of that flow. Without a stage to make, only the run is published.
     """
-    from spectralzoom.flows.survey import survey, survey_field  # Prefect takes a second
-
     asked = SurveySettings.of(settings)
     if not inside_flow() and (run := _publish_stored(settings)) is not None:
         return run
     use_one_thread()
     if settings.engine != "plain" and not inside_flow():
+        from spectralzoom.flows.prefect_flow import survey  # Prefect takes a second
+
         try:
             with _prefect_server(settings.out):
                 state = survey(asked, return_state=True)
@@ -89,8 +90,6 @@ def _publish_stored(settings: Settings) -> RunRef | None:
 
     Raises PipelineError: the settings are refused, before a server starts.
     """
-    from spectralzoom.flows.survey import carry_out
-
     started = datetime.now(UTC)
     if (refused := farm_refusal(settings)) is not None:
         raise SettingsError(refused)

@@ -22,6 +22,7 @@ from spectralzoom.flows.settings.survey_settings import ALWAYS, Settings
 from spectralzoom.flows.settings.values import EXTENT_WHOLE
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.score import load_plan, score
+from spectralzoom.flows.survey import run_stages
 from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.terminal.figures import format_count
 from spectralzoom.flows.terminal.processes import DONE
@@ -56,8 +57,6 @@ def dry_run(settings: Settings) -> tuple[SurveyPlan, Stores]:
 
     Raises PipelineError: the survey would be refused for another reason than its size.
     """
-    from spectralzoom.flows.survey import run_stages  # Prefect takes a second
-
     found = plan_survey(open_field(settings, planning=True))
     archive = Archive(Path(settings.out).absolute())  # where there is none yet
     if is_archive(settings.out):

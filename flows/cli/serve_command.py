@@ -27,9 +27,9 @@ from pydantic import ValidationError
 from spectralzoom.flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
+from spectralzoom.flows.prefect_flow import survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.survey_settings import Settings
-from spectralzoom.flows.survey import survey
 from spectralzoom.flows.tasks.local_server import check_answers, local_server, quiet_environment
 from spectralzoom.flows.tasks.rig_field import RIG_LIMIT
 from spectralzoom.flows.tasks.survey_model import weights_path

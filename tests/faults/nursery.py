@@ -133,6 +133,7 @@ def serve(choices: Path) -> None:
             "spectralzoom.flows.publish.run_folder",
             "spectralzoom.flows.survey_command",
             "spectralzoom.flows.survey",
+            "spectralzoom.flows.prefect_flow",
         ),
         *(
             "spectralzoom.flows.cli.survey_verbs",

@@ -147,7 +147,7 @@ def test_the_wheel_needs_no_home(installed: Path, ground: Path, scene_files: Pat
 
 DEPLOYED = """
 from prefect.flows import load_flow_from_entrypoint
-from spectralzoom.flows.survey import survey
+from spectralzoom.flows.prefect_flow import survey
 print(load_flow_from_entrypoint(survey.to_deployment("north").entrypoint).name)
 """
 

@@ -69,7 +69,7 @@ def run_here(run: Any) -> Any:
     """Run it with Prefect's engine in this process, as a runner does in its own; return the state."""
     from prefect.flow_engine import run_flow
 
-    from spectralzoom.flows.survey import survey
+    from spectralzoom.flows.prefect_flow import survey
 
     return run_flow(survey, flow_run=run, return_type="state")
 
@@ -168,7 +168,7 @@ def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
     from prefect.client.schemas.actions import WorkPoolCreate
 
     from spectralzoom.flows.archive.reprocess_flow import reprocess
-    from spectralzoom.flows.survey import survey
+    from spectralzoom.flows.prefect_flow import survey
 
     with client() as asked:
         asked.create_work_pool(WorkPoolCreate(name="reading", type="process"))

@@ -113,7 +113,7 @@ def test_prefect_asks_for_no_usage_data(tmp_path: Path) -> None:
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:
     """Its parameters have file, field and archive and pass the flow's checks; a second run at a time is cancelled."""
     from spectralzoom.flows.archive.reprocess_flow import reprocess_deployment
-    from spectralzoom.flows.survey import survey
+    from spectralzoom.flows.prefect_flow import survey
 
     ((file, north),) = load_fields([field_file("north")], out=str(tmp_path / "other")).items()
     made = survey_deployment(file, north, schedule_of("0 6 * * *", None, "Europe/Berlin"))

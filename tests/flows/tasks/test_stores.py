@@ -13,12 +13,12 @@ import pytest
 import xarray as xr
 import zarr
 
+from spectralzoom.flows.prefect_flow import survey
 from spectralzoom.flows.products import Pass, Products
 from spectralzoom.flows.publish.publishing import clear_intermediate
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.parameters import SurveySettings
 from spectralzoom.flows.stages.condense import SignalChoice, components_of
-from spectralzoom.flows.survey import survey
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.source import References

@@ -1,0 +1,58 @@
+"""The survey as a Prefect flow.
+
+    from spectralzoom.flows.prefect_flow import survey
+    from spectralzoom.flows.settings.parameters import SurveySettings
+
+    if __name__ == "__main__":  # Prefect imports the program of a served flow again for every run
+        survey(SurveySettings(scene="farm", seconds=25))                          # once, now
+        survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})   # every day at six
+
+`flows.survey` has the stages in their order. `survey_field` runs them without Prefect, whose import takes a second.
+
+No ``from __future__ import annotations`` here: Prefect reads the signatures.
+"""
+
+from typing import cast
+
+from prefect import flow
+from prefect.states import Completed
+
+from spectralzoom.flows.publish.publishing import RunRef, outcome
+from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.stage import inside_flow
+from spectralzoom.flows.survey import survey_field
+from spectralzoom.flows.tasks.observer import say_state
+from spectralzoom.flows.tasks.visit import name_of_flow_run
+
+
+@flow(
+    name="survey",
+    flow_run_name=name_of_flow_run,
+    validate_parameters=True,
+    persist_result=False,
+    on_running=[say_state],
+    on_completion=[say_state],
+    on_failure=[say_state],
+    on_crashed=[say_state],
+)
+def survey(settings: SurveySettings) -> RunRef:
+    """Survey a field: capture, rectify, score, capture again, segment, evaluate and publish.
+
+    Parameters
+    ----------
+    settings
+        Settings of the survey; all have defaults. A run of a deployment is a visit named by its due time, with the
+        newest prior map of the field.
+
+    Returns
+    -------
+    The address of the published run, or of the last store if ``until`` of the settings stops the survey.
+
+    Raises
+    ------
+    PipelineError : what is wrong, what is allowed, and what to do.
+    """
+    run = survey_field(settings)
+    if not inside_flow():
+        return run
+    return cast(RunRef, Completed(message=outcome(run), data=run))  # Prefect returns its data to the caller
