@@ -14,8 +14,7 @@ from unittest.mock import Mock
 import pytest
 from pydantic import ValidationError
 
-from spectralzoom.flows import survey as survey_flow
-from spectralzoom.flows import survey_command
+from spectralzoom.flows import prefect_flow, survey_command
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.settings.load import load_settings
@@ -143,7 +142,7 @@ def test_every_setting_is_a_described_field_of_the_form() -> None:
     """Prefect makes its form from the parameters of the flow."""
     from spectralzoom.flows.settings.load import SURVEY
 
-    schema = survey_flow.survey.parameters.definitions["SurveySettings"]["properties"]
+    schema = prefect_flow.survey.parameters.definitions["SurveySettings"]["properties"]
     assert set(schema) == {*SURVEY, "settings_file"}
     assert all(one.get("description") or "$ref" in json.dumps(one) for one in schema.values())
 
