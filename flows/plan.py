@@ -92,11 +92,12 @@ class SurveyPlan:
         Only a simulated field with labels can be captured again as it was.
         """
         scan = self.scans.best_in_time(self.passes.coarse_s + self.passes.fine_s)
-        scores = self.settings.controls and self.field.source.simulates and self.field.scene.labelled
-        if not scores or scan is None or (scan == self.scans.chosen and self.field.prior is None):
+        settings = self.settings
+        judged = settings.controls and settings.accuracy and self.field.source.simulates and self.field.scene.labelled
+        if not judged or scan is None or (scan == self.scans.chosen and self.field.prior is None):
             return None
         settings = replace(
-            self.settings,
+            settings,
             zoom=NEVER,
             scan_step=scan.step,
             scan_exposure_ms=scan.exposure_ms,

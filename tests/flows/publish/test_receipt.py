@@ -16,7 +16,7 @@ from rich.console import Console
 
 from spectralzoom.flows.publish.field_map import RIGHT_RGB, WRONG_RGB, FieldMap, error_address
 from spectralzoom.flows.publish.receipt import CAPTURE_COSTS, Receipt, build_receipt, check_receipt
-from spectralzoom.flows.publish.receipt_table import format_score, headline, print_summary
+from spectralzoom.flows.publish.receipt_table import format_score, headline, print_summary, saving_rows
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.survey_settings import Settings
 from spectralzoom.flows.terminal.figures import format_area
@@ -145,6 +145,18 @@ def test_the_summary_says_what_was_captured_again() -> None:
     told = "Captured again: 10 % of the field, every line, 17 ms, mostly on the right; expected gain 0.8 points"
     assert told in " ".join(printed(receipt).split())
     assert told in headline(receipt)[1]
+
+
+def test_costs_stand_against_the_cheapest_good_scan() -> None:
+    """With a table of scans its seconds and raw bytes are the reference, without one those of the full scan."""
+    receipt = make_receipt()
+    rows = {row["label"]: (row["full"], row["ratio"]) for row in saving_rows(receipt)}
+    assert rows["capture time"] == ("209 s", 104 / 209)
+    assert rows["bytes kept"] == ("4 MB", 1.5 / 4)
+    receipt["scans"] = {"reference": {"seconds": 52.0, "bytes_raw": 3_000_000}}
+    rows = {row["label"]: (row["full"], row["ratio"]) for row in saving_rows(receipt)}
+    assert rows["capture time"] == ("52 s", 2.0)
+    assert rows["bytes kept"] == ("3 MB", 0.5)
 
 
 def test_the_pause_between_passes_has_a_row() -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from spectralzoom.flows.field import open_field
+from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
 from spectralzoom.flows.tradeoff import coarse_of_sweeps
@@ -21,6 +23,7 @@ from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.built_in import SCOUTING_LAW
 from spectralzoom.pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
+from spectralzoom.pipeline.simulator.scenes.trial import TRIAL_LAW
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 PATH = shipped_weights()
@@ -45,6 +48,21 @@ def test_file_is_small_and_has_a_training_record(weights: Weights) -> None:
     split = weights.record["split"]
     assert not set(split["train"]) & set(split["validation"])
     assert ScanPerformance.read(weights.record["scans"]).steps == (1, 2, 4, 8)
+
+
+def test_a_plan_expects_the_score_of_its_law(tmp_path: Path) -> None:
+    """A scan of a trial scores less than one of a farm; a scene without a law has the table of all."""
+    described = describe_weights(PATH)
+    assert described.scans("unknown@1") == described.scans() == described.record["scans"]
+    expected = {}
+    for scene in ("farm", "trial"):
+        asked = {"scene": scene, "size": "64x64", "scan_step": "1", "scan_exposure_ms": "12", "out": str(tmp_path)}
+        plan = plan_survey(open_field(load_settings(None, asked), planning=True))
+        expected[scene] = plan.scans.chosen.expected["mIoU"]
+    for scene, law in (("farm", FARM_LAW), ("trial", TRIAL_LAW)):
+        table = described.record["scans"]["by_law"][law]
+        assert expected[scene] == pytest.approx(table["miou"][0][table["exposures_ms"].index(12.0)])
+    assert expected["trial"] < expected["farm"] - 0.05
 
 
 def test_weights_of_the_user_replace_the_shipped_ones() -> None:

@@ -257,6 +257,17 @@ def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Pa
     assert np.abs(scores.bias).max() > 0.01
 
 
+def test_scenes_of_several_laws_have_a_table_of_each(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table of all is the mean of those of the laws, here of one scene each."""
+    monkeypatch.setattr("spectralzoom.flows.training.train.built_in_laws", lambda dataset: ("a", "b"))
+    monkeypatch.setattr("spectralzoom.flows.training.train.law_of", lambda name: name)
+    scans = train_weights(_request(folder, out, validation=2, min_exposure_ms=6.0))["scans"]
+    tables = list(scans["by_law"].values())
+    assert [table["scenes"] for table in tables] == [1, 1]
+    assert tables[0]["miou"] != tables[1]["miou"]
+    np.testing.assert_allclose(np.mean([table["miou"] for table in tables], axis=0), scans["miou"])
+
+
 @pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
 def test_missing_scan_performance_is_reported_after_training(folder: Path, out: Path, darkest_ms: float, said: bool):
     """Weights have none without validation scenes; after short exposures training reports that."""
