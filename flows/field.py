@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RECORDED, RIG, Settings
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
 from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
 from spectralzoom.flows.tasks.recorded_field import OpenedRecording, open_recorded
@@ -45,9 +46,10 @@ from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.readers.open_cubes import load_labels_array
 from spectralzoom.storage.readers.scene_files import RasterPixels, SceneFile
-from spectralzoom.storage.runs import dated, moment_of
+from spectralzoom.storage.runs import dated
 from spectralzoom.storage.store import Archive
 
 
@@ -148,7 +150,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     check_scene_there(settings.scene)
     recorded = open_recorded(settings) if settings.source == RECORDED else None
     settings = settings if recorded is None else recorded.settings
-    settings = replace(settings, device=choose_device(settings.device))
+    settings = settings.but(device=choose_device(settings.device))
     model = (
         SurveyModel.unread()
         if settings.ends_unread
@@ -159,7 +161,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         raise SettingsError(refused)
     pixels, scene, notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, model.described.config.patch)
-    zones = open_zones(settings.zones, place_of_field(settings, scene), grid)
+    zones = open_zones(settings, place_of_field(settings, scene), grid)
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
     outside = beyond_training(settings, scene, model.described, model.trained_on) if model.reads else []
     if raster is not None and not planning:
@@ -173,7 +175,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         notes += (f"--visit {settings.visit} is kept, though the file says that it was acquired {scene.acquired}",)
     prior, prior_notes = find_prior(archive, settings, name, grid, model.described.class_names, scene)
     if settings.prior != AUTO:  # a receipt names the run
-        settings = replace(settings, prior=NONE if prior is None else prior.run)
+        settings = settings.but(prior=NONE if prior is None else prior.run)
     simulated = make_source(scene, settings)
     return Field(
         settings=settings,

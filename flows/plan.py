@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.field import Field
-from spectralzoom.flows.settings.survey_settings import NEVER, Settings
-from spectralzoom.flows.settings.values import EXTENT_PART, EXTENT_WHOLE
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import NEVER, PART, WHOLE
 from spectralzoom.flows.stages.rectify import tile_budget
 from spectralzoom.flows.stages.score import PatchGains, all_seen
 from spectralzoom.flows.tasks.capture_plan import (
@@ -96,15 +96,13 @@ class SurveyPlan:
         judged = settings.controls and settings.accuracy and self.field.source.simulates and self.field.scene.labelled
         if not judged or scan is None or (scan == self.scans.chosen and self.field.prior is None):
             return None
-        settings = replace(
-            settings,
+        settings = settings.but(
             zoom=NEVER,
             scan_step=scan.step,
             scan_exposure_ms=scan.exposure_ms,
             seconds=None,
             budget=None,
-            coarse_exposure_ms=None,
-            extent=EXTENT_WHOLE,
+            extent=WHOLE,
             max_age=None,
             prior="none",
             controls=False,
@@ -114,7 +112,7 @@ class SurveyPlan:
     @property
     def part(self) -> bool:
         """Return whether the capture is a partial scan."""
-        return self.settings.extent != EXTENT_WHOLE
+        return self.settings.extent != WHOLE
 
     @property
     def registers(self) -> bool:
@@ -130,15 +128,19 @@ class SurveyPlan:
     def capture(self) -> LineSpec:
         """Return line spacing and light of the first pass or of the uniform scan."""
         usual_ms = self.field.camera.exposure_ms
-        chosen_ms = self.settings.scan_exposure_ms if self.passes.plain else self.settings.coarse_exposure_ms
-        return LineSpec(self.field.light.light * (chosen_ms or usual_ms) / usual_ms, self.step)
+        return LineSpec(self.field.light.light * (self.settings.scan_exposure_ms or usual_ms) / usual_ms, self.step)
+
+    @property
+    def pool(self) -> WorkerPool:
+        """Return the worker pool."""
+        return pool_of(self.settings)
 
     @property
     def work(self) -> FieldWork:
         """Return the computation of the model over the field, region by region."""
         settings = self.settings
         file = WeightsFile.of(self.field.model.path.resolve(), self.field.described, settings.device)
-        return FieldWork(file, self.field.regions, settings.pool, settings.memory)
+        return FieldWork(file, self.field.regions, self.pool, settings.memory)
 
     @property
     def gains(self) -> PatchGains:
@@ -256,7 +258,7 @@ def plan_survey(opened: Field) -> SurveyPlan:
     scans = choose_uniform_scan(layout, described, opened.model.path, len(opened.scene.wavelength_nm), settings)
     passes, scans, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
     opened.source.check((*passes.coarse, *passes.full))
-    check_memory(opened.simulated, opened.grid, passes, settings.memory, settings.pool)
+    check_memory(opened.simulated, opened.grid, passes, settings.memory, pool_of(settings))
     return SurveyPlan(
         field=opened,
         settings=settings,
@@ -272,10 +274,10 @@ def plan_survey(opened: Field) -> SurveyPlan:
 def _extent(opened: Field) -> tuple[PassLayout, ExtentChoice | None, Settings, tuple[str, ...]]:
     """Return the layout of the passes, the partial scan that the settings ask for, settings, and notes."""
     settings, zones = opened.settings, opened.zones
-    is_part = settings.extent == EXTENT_PART
+    is_part = settings.extent == PART
     notes: tuple[str, ...] = ()
     if is_part and opened.prior is None:
-        settings = replace(settings, extent=EXTENT_WHOLE, max_age=None)
+        settings = settings.but(extent=WHOLE, max_age=None)
         notes = ("there is no prior map: the whole field is captured",)
     layout = PassLayout.of(settings, opened.grid, None if zones.kept is None else zones.shown_patches, opened.recorded)
     if not is_part or opened.prior is None:
@@ -289,6 +291,11 @@ def _extent(opened: Field) -> tuple[PassLayout, ExtentChoice | None, Settings, t
         left_out=np.logical_or.reduce(masks) if masks else None,
     )
     return layout, extent, settings, (note,)
+
+
+def pool_of(settings: Settings) -> WorkerPool:
+    """Return the worker pool of the settings."""
+    return WorkerPool(settings.scheduler, settings.workers, settings.bucket)
 
 
 def check_memory(source: SimulatedSource, grid: SceneGrid, plan: CapturePlan, memory: int, pool: WorkerPool) -> None:

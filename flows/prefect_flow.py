@@ -1,10 +1,10 @@
 """The survey as a Prefect flow.
 
     from spectralzoom.flows.prefect_flow import survey
-    from spectralzoom.flows.settings.parameters import SurveySettings
+    from spectralzoom.flows.settings.settings import Settings
 
     if __name__ == "__main__":  # Prefect imports the program of a served flow again for every run
-        survey(SurveySettings(scene="farm", seconds=25))                          # once, now
+        survey(Settings(scene="farm", seconds=25))                          # once, now
         survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})   # every day at six
 
 `flows.survey` has the stages in their order. `survey_field` runs them without Prefect, whose import takes a second.
@@ -18,7 +18,7 @@ from prefect import flow
 from prefect.states import Completed
 
 from spectralzoom.flows.publish.publishing import RunRef, outcome
-from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.survey import survey_field
 from spectralzoom.flows.tasks.observer import say_state
@@ -35,7 +35,7 @@ from spectralzoom.flows.tasks.visit import name_of_flow_run
     on_failure=[say_state],
     on_crashed=[say_state],
 )
-def survey(settings: SurveySettings) -> RunRef:
+def survey(settings: Settings) -> RunRef:
     """Survey a field: capture, rectify, score, capture again, segment, evaluate and publish.
 
     Parameters

@@ -13,9 +13,8 @@ from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.products import Control, Pass, Products
 from spectralzoom.flows.publish.publishing import RunRef, clear_intermediate, clear_raw, publish
-from spectralzoom.flows.settings.parameters import SurveySettings
-from spectralzoom.flows.settings.survey_settings import RIG
-from spectralzoom.flows.settings.values import KEEP_RAW
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import KEEP_RAW, RIG
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse, capture_fine
 from spectralzoom.flows.stages.condense import condense_coarse, condense_fine, condense_raster
@@ -36,7 +35,7 @@ from spectralzoom.storage.readers.scene_files import RasterPixels
 from spectralzoom.storage.store import Archive, Ref
 
 
-def survey_field(settings: SurveySettings) -> RunRef:
+def survey_field(settings: Settings) -> RunRef:
     """Survey a field; inside a Prefect flow the stages are its tasks.
 
     Returns the address of the published run, or of the last store if ``until`` of the settings stops the survey.
@@ -56,7 +55,7 @@ def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
     for note in plan.notes:
         observer.note(note)
     stores = Stores(archive, name=field.name, watch=observer.watch, log=observer.log, finish=tidy_up)
-    with archive.in_use(), plan.settings.pool.open(), field.source.to_oneself(observer.note):
+    with archive.in_use(), plan.pool.open(), field.source.to_oneself(observer.note):
         try:
             products = run_stages(stores, plan)
         except SurveyStopped as stopped:
@@ -187,7 +186,7 @@ def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
         request=SweepRequest.of(plan.passes.coarse, field.camera, settings.cost),
         view=field.view,
         source=field.source,
-        pool=settings.pool,
+        pool=plan.pool,
     )
     _keep(stores, plan, raw)
     signal = condense_coarse(stores, raw, camera=field.camera, signal=settings.signal)
@@ -209,7 +208,7 @@ def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
         camera=field.camera,
         kernel=settings.resampling,
         memory=settings.memory,
-        pool=settings.pool,
+        pool=plan.pool,
     )
     if plan.passes.plain:  # no network has to choose a second pass
         _stop_after(stores, plan, mosaic, "mosaic")
@@ -229,7 +228,7 @@ def _second_pass(
         request=SweepRequest.of(sweeps, field.camera, settings.cost, after_s=plan.passes.coarse_s),
         view=field.view,
         source=field.source,
-        pool=settings.pool,
+        pool=plan.pool,
     )
     _keep(stores, plan, raw)
     signal = condense_fine(stores, raw, first.raw, camera=field.camera, signal=settings.signal)
@@ -247,7 +246,7 @@ def _second_pass(
         light=field.light,
         kernel=settings.resampling,
         memory=settings.memory,
-        pool=settings.pool,
+        pool=plan.pool,
     )
     return Pass(raw, signal, mosaic, seams)
 

@@ -19,8 +19,7 @@ from spectralzoom.flows.publish.publishing import RunRef
 from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.receipt_table import print_summary
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.parameters import SurveySettings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.survey import carry_out, survey_field
 from spectralzoom.flows.tasks.local_server import (
@@ -68,7 +67,6 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
     Inside another flow its tasks become tasks of that flow. Without a stage to make, only the run is published.
     """
-    asked = SurveySettings.of(settings)
     if not inside_flow() and (run := _publish_stored(settings)) is not None:
         return run
     use_one_thread()
@@ -77,12 +75,12 @@ def _survey(settings: Settings, console: Console) -> RunRef:
 
         try:
             with _prefect_server(settings.out):
-                state = survey(asked, return_state=True)
+                state = survey(settings, return_state=True)
                 wait_until_recorded(state.state_details.flow_run_id)
                 return state.result()
         except ServerUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
-    return survey_field(asked)
+    return survey_field(settings)
 
 
 def _publish_stored(settings: Settings) -> RunRef | None:

@@ -25,8 +25,8 @@ from scipy.ndimage import gaussian_filter
 
 from spectralzoom.flows.field import Field, open_field
 from spectralzoom.flows.settings.flags import AsJson, OutFile
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import RASTER, Settings, SignalChoice
+from spectralzoom.flows.settings.settings import Settings, SignalChoice, load_settings
+from spectralzoom.flows.settings.values import RASTER
 from spectralzoom.flows.tasks.scene import check_labels
 from spectralzoom.flows.terminal.figures import format_bytes
 from spectralzoom.flows.terminal.processes import writing

@@ -1,13 +1,23 @@
-"""Declare settings where they are used: default, range, unit, meaning and source."""
+"""Declare settings where they are used: type, default, range, unit, help and source of the default.
+
+A table of settings is a dataclass that checks its values. A field without `stated` is a parameter of a model, and no
+setting.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import Field, field, fields
+from collections.abc import Sequence
+from datetime import UTC, date, datetime
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
+
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+Table = TypeVar("Table")
+REQUIRED: Any = ...  # default of a setting that has none
 
 
 def stated(
@@ -19,44 +29,60 @@ def stated(
     *,
     source: Literal["", "measured", "data sheet", "assumed"] = "",
     example: object = None,
+    group: str = "",
+    **more: Any,
 ) -> Any:
-    """Return a dataclass field with the complete description of a setting.
+    """Return a field with the complete description of a setting.
 
-    ``default`` is ``dataclasses.MISSING`` for a required setting. A number is finite, unless its default is infinite.
-    ``about`` is one line of help, ``ge`` and ``le`` the least and greatest allowed value [unit]. ``source`` says where
-    the default comes from: only "measured" ones were measured on a unit. Help shows ``example`` if there is no default,
-    or if the default is written in another way.
+    A number is finite, unless its default is infinite. ``about`` is one line of help, ``ge`` and ``le`` the least and
+    greatest allowed value [unit]. ``source`` says where the default comes from: only "measured" ones were measured on a
+    unit. Help shows ``example`` if there is no default, or if the default is written in another way. Settings of a
+    ``group`` are on the first page of the help. ``more`` are options of pydantic's Field.
     """
-    known = {"description": about, "ge": ge, "le": le}  # names of pydantic's Field
-    extra = {"unit": unit, "source": source, "example": example}
-    return field(default=default, metadata={**known, "json_schema_extra": extra})
+    extra: dict[str, Any] = {"unit": unit, "source": source, "example": example, "group": group}
+    if isinstance(default, float) and math.isinf(default):
+        more["allow_inf_nan"] = True
+    return Field(default, description=about, ge=ge, le=le, json_schema_extra=extra, **more)
 
 
 assumed = partial(stated, source="assumed")  # the default is not confirmed on a unit
 
 
-def format_number(low: float, high: float, unit: str = "", *, endless: bool = False) -> str:
-    """Return the allowed range of a number, for a message."""
-    text = f"a number from {low:g} to {high:g}" if math.isfinite(high) else f"a number of at least {low:g}"
-    return text + (f" {unit}" if unit else "") + (" or inf" if endless else "")
+@dataclass_transform(frozen_default=True)
+def settings_table(make: type[Table]) -> type[Table]:
+    """Turn a class into a table of settings: a frozen dataclass that checks its values (pydantic.ValidationError)."""
+    table: type[Table] = dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))(make)  # type: ignore[assignment]
+    return table
 
 
-def span_of(item: Field[Any]) -> tuple[float, float]:
-    """Return the least and greatest value of a number."""
-    low, high = item.metadata.get("ge"), item.metadata.get("le")
-    return (-math.inf if low is None else low), (math.inf if high is None else high)
+def parse_text(value: object) -> str:
+    """Return text that is not empty."""
+    if isinstance(value, date):  # of a TOML file
+        return value.isoformat()
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"must be text that is not empty, got {value!r}")
+    if "\0" in value:
+        raise ValueError(f"must be text without a null character, got {value!r}")
+    return value
 
 
-def misfits(part: Any) -> Iterator[tuple[str, str]]:
-    """Yield the numbers of a dataclass that are out of range or not finite: name and message."""
-    for item in fields(part):
-        value, (low, high) = getattr(part, item.name), span_of(item)
-        if value is None or (low, high) == (-math.inf, math.inf):
-            continue
-        endless = item.default in (None, math.inf)
-        if isinstance(value, bool) or not low <= value <= high or (math.isinf(value) and not endless):
-            allowed = format_number(low, high, item.metadata["json_schema_extra"]["unit"], endless=endless)
-            yield item.name, f"must be {allowed}, got {value!r}"
+def parse_moment(value: object) -> datetime:
+    """Return a date and time in UTC, from one with its time zone as TOML writes it."""
+    moment = value
+    if isinstance(value, str):
+        try:
+            moment = datetime.fromisoformat(value)
+        except ValueError:
+            moment = None
+    if not isinstance(moment, datetime):
+        raise ValueError(f"must be a date and time with its zone, such as 2026-06-01T12:00:00+02:00; got {value}")
+    if moment.tzinfo is None:
+        raise ValueError(f"needs a time zone: write {moment.isoformat()}Z for UTC; got {value}")
+    return moment.astimezone(UTC)
+
+
+Text = Annotated[str, BeforeValidator(parse_text)]
+Moment = Annotated[datetime, BeforeValidator(parse_moment, json_schema_input_type=str)]
 
 
 def numbers_of(item: object) -> Sequence[object]:

@@ -13,7 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 import spectralzoom.opened as opened
 from spectralzoom.flows.archive.plan_command import plan_content
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.load import unnested
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.terminal.processes import place_caches, send_no_analytics
 from spectralzoom.flows.terminal.progress import Listener, heard_by, on_stderr
 from spectralzoom.opened import OpenedRun
@@ -22,7 +23,6 @@ from spectralzoom.pipeline.errors import SettingsError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from spectralzoom.flows.settings.survey_settings import Settings
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
 USUAL = {"engine": "plain"}  # a Prefect server starts only on request
@@ -158,17 +158,8 @@ def train(
 def _settings(given: Asked, flags: Mapping[str, Any]) -> Settings:
     """Return the settings of a file or a table; keywords win over them."""
     path = None if given is None or isinstance(given, Mapping) else given
-    table = _by_key(given) if isinstance(given, Mapping) else {}
-    return load_settings(path, table | _by_key(flags), usual=USUAL)
-
-
-def _by_key(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings by their keys, such as ``camera.exposure_ms``, with paths as text."""
-    found: dict[str, Any] = {}
-    for name, value in table.items():
-        inner = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, Mapping) else {name: value}
-        found |= {key: _plain(one) for key, one in inner.items()}
-    return found
+    asked = unnested(given if isinstance(given, Mapping) else {}) | unnested(flags)
+    return load_settings(path, {key: _plain(value) for key, value in asked.items()}, usual=USUAL)
 
 
 def _plain(value: Any) -> Any:

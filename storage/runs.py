@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError, list_some
+from spectralzoom.pipeline.words import is_name, moment_of
 from spectralzoom.storage.store import (
     CAPTURED,
     LATEST,
@@ -29,7 +29,6 @@ from spectralzoom.storage.store import (
     file_problem,
     inputs_first,
     is_known,
-    is_name,
     lies_ahead,
     listed_bytes,
     manifest_path,
@@ -40,25 +39,12 @@ from spectralzoom.storage.store import (
 from spectralzoom.storage.whole_files import entries, refusals
 
 RECEIPT = "receipt.json"
-YEARS = range(1900, 2201)
 _WITH_TIME = re.compile(r"\s*[\dW-]+[^\d-]\d\d")  # a date and an hour, in ISO 8601
-_DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
 LINE_PRODUCTS = {"raw_coarse": "signal_coarse", "raw_fine": "signal_fine"}  # of a run: raw lines, and condensed ones
 LINES = re.compile(rf"stages/({CAPTURED}|condense(_fine)?)/.*")
 DAY_S = 86400.0
 ONLY_COPY = "damaged, and not simulated: restore it from a copy; --raw-too removes it, to read its source again"
 IN_USE = "the archive is in use: run gc again when it is free"
-
-
-def moment_of(text: object) -> datetime | None:
-    """Return the moment or day in ISO 8601 at the begin of a text, in UTC if it names no zone; else None."""
-    if not isinstance(text, str) or not (words := text.split()):
-        return None
-    for some in (" ".join(words), " ".join(words[:2]), words[0], *_DAY.findall(words[0])):
-        with suppress(ValueError):
-            found = datetime.fromisoformat(some)
-            return found.replace(tzinfo=found.tzinfo or UTC) if found.year in YEARS else None
-    return None
 
 
 def dated(*texts: str | None) -> str | None:

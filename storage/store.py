@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, list_some
+from spectralzoom.pipeline.words import CLEARED, PART, UNFINISHED, is_name
 from spectralzoom.storage.whole_files import (
-    PART,
     aside,
     bytes_in,
     entries,
@@ -53,7 +53,7 @@ from spectralzoom.storage.whole_files import (
     sync,
 )
 
-MANIFEST, CLEARED = "manifest.json", ".cleared"
+MANIFEST = "manifest.json"
 RESTS_ON = "rests_on"  # of a run's manifest: address of every store below it -> SHA-256 of its manifest.json
 LATEST = "latest"
 KEY_LENGTH = 20
@@ -61,7 +61,6 @@ SECOND = len("20261120T101701")  # of a run's name: when it was begun
 MOST_LOOKS = 5
 CLOCK_S = 2.0  # clocks of two machines differ by less
 CAPTURED = "capture"  # lines as they came; "condense" and "condense_fine": the same, compressed
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _BUCKET = re.compile(r"(?i)[a-z][a-z0-9+]+:(?=/)")
 _CHUNK = re.compile(r".*\.zarr/.*/c[/.][0-9/.]+")  # of an array; each has a crc32c (arrays.layout)
 
@@ -129,11 +128,6 @@ class Ref:
     def uri(self) -> str:
         """Address relative to the archive."""
         return f"stages/{self.stage}/{self.key}"
-
-
-def is_name(name: str) -> bool:
-    """Return whether this can be the name of a stage, a store or a run."""
-    return _NAME.fullmatch(name) is not None and not name.endswith((PART, CLEARED))
 
 
 def uri_of(address: str) -> str | None:
@@ -520,7 +514,7 @@ class Archive:
         """Return what lies among stores and runs and is neither."""
         loose = [one for one in entries(self.root / "stages") if not is_folder(one)]
         known = {*self._folders("stages"), *self._folders("runs")}
-        return loose + [one for one in self._places() if one not in known and not one.name.endswith((PART, CLEARED))]
+        return loose + [one for one in self._places() if one not in known and not one.name.endswith(UNFINISHED)]
 
     def _places(self) -> list[Path]:
         """Return what lies where stores and runs do."""

@@ -14,16 +14,13 @@ import os
 import secrets
 import shutil
 import tempfile
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError, disk_advice, visible
+from spectralzoom.pipeline.words import PART
 
-PART = ".part"
-MOST_BYTES = 10_000_000  # settings are a page long
 _PREFIX = ".export-"
 PROBE_BYTES = 1 << 20  # a disk without room for so much is full
 
@@ -218,23 +215,3 @@ def _plain(value: object) -> object:
     if hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file, with or without a byte order mark.
-
-    Raises FileNotFoundError: there is no such file. ValueError: it cannot be read as TOML.
-    """
-    try:
-        size = path.stat().st_size
-        if not path.is_file():  # a pipe would be waited for
-            raise ValueError("it is no plain file")
-        if size > MOST_BYTES:
-            raise ValueError(f"it has {size} bytes, settings have a few thousand")
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise ValueError(str(error)) from error
-    except RecursionError:
-        raise ValueError("its lists or tables are nested too deeply") from None

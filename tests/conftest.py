@@ -21,7 +21,7 @@ from rich.console import Console
 
 from spectralzoom.flows import survey_command
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.models.network.segmenter import Segmenter
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis

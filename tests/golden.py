@@ -21,7 +21,6 @@ import tempfile
 import time
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,6 @@ import xarray as xr  # noqa: E402
 
 import spectralzoom  # noqa: E402
 from spectralzoom import OpenedRun  # noqa: E402
-from spectralzoom.flows.settings.survey_settings import Settings  # noqa: E402
 
 GOLDEN = ROOT / "tests" / "golden.json"
 WRITE = "python tests/golden.py"
@@ -47,7 +45,6 @@ Row = dict[str, Any]
 
 BANDS = tuple(range(8, 264, 8))  # 32 of the farm's 270
 FARM: dict[str, Any] = {"scene": "farm", "size": "128x96", "bands": BANDS, "seed": 0, "camera": {"samples": 80}}
-GOING = {"controls": False, "unknown": "off"}  # settings of features that are to go; given while they exist
 NAMED = {"effects": "rotation,slit,smear,shot,read-noise"}
 TWO_PASSES = {"budget": 0.8, **NAMED}
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 1400.0}
@@ -66,8 +63,7 @@ def survey(out: Path, **asked: Any) -> OpenedRun:
 
 
 def _flags(out: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
-    going = {name: value for name, value in GOING.items() if name in {field.name for field in fields(Settings)}}
-    return {**FARM, **going, **asked, "out": str(out / "archive"), "engine": "plain"}
+    return {**FARM, **asked, "out": str(out / "archive"), "engine": "plain"}
 
 
 def survey_raster(out: Path) -> OpenedRun:
@@ -128,7 +124,7 @@ def survey_area(out: Path) -> OpenedRun:
     outline = [[list(place) for place in (*ring, ring[0])] for ring in (AREA, HOLE)]
     feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": outline}}
     (out / "area.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    return survey(out, budget=0.8, effects="none", pose=POSE, zones={"area": str(out / "area.geojson")})
+    return survey(out, budget=0.8, effects="none", pose=POSE, area=str(out / "area.geojson"))
 
 
 def survey_killed(out: Path) -> OpenedRun:

@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Switch
-from spectralzoom.flows.settings.load import OF_THE_PLAN
-from spectralzoom.flows.settings.survey_settings import ALWAYS, RECORDED, Settings
+from spectralzoom.flows.settings.load import unnested
+from spectralzoom.flows.settings.rules import OF_THE_PLAN
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import ALWAYS, RECORDED
 from spectralzoom.flows.tasks.scores import score_of
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
@@ -179,7 +181,7 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """Return the command line of these settings into the archive ``out``; tables are only named.
+    """Return the command line of these settings into the archive ``out``.
 
     A chosen uniform scan stands for the time that it was chosen by. Recorded lines have their own exposures.
     Two passes of recorded lines that state an exposure repeat the plan of their run.
@@ -189,25 +191,21 @@ def command(settings: Mapping[str, Any], out: str) -> str:
     chosen = settings.get("scan_step") and settings.get("zoom") != ALWAYS
     left_out: set[str] = {"seconds"} if chosen else set()
     if settings.get("source") == RECORDED:
-        repeated = settings.get("coarse_exposure_ms") is not None
-        left_out |= {"coarse_exposure_ms", "scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}
-    asked, defaults = (json.loads(to_json(one)) for one in ({**settings, "out": out}, Settings().to_dict()))
+        repeated = settings.get("scan_exposure_ms") is not None and not chosen
+        left_out |= {"scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}
+    asked, usual = (json.loads(to_json(unnested(one))) for one in ({**settings, "out": out}, Settings().to_dict()))
     parts = ["spectralzoom", "survey"]
-    tables: list[str] = []
-    for name, usual in defaults.items():
-        value = asked.get(name, usual)
+    for name, value in asked.items():
         flag = name.replace("_", "-")
-        if value is None or value == usual or name in left_out:
+        if value is None or value == usual.get(name) or name in left_out or name == "notes":
             continue
-        if isinstance(value, dict):
-            tables.append(f"[{name}]")
-        elif isinstance(value, bool):
+        if isinstance(value, bool):
             parts.append(f"--{flag}" if value else f"--no-{flag}")
         elif isinstance(value, list):
             parts += [f"--{flag}", ("x" if name == "size" else ",").join(map(str, value))]
         else:
             parts += [f"--{flag}", str(value)]
-    return shlex.join(parts) + (f"  # with {', '.join(tables)} as in its receipt" if tables else "")
+    return shlex.join(parts)
 
 
 def show_contents(content: dict[str, Any], console: Console) -> None:

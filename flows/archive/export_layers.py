@@ -17,9 +17,9 @@ from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.publish.receipt import Receipt, load_receipt
 from spectralzoom.flows.settings.flags import Switch, split_list
-from spectralzoom.flows.settings.load import time_of_visit
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RIG
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RIG
 from spectralzoom.flows.stages.ground import colours_of
+from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.pipeline.ground.georeference import zoomed_out

@@ -16,10 +16,9 @@ from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.publish.findings import field_figures
 from spectralzoom.flows.publish.receipt_table import finding_rows
-from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import ALWAYS, Settings
-from spectralzoom.flows.settings.values import EXTENT_WHOLE
+from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, HelpAll, SurveyFlags, by_setting, print_every_flag
+from spectralzoom.flows.settings.settings import Settings, load_settings
+from spectralzoom.flows.settings.values import ALWAYS, WHOLE
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.score import load_plan, score
 from spectralzoom.flows.survey import run_stages
@@ -37,7 +36,9 @@ MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
 
 
-def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+def plan(
+    settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, help_all: HelpAll = False
+) -> int:
     """Print what a survey would run: the stages that are stored, those to be made, and estimates.
 
     Estimates are seconds of the camera, bytes, multiply-adds and score, each with its source. Nothing is written. Give
@@ -48,6 +49,8 @@ def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json
     settings
         A survey's TOML file; flags win over it.
     """
+    if help_all:
+        return print_every_flag()
     put_out(plan_content(load_settings(settings, by_setting(flags))), show_plan, as_json=as_json)
     return DONE
 
@@ -77,8 +80,8 @@ def plan_content(settings: Settings) -> dict[str, Any]:
             fine = load_plan(attention)
     zoomed = None if passes.plain else plan
     if passes.plain and plan.scans.two_passes is not None:  # which the planner considered
-        zoomed = plan_survey(open_field(replace(settings, zoom=ALWAYS), planning=True))
-    whole = replace(plan.settings, extent=EXTENT_WHOLE)
+        zoomed = plan_survey(open_field(settings.but(zoom=ALWAYS), planning=True))
+    whole = plan.settings.but(extent=WHOLE)
     uniform = replace(plan, settings=whole, passes=replace(passes, plain=True), extent=None)
     work = uniform.work_done(uniform.likely_patches).total  # of each uniform scan
     best = None if passes.plain else plan.scans.best_in_time(passes.coarse_s + passes.fine_s)

@@ -18,8 +18,8 @@ from rich.markup import escape
 
 from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Scheduler, Switch, Workers, WorkersBucket
-from spectralzoom.flows.settings.load import load_settings, of_this_version, parse_settings
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, RIG, Settings
+from spectralzoom.flows.settings.settings import OF_THE_MACHINE, Settings, load_settings, parse_settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
 from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.recorded_field import open_recorded
@@ -134,7 +134,7 @@ def _settings_of(
     prior = settings.prior
     while (newer := renewed.get(prior, prior)) != prior:
         prior = newer
-    settings = replace(settings, prior=prior, **here)
+    settings = settings.but(prior=prior, **here)
     shown = _is_there(run, settings)
     rows = dry_run(settings)[1].rows if shown else {}
     if shown and run.problem is None and all(row.state == "cached" for row in rows.values()):
@@ -252,5 +252,6 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
-    known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE)
+    known = {key: value for key, value in run.settings.items() if key in Settings.model_fields}
+    known |= dict.fromkeys(OF_THE_MACHINE)
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})

@@ -19,7 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from spectralzoom.flows.settings.flags import AsJson, Switch
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, stderr
 from spectralzoom.pipeline.errors import PipelineError, RigError

@@ -8,7 +8,6 @@ import re
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,8 +27,7 @@ from spectralzoom.flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_d
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.prefect_flow import survey
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.tasks.local_server import check_answers, local_server, quiet_environment
 from spectralzoom.flows.tasks.rig_field import RIG_LIMIT
 from spectralzoom.flows.tasks.survey_model import weights_path
@@ -37,8 +35,9 @@ from spectralzoom.flows.terminal.processes import DONE, terminable
 from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
+from spectralzoom.pipeline.toml_files import read_toml
 from spectralzoom.storage.store import Archive
-from spectralzoom.storage.whole_files import locked, read_toml
+from spectralzoom.storage.whole_files import locked
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -111,7 +110,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> dict[Path, Set
             raise SettingsError(
                 f'{fields[name][0]} and {file} are both called {name}: give one of them another name = "..."'
             )
-        settings = replace(settings, name=name, out=str(Path(settings.out).absolute()))
+        settings = settings.but(name=name, out=str(Path(settings.out).absolute()))
         try:
             plan_survey(open_field(settings, planning=True))
         except NoSceneYet as error:

@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.field import make_source, view_of
+from spectralzoom.flows.plan import pool_of
 from spectralzoom.flows.publish.receipt_table import print_effects
 from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse
 from spectralzoom.flows.stages.effects import choose_effects, load_manifest
@@ -116,7 +116,7 @@ def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequenc
         request=SweepRequest.of(sweeps, settings.camera, settings.cost),
         view=view_of(settings, scene, source, settings.name or Path(scene.name).stem),
         source=source,
-        pool=settings.pool,
+        pool=pool_of(settings),
     )
     return effects, raw
 

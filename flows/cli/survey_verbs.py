@@ -11,9 +11,8 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 from rich.markup import escape
 
-from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, SurveyFlags, by_setting
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, HelpAll, SurveyFlags, by_setting, print_every_flag
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.terminal.processes import format_failure
 from spectralzoom.flows.terminal.progress import print_json, say, stderr, table
 from spectralzoom.pipeline.errors import SurveyStopped
@@ -23,7 +22,13 @@ Verbose = Annotated[
 ]
 
 
-def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False, verbose: Verbose = False) -> int:
+def survey(
+    *settings: Path,
+    flags: SurveyFlags = NO_FLAGS,
+    as_json: AsJson = False,
+    verbose: Verbose = False,
+    help_all: HelpAll = False,
+) -> int:
     """Survey a field: capture it in one or two passes, map its classes, and publish a receipt and a report.
 
     If a survey fails, the next ones still run. The exit code is that of the last failure. With --json several surveys
@@ -35,6 +40,8 @@ def survey(*settings: Path, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = Fal
     settings
         Settings files (TOML), surveyed one after the other; flags override each. Default: none.
     """
+    if help_all:
+        return print_every_flag()
     from spectralzoom.flows.cli.tiles import COLUMNS, tiles_of  # numpy and readers take a second
 
     files = settings or (None,)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, SIM, Settings
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RASTER, SIM
 from spectralzoom.flows.tasks.scene import DATE, check_scene_there
 from spectralzoom.flows.tasks.scores import format_prediction
 from spectralzoom.flows.terminal.figures import format_percent, format_points, format_seconds, spaced
@@ -48,7 +48,7 @@ def tiles_of(settings: Settings) -> list[Settings]:
             f"--scene {scene} has {len(files)} scenes, and --labels fits one; lay labels beside each scene"
         )
     prefix = "" if settings.name is None else f"{settings.name}-"
-    return [replace(settings, scene=str(file), name=f"{prefix}{file.stem}") for file in files]
+    return [settings.but(scene=str(file), name=f"{prefix}{file.stem}") for file in files]
 
 
 def tile_row(scene: str, published: Published, seconds: float) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from spectralzoom.flows.settings.survey_settings import RASTER
+from spectralzoom.flows.settings.values import RASTER
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import damage

@@ -35,10 +35,11 @@ from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.pipeline.planning.uniform_scans import format_scan
+from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
-from spectralzoom.storage.runs import RECEIPT, moment_of
+from spectralzoom.storage.runs import RECEIPT
 from spectralzoom.storage.whole_files import to_json
 
 REPORT = "report.html"

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from dataclasses import asdict, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 from pydantic import BeforeValidator
 
 from spectralzoom.flows.settings.documents import about, toml_value
-from spectralzoom.flows.settings.load import FLAGS, SURVEY, TABLES
+from spectralzoom.flows.settings.load import declared
+from spectralzoom.flows.settings.settings import MACHINE, OUTPUT, SCENE, TIME, Settings
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.setting_fields import numbers_of
 
@@ -40,42 +42,61 @@ Names = Annotated[  # with commas, one a flag, or both
     Parameter(negative="", converter=lambda _, tokens: split_list(",".join(token.value for token in tokens))),
     BeforeValidator(split_list),
 ]
-IN_TABLES = {flag: setting for setting, flag in FLAGS.items()}
-_IN_TABLES = {name: place.partition(".") for name, place in IN_TABLES.items()}
-_DECLARED = SURVEY | {name: TABLES[table][key] for name, (table, _, key) in _IN_TABLES.items()}
+HelpAll = Annotated[bool, Parameter(negative="", help="Print the flags of every setting, and exit.")]
+GROUPS = {name: Group(name, sort_key=number) for number, name in enumerate((SCENE, TIME, OUTPUT, MACHINE))}
+KEYS = tuple(f"{table}.{key}".lstrip(".") for table, keys in declared(Settings).items() for key in keys)
 
 
-def _flags(names: Iterable[str]) -> Any:
-    """Return a dataclass of flags for these settings; None stands for a flag that is not given."""
+def _flags(keys: Iterable[str], *, all_shown: bool) -> Any:
+    """Return a dataclass of flags for settings such as ``camera.samples``; None stands for a flag that is not given.
+
+    The first page of the help has the settings of a group, and the others if ``all_shown``.
+    """
     made = []
-    for name in names:
-        one = _DECLARED[name]
-        kind: Any = bool if one.kind is bool else str
-        help_text = about(one) + ("" if one.item.default is None else f"; default: {toml_value(one).strip(chr(34))}")
-        made.append((name, Annotated[kind | None, Parameter(help=help_text)], None))
+    for full in keys:
+        table, _, key = full.rpartition(".")
+        one = declared(Settings)[table][key]
+        usual = "" if one.get("default") is None else f"; default: {toml_value(one).strip(chr(34))}"
+        kind: Any = bool if one.get("type") == "boolean" else str
+        page: Any = {"group": GROUPS[one["group"]]} if one["group"] else {"show": all_shown}
+        flag = Parameter(name=f"--{full.replace('_', '-')}", help=about(one) + usual, **page)
+        made.append((full.replace(".", "__"), Annotated[kind | None, flag], None))
     return make_dataclass("Flags", made, frozen=True, kw_only=True)
 
 
-_RENDERING = ("effects", "seed", "day", "hour", "interest", "sky", "light_fraction", "bands", "wavelengths")
+RENDERING = ("effects", "seed", "day", "hour", "interest", "bands", "wavelengths", "tol", "size", "workers")
+SIMULATED = ("camera.", "optics.", "mirror.", "detector.", "air.", "sky.")
+OF_A_SIMULATION = tuple(key for key in KEYS if key in RENDERING or key.startswith(SIMULATED))
 
 
 @Parameter(name="*")
-class SurveyFlags(_flags(name for name in _DECLARED if name not in TABLES or name in IN_TABLES)):  # type: ignore[misc]
+class SurveyFlags(_flags(KEYS, all_shown=False)):  # type: ignore[misc]
     """Flags of all settings of a survey."""
 
 
 @Parameter(name="*")
-class SimulationFlags(_flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))):  # type: ignore[misc]
+class SimulationFlags(_flags(OF_A_SIMULATION, all_shown=True)):  # type: ignore[misc]
     """Flags of a simulated scan."""
 
 
 def by_setting(flags: Any) -> dict[str, object]:
     """Return the values of flags by setting, for `load_settings`."""
-    return {IN_TABLES.get(name, name): value for name, value in asdict(flags).items()}
+    return {name.replace("__", "."): value for name, value in asdict(flags).items()}
 
 
 NO_FLAGS = SurveyFlags()
 NO_SIMULATION_FLAGS = SimulationFlags()
+
+
+def print_every_flag() -> int:
+    """Print every setting with its flag, table by table; return the exit code."""
+    for title, keys in declared(Settings).items():
+        print(f"\n[{title}]  {Settings.model_fields[title].description}" if title else "")
+        for key, one in keys.items():
+            flag = f"--{title}.{key}".replace("--.", "--no-" if one.get("default") is True else "--").replace("_", "-")
+            usual = "" if one.get("default") in (None, "") else f"; default: {toml_value(one)}"
+            print(textwrap.fill(f"{flag:28} {about(one)}{usual}", 120, subsequent_indent=" " * 29))
+    return 0
 
 
 def check_outside(out: Path, root: Path) -> Path:

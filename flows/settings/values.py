@@ -9,23 +9,28 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, ByteSize, PlainSerializer, TypeAdapter, ValidationError
 
 from spectralzoom.pipeline.errors import BudgetError
 from spectralzoom.pipeline.planning.partial_scans import LineRun
-from spectralzoom.pipeline.setting_fields import format_number, numbers_of
+from spectralzoom.pipeline.setting_fields import numbers_of, parse_text
 from spectralzoom.pipeline.simulator.effects.probe import Unit
 from spectralzoom.pipeline.simulator.render import BY_NAME
+from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
 from spectralzoom.pipeline.simulator.selection.choice import named_effects
-from spectralzoom.storage.parallel.pool import WorkerPool
-from spectralzoom.storage.runs import YEARS, moment_of
-from spectralzoom.storage.store import is_name
+from spectralzoom.pipeline.words import YEARS, is_name, is_scheduler, moment_of
+
+BUILT_IN_SCENES = BUILT_IN_NAMES
+RIG_FIELD = "field"  # scene in front of a rig or in a recording: only its size and bands are known
+ALWAYS: Literal["always"] = "always"  # values of the setting `zoom`
+NEVER: Literal["never"] = "never"
+AUTO: Literal["auto"] = "auto"  # of the settings `zoom`, `source` and `prior`
+SIM, RIG, RASTER, RECORDED = "sim", "rig", "raster", "recorded"  # of the setting `source`
 
 LEAST_MEMORY = 256 * 1024**2
-EXTENT_WHOLE, EXTENT_PART = "whole", "part"
+WHOLE, PART = "whole", "part"  # of the setting `extent`
 KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
 _BYTES = TypeAdapter(ByteSize)
 _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d(?!\d)")
@@ -40,17 +45,6 @@ class Tolerance:
 
     def __str__(self) -> str:
         return f"{self.value!r}" + ("" if self.unit == "sigma" else "dn")
-
-
-def parse_text(value: object) -> str:
-    """Return text that is not empty."""
-    if isinstance(value, date):  # of a TOML file
-        return value.isoformat()
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"must be text that is not empty, got {value!r}")
-    if "\0" in value:
-        raise ValueError(f"must be text without a null character, got {value!r}")
-    return value
 
 
 def parse_name(value: object) -> str:
@@ -114,6 +108,17 @@ def parse_memory(value: object) -> int:
     return count
 
 
+def parse_scheduler(value: object) -> str:
+    """Return threads, processes, or the address of a dask scheduler."""
+    text = parse_text(value)
+    if not is_scheduler(text):
+        raise ValueError(
+            "must be threads, processes, or the address of a dask scheduler such as tcp://192.168.1.5:8786; "
+            f"got {text!r}"
+        )
+    return text
+
+
 def parse_size(value: object) -> tuple[int, int]:
     """Return (width, height) [px], from text such as 1280x1024 or from two whole numbers."""
     parts = re.split("[x,]", value.lower()) if isinstance(value, str) else value
@@ -132,21 +137,6 @@ def parse_effects(value: object) -> str:
     chosen = named_effects(",".join(words), list(BY_NAME))
     alone = words in (["auto"], ["all"], ["none"])
     return words[0] if alone or chosen is None else ",".join(name for name in BY_NAME if name in chosen)
-
-
-def parse_moment(value: object) -> datetime:
-    """Return a date and time in UTC, from one with its time zone as TOML writes it."""
-    moment = value
-    if isinstance(value, str):
-        try:
-            moment = datetime.fromisoformat(value)
-        except ValueError:
-            moment = None
-    if not isinstance(moment, datetime):
-        raise ValueError(f"must be a date and time with its zone, such as 2026-06-01T12:00:00+02:00; got {value}")
-    if moment.tzinfo is None:
-        raise ValueError(f"needs a time zone: write {moment.isoformat()}Z for UTC; got {value}")
-    return moment.astimezone(UTC)
 
 
 def parse_tolerance(value: object) -> Tolerance:
@@ -179,7 +169,7 @@ def parse_wavelengths(value: object) -> tuple[float, ...]:
     for item in _items(value):
         wave = _to_float(item)
         if wave is None or not low <= wave <= high:
-            raise ValueError(f"must each be {format_number(low, high, 'nm')}, got {item!r}")
+            raise ValueError(f"must each be a number from {low} to {high} nm, got {item!r}")
         waves.append(wave)
     if not waves:
         raise ValueError(f"must list wavelengths in nm, such as 660,800; got {value!r}")
@@ -189,7 +179,7 @@ def parse_wavelengths(value: object) -> tuple[float, ...]:
 def parse_extent(value: object) -> str:
     """Return ``whole``, ``part``, or runs of lines such as 0:12-310,1:0-40."""
     word = str(value).strip().lower()
-    return word if word in (EXTENT_WHOLE, EXTENT_PART) else format_extent(parse_extent_runs(word))
+    return word if word in (WHOLE, PART) else format_extent(parse_extent_runs(word))
 
 
 def parse_extent_runs(text: str) -> tuple[LineRun, ...]:
@@ -242,14 +232,16 @@ def to_whole(value: object) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
-Name = Annotated[str, PlainValidator(parse_name)]
-VisitName = Annotated[str, PlainValidator(parse_visit)]
-Budget = Annotated[float, PlainValidator(parse_budget)]
-Compute = Annotated[str, PlainValidator(parse_compute)]
-Memory = Annotated[int, PlainValidator(parse_memory)]
-Scheduler = Annotated[str, PlainValidator(lambda value: WorkerPool(parse_text(value)).scheduler)]
-Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
-Effects = Annotated[str, PlainValidator(parse_effects)]
-Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
-Extent = Annotated[str, PlainValidator(parse_extent)]
-Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]
+# each is read by its own parser; a form offers the type behind the parser
+Name = Annotated[str, BeforeValidator(parse_name, str)]
+VisitName = Annotated[str, BeforeValidator(parse_visit, str)]
+Budget = Annotated[float, BeforeValidator(parse_budget, float | str)]
+Compute = Annotated[str, BeforeValidator(parse_compute, str | float)]
+Memory = Annotated[int, BeforeValidator(parse_memory, str | int)]
+Scheduler = Annotated[str, BeforeValidator(parse_scheduler, str)]
+Size = Annotated[tuple[int, int], BeforeValidator(parse_size, str | list[int])]
+Effects = Annotated[str, BeforeValidator(parse_effects, str | list[str])]
+Bands = Annotated[tuple[int, ...], BeforeValidator(parse_bands, str | list[int])]
+Extent = Annotated[str, BeforeValidator(parse_extent, str)]
+Wavelengths = Annotated[tuple[float, ...], BeforeValidator(parse_wavelengths, str | list[float])]
+Limit = Annotated[Tolerance, BeforeValidator(parse_tolerance, str | float), PlainSerializer(str)]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.frame import FieldFrame
-from spectralzoom.flows.settings.survey_settings import SignalChoice
+from spectralzoom.flows.settings.settings import SignalChoice
 from spectralzoom.flows.stage import Output, Report, Unkeyed, stage
 from spectralzoom.flows.stages.capture import RIG_RECORD
 from spectralzoom.pipeline.errors import IncompleteStoreError, SceneError

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.settings.survey_settings import ALWAYS, AUTO, NEVER, RECORDED, Settings
-from spectralzoom.flows.settings.values import EXTENT_WHOLE, parse_extent_runs
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import ALWAYS, AUTO, NEVER, RECORDED, WHOLE, parse_extent_runs
 from spectralzoom.models.weights.files import Description
 from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
 from spectralzoom.pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
@@ -64,9 +64,8 @@ class PassLayout:
     cost: CostModel
     pointing_px: float = 0.0  # maximum pointing error
     step: int | None = None  # line spacing of a uniform scan; None: two passes
-    exposure_ms: float | None = None  # of a uniform scan; None: the camera's
-    coarse_exposure_ms: float | None = None
-    extent: str = EXTENT_WHOLE  # of a uniform scan
+    exposure_ms: float | None = None  # of a uniform scan, or of the first pass; None: the camera's
+    extent: str = WHOLE  # of a uniform scan
     first_step: int = FIRST_STEP  # line spacing of the first of two passes
     as_taken: bool = False  # use all lines of a recording
     shown: NDArray[np.bool_] | None = None  # (patch,) to capture; None: all, also of a scan that is used as taken
@@ -90,7 +89,6 @@ class PassLayout:
             settings.pointing_px,
             step if as_taken is None else max(sweep.step for sweep in as_taken),
             settings.scan_exposure_ms,
-            settings.coarse_exposure_ms,
             settings.extent,
             FIRST_STEP if settings.scan_step is None else settings.scan_step,
             as_taken is not None,
@@ -100,7 +98,7 @@ class PassLayout:
 
     def uniform(self, step: int, exposure_ms: float | None = None) -> PassLayout:
         """Return the layout of a uniform scan of the whole field."""
-        return replace(self, step=step, exposure_ms=exposure_ms, extent=EXTENT_WHOLE, as_taken=False)
+        return replace(self, step=step, exposure_ms=exposure_ms, extent=WHOLE, as_taken=False)
 
     def plan(self, budget: float | None, seconds: float | None = None) -> CapturePlan:
         """Return the first pass and the full scan; with pointing errors, sweeps overlap and are longer.
@@ -121,9 +119,9 @@ class PassLayout:
                 limit = f"--seconds {seconds:g}" if budget is None else f"a --budget of {budget:g}, {limit_s:.2f} s,"
                 fixed = self.cost.seconds([replace(one, lines=0) for one in coarse], self.camera)
                 ways = ["give more"] if budget is None or coarse_s <= whole_s else []
-                longer = budget is not None or self.coarse_exposure_ms is None  # than the shortest, for --seconds
-                ways += ["give a shorter --coarse-exposure-ms"] * (longer and self.recorded is None and fixed < limit_s)
-                left_out = "--zoom never" if budget is None else "without --budget, --policy and --coarse-exposure-ms"
+                longer = budget is not None or self.exposure_ms is None  # than the shortest, for --seconds
+                ways += ["give a shorter --scan-exposure-ms"] * (longer and self.recorded is None and fixed < limit_s)
+                left_out = "--zoom never" if budget is None else "without --budget and --policy"
                 raise BudgetError(
                     f"{limit} is below the time of the first pass of every {self.first_step}th line, "
                     f"{coarse_s + 0.01:.2f} s of the full scan's {whole_s:.2f} s; "
@@ -157,9 +155,9 @@ class PassLayout:
             )
         else:
             swept = full_sweeps(grid, camera, along, overlap_px=self._overlap(self.first_step))
-            scan_passes = every_nth(swept, self.first_step, self.coarse_exposure_ms)
+            scan_passes = every_nth(swept, self.first_step, self.exposure_ms)
         scan_passes = cut(scan_passes)
-        if self.extent != EXTENT_WHOLE:
+        if self.extent != WHOLE:
             scan_passes = sweeps_of_runs(scan_passes, parse_extent_runs(self.extent))
         scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
         if self.recorded is None:
@@ -236,7 +234,7 @@ def choose_uniform_scan(
     scans = uniform_scans(record, sweeps, camera, layout.cost, bands, seconds=settings.seconds, recorded_ms=recorded_ms)
     chosen = None
     exposure_ms = (recorded_ms or {}).get(layout.step or 0) or layout.exposure_ms or camera.exposure_ms
-    if layout.extent != EXTENT_WHOLE:  # the table is for whole fields
+    if layout.extent != WHOLE:  # the table is for whole fields
         pass
     elif layout.step in sweeps and record.knows(exposure_ms):
         chosen = priced_scan(record, sweeps[layout.step], camera, layout.cost, bands, exposure_ms)
@@ -272,7 +270,7 @@ def lay_out_passes(
         and chosen.expected[MIOU] < max(one.expected[MIOU] for one in scans.offered) - NEARLY
         and len(layout.sweeps()[2]) >= LEAST_SWATHS
     )
-    seconds = settings.seconds if settings.coarse_exposure_ms is None else None
+    seconds = settings.seconds if settings.scan_exposure_ms is None else None
     if content is not None and seconds is not None and (settings.zooms or may_pay):
         record = ScanPerformance.read(content, settings.sky.fraction_of_clear)
         first = choose_first_pass(layout, record, seconds, (settings.scan_step,) if settings.scan_step else FIRST_STEPS)
@@ -280,7 +278,7 @@ def lay_out_passes(
     notes = tuple[str, ...]()
     if settings.zoom == AUTO:
         pays = first is not None and chosen is not None and first.expected >= chosen.expected[MIOU] - NEARLY
-        settings = replace(settings, zoom=ALWAYS if pays and not settings.zooms else NEVER)
+        settings = settings.but(zoom=ALWAYS if pays and not settings.zooms else NEVER)
         if pays and first is not None and chosen is not None:
             notes = (
                 f"two passes: {format_scan(first.step, first.exposure_ms)} first, then lines of the highest expected "
@@ -291,19 +289,19 @@ def lay_out_passes(
         layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
         if first is not None:
             exposure_ms = first.exposure_ms if layout.recorded is None else None  # recorded lines have their own
-            layout = replace(layout, first_step=first.step, coarse_exposure_ms=exposure_ms)
-            settings = replace(settings, coarse_exposure_ms=exposure_ms)
-        settings = replace(settings, scan_step=layout.first_step if settings.zoom == ALWAYS else None)
+            layout = replace(layout, first_step=first.step, exposure_ms=exposure_ms)
+            settings = settings.but(scan_exposure_ms=exposure_ms)
+        settings = settings.but(scan_step=layout.first_step if settings.zoom == ALWAYS else None)
         return layout.plan(settings.budget, settings.seconds), replace(scans, chosen=None), settings, notes
     if chosen is not None and (layout.step is None or (layout.recorded is not None and not layout.as_taken)):
         layout = replace(layout, step=chosen.step, exposure_ms=chosen.exposure_ms)
     step = None if layout.as_taken else layout.step
-    settings = replace(settings, scan_step=step, scan_exposure_ms=layout.exposure_ms, extent=layout.extent)
+    settings = settings.but(scan_step=step, scan_exposure_ms=layout.exposure_ms, extent=layout.extent)
     if layout.step is not None or settings.plain:
         return layout.plan(None), scans, settings, ()
     why = "have no record of scans to choose by" if content is None else "know no scan of this exposure or shorter"
     note = f"every line is captured: the weights {why}"
-    return layout.uniform(1).plan(None), scans, replace(settings, scan_step=1), (note,)
+    return layout.uniform(1).plan(None), scans, settings.but(scan_step=1), (note,)
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,17 @@ from pathlib import Path
 from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.settings.load import anchor_paths
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from spectralzoom.flows.settings.values import EXTENT_PART
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, PART
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX, shift_px
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore
 from spectralzoom.storage.arrays.georeference import load_geobox
-from spectralzoom.storage.runs import Run, dated, has_time, moment_of, read_run
+from spectralzoom.storage.runs import Run, dated, has_time, read_run
 from spectralzoom.storage.store import Archive, Ref, run_stem
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
@@ -28,7 +29,7 @@ PROBABILITIES = "class_probabilities"  # a product of runs
 PRIOR_FIGURES = "prior_map.json"  # beside a map: the figures of its prior map
 OF_THE_LIGHT = (  # settings that two runs of the same captured light share
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
-    *("extent", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy"),
+    *("extent", "scan_step", "scan_exposure_ms", "budget", "policy"),
 )
 
 
@@ -96,7 +97,7 @@ def _before(archive: Archive, settings: Settings, name: str, scene: RasterScene)
     found: list[tuple[float, int, Run]] = []
     asked = anchor_paths(settings.to_dict(), Path.cwd())
     # The prior map may choose the extent: then the extent does not identify the light.
-    chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == EXTENT_PART else ()
+    chosen = ("extent", "scan_step", "scan_exposure_ms") if settings.extent == PART else ()
     light = [key for key in OF_THE_LIGHT if key not in chosen]
     for number, folder in enumerate(reversed(archive.runs())):
         if run_stem(name) not in folder.name:  # no receipt has to be read for that

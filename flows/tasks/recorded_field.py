@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.settings.load import time_of_visit
-from spectralzoom.flows.settings.survey_settings import MOST_STEP, RECORDED, Settings
+from spectralzoom.flows.settings.load import merged, nested
+from spectralzoom.flows.settings.rules import OF_THE_PLAN, changed
+from spectralzoom.flows.settings.settings import MOST_STEP, Settings, parse_settings
+from spectralzoom.flows.settings.values import ALWAYS, BUILT_IN_SCENES, RECORDED
 from spectralzoom.flows.tasks.scene import FieldSource, unlit_scene
+from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.flows.terminal.figures import known_number
 from spectralzoom.pipeline.capture.recorded import RecordedSource
 from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
@@ -24,9 +29,38 @@ from spectralzoom.pipeline.source import Source
 from spectralzoom.storage.readers.recordings import Recording, find_recorded_run, open_recording
 from spectralzoom.storage.readers.scene_files import load_field_labels
 from spectralzoom.storage.runs import Run
-from spectralzoom.storage.store import stage_key
+from spectralzoom.storage.store import is_archive, stage_key
 
 OFF_CENTRE_PX = 0.5  # least offset of a recorded field that is noted
+OF_THE_RUN = (
+    *("camera", "cost", "rig", "pose", "area", "plots", "plots_name", "resampling", "pointing_px", "seed", "sky"),
+    *("weights", "expected_loss", "signal"),
+)
+BUILT_IN_WEIGHTS = "farm"
+
+
+def as_its_run(settings: Settings) -> Settings:
+    """Return settings of recorded sweeps with those of the run that took them, where nothing else is stated.
+
+    So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did, and its visit is the time of that run.
+    Raises SceneError, ArchiveError: there is no such recording or run.
+    """
+    found = None if settings.sweeps is None else find_recorded_run(settings.sweeps)
+    if found is None:
+        return settings
+    run, shape, _ = found
+    requested = set(changed(settings, *OF_THE_PLAN))
+    uniform = run.settings.get("zoom") != ALWAYS and (run.settings.get("seconds") or run.settings.get("scan_step"))
+    another_plan = requested - {"macs"} if uniform else requested & {"seconds", "scan_step", "macs"}
+    names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
+    usual = {name: run.settings[name] for name in names if run.settings.get(name) is not None}
+    usual |= {"name": str(run.receipt.get("survey") or run.folder.name), "visit": time_of_visit(run)}
+    usual |= {} if shape is None else {"size": shape[::-1]}
+    if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
+        usual["weights"] = BUILT_IN_WEIGHTS
+    stated = settings.to_dict()
+    kept = {key: reduce(getitem, key.split("."), stated) for key in changed(settings, *usual)}
+    return parse_settings({**stated, **merged(usual, nested(kept))})
 
 
 @dataclass(frozen=True)
@@ -85,9 +119,17 @@ class OpenedRecording:
 def open_recorded(settings: Settings) -> OpenedRecording:
     """Open the recording of the settings, without reading lines.
 
+    Settings that are not stated are those of the run that took the lines.
+
     Raises SceneError, WavelengthError, SettingsError, ArchiveError, PoseError: as `open_recording`, or its lines are
     too far apart.
     """
+    sweeps, out = Path(str(settings.sweeps)).resolve(), Path(settings.out).resolve()
+    if out == (sweeps.parent if sweeps.is_file() else sweeps) and not is_archive(settings.out):
+        raise SettingsError(
+            f"--out {settings.out} is the folder of the sweeps, and would hide them; choose another one"
+        )
+    settings = as_its_run(settings)
     recording = open_recording(
         str(settings.sweeps),
         settings.camera,
@@ -111,7 +153,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         if of_run == shape and settings.pose is None:
             geobox = place
             recording = replace(recording, pixel_m=_pixel_of(run))
-    settings = replace(settings, camera=camera, size=shape[::-1])
+    settings = settings.but(camera=camera, size=shape[::-1])
     if settings.as_taken:
         step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
         if step > MOST_STEP:

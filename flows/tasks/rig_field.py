@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from spectralzoom.flows.settings.survey_settings import RIG, Settings
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import RIG
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.scene import FieldSource
 from spectralzoom.pipeline.errors import RigError

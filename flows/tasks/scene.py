@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM, Settings
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM
 from spectralzoom.models.weights.files import Description, Weights
 from spectralzoom.pipeline.errors import NoSceneYet, SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
@@ -55,7 +56,7 @@ def scene_of_visit(settings: Settings, moment: datetime) -> Settings:
         raise SettingsError(f"--scene {settings.scene}: {error} is not allowed; braces are {{date:%Y-%m-%d}}") from None
     if not split_variable(found)[0].exists():
         raise NoSceneYet(f"there is no file {found} yet, which --scene {settings.scene} stands for")
-    return replace(settings, scene=found)
+    return settings.but(scene=found)
 
 
 def check_scene_there(scene: str) -> None:
@@ -352,4 +353,4 @@ def for_rig(settings: Settings) -> Settings:
     """Return settings in which a visit of a rig has a name."""
     if settings.source != RIG or settings.visit is not None:
         return settings
-    return replace(settings, visit=f"{datetime.now(UTC):%Y-%m-%d}")
+    return settings.but(visit=f"{datetime.now(UTC):%Y-%m-%d}")

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES
 from spectralzoom.models.network.machine import choose_device
 from spectralzoom.models.network.spectral import project
 from spectralzoom.models.weights.files import (
@@ -125,8 +126,8 @@ def beyond_training(
         found += _season(settings.moment, trained, now=settings.source == "rig")
         usual = settings.camera.exposure_ms
         least = trained.exposure_ms[0]
-        one, other = settings.scan_exposure_ms or usual, settings.coarse_exposure_ms or usual
-        shortest = (one if settings.plain else min(usual, other)) * scene.light_fraction
+        taken = settings.scan_exposure_ms or usual
+        shortest = (taken if settings.plain else min(usual, taken)) * scene.light_fraction
         if shortest < DARKER * least and not settings.is_map:  # a raster has no exposures
             under = "" if scene.light_fraction == 1 else " under a clear sky, by their light"
             found.append(f"exposures of {shortest:g} ms{under} (training: {least:g} ms and more, by --min-exposure-ms)")

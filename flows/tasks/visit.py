@@ -1,25 +1,27 @@
-"""The visit of a survey: when a run of a deployment was due."""
+"""The visit of a survey: when a run of a deployment was due, and when a published run was captured."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from datetime import UTC, datetime
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from spectralzoom.flows.settings.parameters import SurveySettings
-from spectralzoom.flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.tasks.scene import scene_of_visit
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.readers.open_cubes import open_cube_source
+from spectralzoom.storage.runs import Run
 
 
-def settings_of_visit(parameters: SurveySettings) -> Settings:
+def settings_of_visit(settings: Settings) -> Settings:
     """Return the settings of a run; a run of a deployment is a visit of its due time.
 
     Raises SettingsError, SceneError: the settings or the raster cannot be used.
     """
     due = due_time()
-    settings = parameters.settings()
     return settings if due is None else at_due_time(scene_of_visit(settings, due.astimezone()), due)
 
 
@@ -40,7 +42,7 @@ def name_of_flow_run() -> str:
     """Return the name of the present flow run: ``survey``, the field, and the visit if it has a name or a due time."""
     from prefect.runtime import flow_run
 
-    settings = flow_run.parameters["settings"].settings()
+    settings = flow_run.parameters["settings"]
     due = due_time()
     visit = settings.visit or (None if due is None else _named(due))
     return "-".join(["survey", settings.name or Path(settings.scene).stem, *([] if visit is None else [visit])])
@@ -57,11 +59,27 @@ def at_due_time(settings: Settings, due: datetime) -> Settings:
     The farm has the day of the due time in this machine's time zone. Stated values of visit, day and prior are kept.
     """
     acquired = open_cube_source(settings.scene).acquired if settings.is_map and settings.visit is None else None
-    requested = replace(
-        settings,
-        visit=settings.visit or acquired or _named(due),
-        prior="latest" if settings.prior == "auto" else settings.prior,
+    requested = settings.but(
+        visit=settings.visit or acquired or _named(due), prior="latest" if settings.prior == "auto" else settings.prior
     )
     if requested.source == "sim" and requested.scene in BUILT_IN_SCENES and requested.day is None:
-        return replace(requested, day=due.astimezone().timetuple().tm_yday)
+        return requested.but(day=due.astimezone().timetuple().tm_yday)
     return requested
+
+
+def time_of_visit(run: Run) -> str | None:
+    """Return the moment of a run's visit or file, else day and hour of a built-in scene, else when the run began.
+
+    A day of a built-in scene counts in the year of the run. The moment is in ISO 8601 in UTC; None: nothing is known.
+    """
+    named = moment_of(run.acquired)
+    began = moment_of(run.receipt.get("started")) or moment_of(run.created)
+    found = named or began
+    with suppress(TypeError, ValueError, OverflowError):
+        if named is None and began is not None and run.settings.get("scene") in BUILT_IN_SCENES:
+            day, hour = (run.settings.get(name) for name in ("day", "hour"))
+            grown = timedelta(days=(USUAL_DAY if day is None else day) - 1, hours=USUAL_HOUR if hour is None else hour)
+            found = datetime(began.astimezone(UTC).year, 1, 1, tzinfo=UTC) + grown
+    with suppress(OverflowError):
+        return None if found is None else found.astimezone(UTC).isoformat()
+    return None

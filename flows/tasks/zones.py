@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from spectralzoom.flows.settings.survey_settings import Settings, ZoneChoice
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.pipeline.errors import ZoneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, NoPlace, PlacedPicture, PosedField
@@ -65,8 +65,8 @@ def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
     return PosedField(ground_grid(view, scene.shape))
 
 
-def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZones:
-    """Read the ``files`` of the settings, and transform their polygons to the field.
+def open_zones(settings: Settings, place: FieldPlace, grid: SceneGrid) -> SurveyZones:
+    """Read the files of area and plots of the settings, and transform their polygons to the field.
 
     Raises ZoneError: a file is not valid, the field has no place on the earth, or area or plots lie outside of it.
     """
@@ -83,12 +83,12 @@ def open_zones(files: ZoneChoice, place: FieldPlace, grid: SceneGrid) -> SurveyZ
             raise ZoneError(_format_beside(found, on))
         return shapes
 
-    area = None if files.area is None else tuple(read(files.area).values())
-    plots = None if files.plots is None else read(files.plots, named_by=files.plots_name)
+    area = None if settings.area is None else tuple(read(settings.area).values())
+    plots = None if settings.plots is None else read(settings.plots, named_by=settings.plots_name)
     inside = None if area is None else pixels_inside(area, shape)
     if inside is not None and not inside.any():
         raise ZoneError(
-            f"the area of {files.area} contains no pixel centre: it is smaller than a pixel of this field; give a "
+            f"the area of {settings.area} contains no pixel centre: it is smaller than a pixel of this field; give a "
             "larger one, or leave it out"
         )
     return SurveyZones(place, grid, None if inside is None or inside.all() else inside, plots, tuple(notes))

@@ -5,20 +5,19 @@ Positions along the line and along the scan are in px: one IFOV in the tangent p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.setting_fields import assumed, stated
+from spectralzoom.pipeline.setting_fields import assumed, settings_table, stated
 
 Number = TypeVar("Number", float, NDArray[np.float64])
 ONE_DRAW_READ_NOISE_E = 10.0
 LARGEST_SUM_DN = 65535
 
 
-@dataclass(frozen=True)
+@settings_table
 class LineCamera:
     """A pushbroom camera behind the mirror. Values marked as assumed are not measured on a unit.
 

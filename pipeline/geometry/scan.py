@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry import mirror
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.setting_fields import stated
+from spectralzoom.pipeline.setting_fields import settings_table, stated
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]
@@ -69,16 +69,15 @@ def merged_ms(exposure_ms: ArrayLike, weights: Sequence[float] | None = None) ->
     return float(np.average(np.asarray(exposure_ms, np.float64) ** -2.0, weights=weights) ** -0.5)
 
 
-@dataclass(frozen=True)
+@settings_table
 class CostModel:
-    """Capture time of a plan. Values are assumed until measured on a rig; settings name their source."""
+    """Capture time of a plan. Values are assumed until measured on a rig."""
 
     slew_s: float = stated(0.05, "Time to turn the mirror to a sweep's first line", "s", 0, 10)
     settle_frames: float = stated(2.0, "Frames that the mirror takes to come to rest", "", 0, 1000)
     capture_start_s: float = stated(0.2, "Time to start a capture", "s", 0, 60)
     reload_s: float = stated(1.6, "Time to load vector_pairs positions into the mirror's memory", "s", 0, 60)
     vector_pairs: int = stated(1500, "Positions that the mirror's memory holds", "", 1, 10_000_000)
-    provenance: str = stated("assumed", "Source of the measured values")
 
     def setup_seconds(self, camera: LineCamera) -> float:
         """Return the time of slew, settling and start of one sweep [s]."""

@@ -19,14 +19,14 @@ through the foot that falls by ``slope_deg`` towards ``aspect_deg`` (clockwise f
 
 from __future__ import annotations
 
-from dataclasses import MISSING, asdict, dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.errors import PoseError
-from spectralzoom.pipeline.setting_fields import misfits, stated
+from spectralzoom.pipeline.setting_fields import REQUIRED, settings_table, stated
 
 Floats = NDArray[np.float64]
 
@@ -34,21 +34,21 @@ LEAST_SINK = 1e-12  # a ray that sinks less along its depth counts as parallel t
 ROWS_AT_ONCE = 256
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings_table
 class RigPose:
     """Place of the mirror's pivot, its undeflected direction, and the plane of ground that it looks at.
 
     Give ``height_m`` above the foot, or ``range_m`` to the ground along the undeflected direction.
 
-    Raises PoseError: a value is not finite or out of range, or not exactly one of height and range is given.
+    Raises pydantic.ValidationError: a value is not finite or out of range, or not one of height and range is given.
     """
 
-    lon_deg: float = stated(MISSING, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)
-    lat_deg: float = stated(MISSING, "Latitude, WGS 84; south is negative", "deg", -90, 90, example=52.1)
+    lon_deg: float = stated(REQUIRED, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)
+    lat_deg: float = stated(REQUIRED, "Latitude, WGS 84; south is negative", "deg", -90, 90, example=52.1)
     heading_deg: float = stated(
-        MISSING, "Azimuth of the undeflected view direction, clockwise from north", "deg", -360, 360, example=30.0
+        REQUIRED, "Azimuth of the undeflected view direction, clockwise from north", "deg", -360, 360, example=30.0
     )
-    tilt_deg: float = stated(MISSING, "Angle below the horizon; 90 looks straight down", "deg", -90, 90, example=35.0)
+    tilt_deg: float = stated(REQUIRED, "Angle below the horizon; 90 looks straight down", "deg", -90, 90, example=35.0)
     height_m: float | None = stated(
         None,
         "Height of the mirror's pivot above the ground below it; or instead range_m",
@@ -67,8 +67,6 @@ class RigPose:
     elevation_m: float = stated(0.0, "Height of the ground below the rig above the ellipsoid", "m", -500, 9000)
 
     def __post_init__(self) -> None:
-        for name, fault in misfits(self):
-            raise PoseError(f"the rig's pose: {name} {fault}")
         if (self.height_m is None) == (self.range_m is None):
             raise PoseError(
                 "the rig's pose needs height_m or range_m, one of the two; got "

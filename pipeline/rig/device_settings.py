@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.mirror import Axes, Mounting
 from spectralzoom.pipeline.geometry.scan import Ends
-from spectralzoom.pipeline.setting_fields import assumed, stated
+from spectralzoom.pipeline.setting_fields import assumed, settings_table, stated
 
 FAKE = "fake"  # of a driver's name
 CONTROL_PORT = 8100  # of the camera's commands; the maker's
@@ -47,7 +47,7 @@ def check_times(exposure_ms: float, frame_period_ms: float, most_rate_hz: float)
         )
 
 
-@dataclass(frozen=True)
+@settings_table
 class SurveyRig:
     """The table [rig] of a survey: both devices, and the white reference.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -20,6 +19,7 @@ from operator import call
 from typing import Any, TypeVar
 
 from spectralzoom.pipeline.errors import SettingsError, WorkerError
+from spectralzoom.pipeline.words import is_scheduler
 from spectralzoom.storage.remote.objects import Objects
 from spectralzoom.storage.remote.worker_stores import fetching_work
 
@@ -33,7 +33,6 @@ _ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}",
     "MALLOC_TOP_PAD_": f"{2**26}",
 }
-_ADDRESS = re.compile(r"(tcp|tls)://[^\s/:]+:\d+|(tcp|tls)://\[[0-9a-fA-F:]+\]:\d+")
 RESERVED_BYTES = 512 * 2**20  # a process before its first block: interpreter, torch, zarr
 
 Item = TypeVar("Item")
@@ -65,7 +64,7 @@ class WorkerPool:
     bucket: str | None = None
 
     def __post_init__(self) -> None:
-        if self.scheduler not in ("threads", "processes") and not _ADDRESS.fullmatch(self.scheduler):
+        if not is_scheduler(self.scheduler):
             raise SettingsError(
                 f"scheduler must be threads, processes, or the address of a dask scheduler such as "
                 f"tcp://192.168.1.5:8786; got {self.scheduler!r}"

@@ -23,9 +23,9 @@ from pydantic import (
 
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.setting_fields import numbers_of
+from spectralzoom.pipeline.toml_files import read_toml
 from spectralzoom.storage.readers.band_facts import RANGE_NM, Bands, bands_text, why_unknown
 from spectralzoom.storage.readers.own_files import stated_file, within
-from spectralzoom.storage.whole_files import read_toml
 
 SETTINGS_NAME = "scene.toml"
 IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scene.toml may be above such a folder

@@ -22,8 +22,7 @@ from rich.console import Console
 
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
 
 FIRST_VISIT = ROOT / "docs" / "tutorials" / "first-visit.toml"

@@ -26,7 +26,7 @@ from string import Template
 from typing import Any
 
 from spectralzoom.flows.cli.main import build_app, main
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.storage.readers.scene_toml import load_scene_settings
 from tests.docs.pages import ROOT, Block
 from tests.flows.conftest import FEW_BANDS

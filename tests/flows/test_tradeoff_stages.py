@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from spectralzoom.flows import tradeoff as stages
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tradeoff import Tradeoff, measure_tradeoff, tradeoff
 from spectralzoom.pipeline.errors import SceneError

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from spectralzoom.pipeline.errors import ArchiveError, SceneError
+from spectralzoom.pipeline.toml_files import MOST_BYTES, read_toml
 from spectralzoom.storage import whole_files
 from spectralzoom.storage.readers.scene_toml import load_scene_settings
-from spectralzoom.storage.whole_files import MOST_BYTES, read_toml, remove_leftovers, write_whole, written_aside
+from spectralzoom.storage.whole_files import remove_leftovers, write_whole, written_aside
 
 
 def _files(folder: Path) -> dict[str, str]:

@@ -17,10 +17,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.readers.scene_files import load_scene_file
-from spectralzoom.storage.runs import moment_of
 from tests.flows.conftest import command_line
 from tests.storage.readers.test_label_grids import write
 

@@ -22,7 +22,7 @@ from rasterio.enums import ColorInterp
 import spectralzoom.models.reading.prior_map as prior_map
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.ground.georeference import pixel_rows_m2
 from spectralzoom.storage.arrays.mosaics import open_mosaic

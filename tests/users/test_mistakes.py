@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.training.data import load_data_set
 from spectralzoom.storage.readers.scene_files import load_scene_file
 from spectralzoom.storage.store import Archive

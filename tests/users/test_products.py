@@ -17,7 +17,7 @@ from affine import Affine
 
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.archive.export_layers import ProductFlags, parse_doses
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import SettingsError, WavelengthError
 from spectralzoom.pipeline.ground.map_grid import ground_grid, image_at

@@ -21,7 +21,7 @@ from spectralzoom.flows.archive.commands import gc
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
 from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.processes import DONE, PARTLY
 from spectralzoom.models.weights.files import save_weights

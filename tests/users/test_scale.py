@@ -13,7 +13,7 @@ import shapely
 
 from spectralzoom.flows.archive.plan_command import plan_content
 from spectralzoom.flows.publish.receipt_table import finding_rows
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.tasks.zones import place_of_field
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.ground.field_places import scale_of_pixels, scale_of_view

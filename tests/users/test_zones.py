@@ -18,7 +18,7 @@ from affine import Affine
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings, parse_settings
+from spectralzoom.flows.settings.settings import load_settings, parse_settings
 from spectralzoom.pipeline.errors import SettingsError, ZoneError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from spectralzoom.storage.arrays.class_maps import ClassMap, ProbabilityStore, load_class_map

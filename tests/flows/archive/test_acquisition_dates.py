@@ -18,7 +18,7 @@ from rich.console import Console
 
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.recorded_field import open_recorded
 from spectralzoom.flows.tasks.visit import at_due_time

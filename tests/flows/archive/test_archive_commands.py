@@ -14,7 +14,7 @@ import pytest
 from spectralzoom.flows.archive.commands import command, contents, gc, ls, verify
 from spectralzoom.flows.archive.explain_command import explain
 from spectralzoom.flows.archive.reprocess_command import asked_again
-from spectralzoom.flows.settings.load import load_settings, parse_settings
+from spectralzoom.flows.settings.settings import load_settings, parse_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.figures import format_bytes
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY

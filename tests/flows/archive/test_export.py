@@ -19,7 +19,7 @@ import xarray as xr
 
 from spectralzoom.flows.archive.export_command import run_export
 from spectralzoom.flows.archive.export_layers import ExportedRun
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, NoRunError, SettingsError
 from spectralzoom.storage.runs import verify_everything

@@ -14,7 +14,7 @@ from PIL import Image
 
 import spectralzoom.models.reading.prior_map as prior_map
 from spectralzoom.flows.archive.export_command import run_export
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.models.weights.files import load_weights, save_weights, with_record
 from tests.conftest import QUIET, RGB_NM, patchy_scene

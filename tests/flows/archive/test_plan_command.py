@@ -16,8 +16,7 @@ from rich.console import Console
 
 from spectralzoom.flows.archive.plan_command import plan_content, scan_table, show_plan
 from spectralzoom.flows.field import open_field
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.figures import format_seconds
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError

@@ -16,7 +16,7 @@ from rich.console import Console
 from spectralzoom.flows.archive import reprocess_command
 from spectralzoom.flows.archive.commands import verify
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import SettingsError, WeightsError

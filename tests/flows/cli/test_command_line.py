@@ -12,7 +12,6 @@ import pytest
 from spectralzoom.flows.cli import main as cli
 from spectralzoom.flows.cli.main import GOES_ON, VERBS, build_app
 from spectralzoom.flows.settings.flags import IN_TABLES
-from spectralzoom.flows.settings.load import SURVEY, TABLES
 from tests.flows.conftest import python
 
 ONE_THREAD = """

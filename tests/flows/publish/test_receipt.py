@@ -18,7 +18,7 @@ from spectralzoom.flows.publish.field_map import RIGHT_RGB, WRONG_RGB, FieldMap,
 from spectralzoom.flows.publish.receipt import CAPTURE_COSTS, Receipt, build_receipt, check_receipt
 from spectralzoom.flows.publish.receipt_table import format_score, headline, print_summary, saving_rows
 from spectralzoom.flows.publish.report import render_report
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.terminal.figures import format_area
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.storage.whole_files import to_json

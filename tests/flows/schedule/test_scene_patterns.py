@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from spectralzoom.flows.cli.serve_command import load_fields
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.tasks.scene import scene_of_visit
 from spectralzoom.pipeline.errors import NoSceneYet, SettingsError, WeightsError
 

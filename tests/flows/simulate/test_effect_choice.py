@@ -8,8 +8,7 @@ import pytest
 
 from spectralzoom.flows.cli.simulate_command import open_simulation, scan
 from spectralzoom.flows.field import make_source
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages import effects as effect_choice
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest

@@ -10,7 +10,7 @@ import pytest
 
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.pipeline.errors import SettingsError
 

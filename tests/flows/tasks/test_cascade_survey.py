@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from spectralzoom.flows.archive.plan_command import plan_content
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.weights.files import CASCADE, save_weights
 from tests.conftest import RGB_NM, Flags, Survey, random_weights

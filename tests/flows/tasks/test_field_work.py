@@ -12,7 +12,7 @@ import pytest
 
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.tasks.drawing import MAP, PROBABILITIES, Drawing, draw_field, prior_map_of
 from spectralzoom.flows.tasks.field_work import FieldWork, Scoring, WeightsFile, overview_file
 from spectralzoom.flows.tasks.patch_budget import SHARD

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import Output
 from spectralzoom.flows.stages.ground import STORE, colours_of, ground
 from spectralzoom.flows.tasks.zones import place_of_field

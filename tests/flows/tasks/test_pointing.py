@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.publish.receipt_table import finding_rows
-from spectralzoom.flows.settings.load import load_settings, parse_settings
+from spectralzoom.flows.settings.settings import load_settings, parse_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.pipeline.errors import SettingsError

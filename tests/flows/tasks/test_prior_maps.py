@@ -20,7 +20,7 @@ from rich.console import Console
 
 import spectralzoom.flows.tasks.prior_maps as memory
 from spectralzoom.flows.archive.reprocess_command import run_reprocess
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.models.network.sizes import TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.weights.files import add_reader, load_weights

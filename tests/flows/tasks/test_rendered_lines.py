@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.field import make_source
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.stages.capture import take_lines
 from spectralzoom.pipeline.errors import RigError, SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera

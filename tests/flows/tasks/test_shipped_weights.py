@@ -9,7 +9,7 @@ import pytest
 
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
 from spectralzoom.flows.tradeoff import coarse_of_sweeps
 from spectralzoom.models.evaluation.metrics import mean_iou

@@ -16,8 +16,7 @@ import zarr
 from spectralzoom.flows.prefect_flow import survey
 from spectralzoom.flows.products import Pass, Products
 from spectralzoom.flows.publish.publishing import clear_intermediate
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stages.condense import SignalChoice, components_of
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
@@ -69,11 +68,11 @@ def test_stores_of_another_run_are_not_cleared(tmp_path: Path, monkeypatch: pyte
         """Run the other survey when the first one has its map."""
         monkeypatch.undo()
         nothing = {"policy": "mask", "mask": str(tmp_path / "nothing.npy")}
-        others.append(survey.fn(SurveySettings(**given, **nothing, keep="raw")).folder)
+        others.append(survey.fn(Settings(**given, **nothing, keep="raw")).folder)
         clear_intermediate(*survey_of)
 
     act_instead(monkeypatch, "clear_intermediate", meanwhile)
-    one = read_run(survey.fn(SurveySettings(**given, policy="random")).folder)
+    one = read_run(survey.fn(Settings(**given, policy="random")).folder)
     archive = Archive.open(tmp_path / "archive")
     assert "raw_fine" in one.products
     assert archive.locate(one.products["raw_coarse"]).is_dir()

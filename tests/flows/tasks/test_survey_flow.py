@@ -17,8 +17,7 @@ from pydantic import ValidationError
 from spectralzoom.flows import prefect_flow, survey_command
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.parameters import SurveySettings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Request, Stores
 from spectralzoom.flows.survey import run_stages
 from spectralzoom.flows.tasks.local_server import ServerUnavailable
@@ -112,10 +111,10 @@ SETTINGS = [
 def test_parameters_are_the_settings(given: dict[str, object]) -> None:
     """Parameters stored by a server give the same settings, with absolute paths."""
     settings = load_settings(None, given)
-    parameters = SurveySettings.of(settings)
+    parameters = Settings.of(settings)
     assert parameters.settings() is settings
     kept = json.loads(parameters.model_dump_json(exclude_none=True))
-    again = SurveySettings(**kept).settings()
+    again = Settings(**kept).settings()
     changed = {name for name, value in settings.to_dict().items() if again.to_dict()[name] != value}
     assert changed <= {"out", "scene", "weights", "zones"}
     assert Path(again.out) == Path.cwd() / settings.out
@@ -124,25 +123,24 @@ def test_parameters_are_the_settings(given: dict[str, object]) -> None:
 def test_a_password_is_no_parameter() -> None:
     """A server stores the parameters of its runs, so the password is left out and refused."""
     settings = load_settings(None, {"source": "rig", "rig.password": "secret-4711"})
-    assert "secret-4711" not in SurveySettings.of(settings).model_dump_json()
+    assert "secret-4711" not in Settings.of(settings).model_dump_json()
     with pytest.raises(ValidationError, match=r"rig\.password"):
-        SurveySettings(rig={"password": "secret-4711"})
+        Settings(rig={"password": "secret-4711"})
 
 
 def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:
     """The error comes before a run begins."""
     with pytest.raises(ValidationError, match="fraction of the full scan's seconds, above 0 and at most 1, got 3"):
-        SurveySettings(budget=3)
-    assert SurveySettings(budget="70%").settings().budget == 0.7
+        Settings(budget=3)
+    assert Settings(budget="70%").settings().budget == 0.7
     with pytest.raises(ValidationError, match=r"unknown setting .*did you mean 'budget'"):
-        SurveySettings(bugdet=0.5)
+        Settings(bugdet=0.5)
 
 
 def test_every_setting_is_a_described_field_of_the_form() -> None:
     """Prefect makes its form from the parameters of the flow."""
-    from spectralzoom.flows.settings.load import SURVEY
 
-    schema = prefect_flow.survey.parameters.definitions["SurveySettings"]["properties"]
+    schema = prefect_flow.survey.parameters.definitions["Settings"]["properties"]
     assert set(schema) == {*SURVEY, "settings_file"}
     assert all(one.get("description") or "$ref" in json.dumps(one) for one in schema.values())
 

@@ -19,7 +19,7 @@ from rich.console import Console
 from spectralzoom.flows.publish.receipt import check_receipt
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.scene import open_scene
 from spectralzoom.models.network.spectral import LineSpec

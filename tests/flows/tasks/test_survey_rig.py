@@ -15,8 +15,7 @@ import zarr
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.publish.run_folder import Published
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.rig_field import rig_to_oneself
 from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from spectralzoom.flows.settings.load import load_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.arrays.mosaics import open_mosaic

@@ -16,7 +16,7 @@ from spectralzoom.flows.archive.reprocess_command import run_reprocess
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
 from spectralzoom.flows.publish.receipt_table import finding_rows
-from spectralzoom.flows.settings.load import load_settings
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.pipeline.errors import BudgetError, SettingsError, WeightsError
 from tests.conftest import QUIET, Flags, Survey, WeightsMaker

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from spectralzoom.flows.publish.receipt_table import finding_rows
-from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.model_flags import TrainFlags
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.survey_model import beyond_training, training_note
 from spectralzoom.flows.training.train import train_weights

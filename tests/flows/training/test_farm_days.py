@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from spectralzoom.flows.archive.reprocess_command import asked_again, newest_runs
-from spectralzoom.flows.settings.load import parse_settings
-from spectralzoom.flows.settings.survey_settings import Settings
+from spectralzoom.flows.settings.settings import Settings, parse_settings
 from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
 from spectralzoom.flows.training.data import farm_days, farm_test_data, open_training_data, read_farm_name
 from spectralzoom.flows.training.train_scenes import TrainRequest, observe_all

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.model_flags import TrainFlags
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest

@@ -20,8 +20,8 @@ from rich.console import Console
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.evaluate.command import evaluate_weights
 from spectralzoom.flows.field import open_field
-from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.training import figures, train_scenes
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData

@@ -10,8 +10,8 @@ import pytest
 
 from spectralzoom.flows.evaluate.command import evaluate_weights
 from spectralzoom.flows.field import open_field
-from spectralzoom.flows.settings.load import load_settings
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
+from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.network.spectral import LineSpec

@@ -1,0 +1,493 @@
+"""Define the settings of a survey, each once: type, default, range, unit and one line of help.
+
+The TOML, the flags, Prefect's form, the example file and the manual follow from the model `Settings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
+)
+
+from spectralzoom.flows.settings.load import (
+    FLAG,
+    declared,
+    known_only,
+    merged,
+    nested,
+    read_file,
+    sentence_of,
+    without_null,
+)
+from spectralzoom.flows.settings.rules import completed, contradictions, mistakes
+from spectralzoom.flows.settings.values import (
+    ALWAYS,
+    AUTO,
+    BUILT_IN_SCENES,
+    RASTER,
+    RECORDED,
+    RIG,
+    SIM,
+    WHOLE,
+    Bands,
+    Budget,
+    Compute,
+    Effects,
+    Extent,
+    Limit,
+    Memory,
+    Name,
+    Scheduler,
+    Size,
+    Tolerance,
+    VisitName,
+    Wavelengths,
+)
+from spectralzoom.models.network.machine import PROCESSOR, Device
+from spectralzoom.models.policies.policies import Policy
+from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.geometry.camera import LineCamera
+from spectralzoom.pipeline.geometry.scan import CostModel
+from spectralzoom.pipeline.ground.view import RigPose
+from spectralzoom.pipeline.rectify.kernels import Kernel
+from spectralzoom.pipeline.rig.device_settings import FAKE, SurveyRig
+from spectralzoom.pipeline.setting_fields import Text, settings_table, stated
+from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
+from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
+from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
+
+USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
+OF_THE_MACHINE = ("scheduler", "workers", "bucket", "device")  # settings that depend on the machine of the survey
+MOST_STEP = 8  # greatest line spacing [px]
+AS_STORED = {"": "stored"}  # origin of settings that were checked before: nothing follows from them
+EVERY = "every value"  # context of a dump
+SCENE, TIME, OUTPUT, MACHINE = "Scene", "Time and accuracy", "Output", "Machine"  # groups of the help's first page
+
+
+@settings_table
+class SignalChoice:
+    """Limits of the spectral compression into components that exceed the noise."""
+
+    step: float = stated(1.0, "Quantisation step of the scores, in standard deviations of the noise", "", 0.01, 10)
+    false_alarm: float = stated(0.01, "Probability that noise alone yields a component in a field", "", 1e-6, 0.2)
+    rare_spectra: float = 1.0  # per sweep, that noise alone may mark as rare; rare spectra keep their residuals
+    least: int = 4  # components
+
+
+class Settings(BaseModel):
+    """Settings of one survey. The source ``auto`` is resolved here, so that receipts name the actual source.
+
+    Raises pydantic.ValidationError, with one sentence on the first mistake (`SettingsError`, `BudgetError`).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, json_schema_extra=without_null)
+
+    settings_file: str | None = Field(
+        default=None,
+        exclude=True,
+        description="Settings file (TOML) on the machine of the survey; other parameters override it",
+    )
+    scene: Text = stated(
+        "farm",
+        "Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and"
+        " others. A folder of tiles, or tiles/*.tif, is one run a tile on the command line."
+        " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
+        group=SCENE,
+    )
+    labels: Text | None = stated(
+        None,
+        "Label image on the scene's pixels (class colours or numbers); enables accuracy",
+        example="labels.png",
+        group=SCENE,
+    )
+    bands: Bands | None = stated(None, "Band numbers to use, counted from 0: 0,1 or 0-3; default: all", example=(0, 1))
+    wavelengths: Wavelengths | None = stated(
+        None, "Centre wavelengths of these bands: 660,800", "nm", example=(660.0, 800.0), group=SCENE
+    )
+    source: Literal["auto", "sim", "rig", "raster", "recorded"] = stated(
+        AUTO,
+        "Pixel source: sim (simulated rig), rig (hardware of table [rig]), raster (pixels of the file as they are),"
+        " recorded (the sweeps of --sweeps); auto: recorded with --sweeps, raster for files, sim for built-in scenes,"
+        " rig for the scene `field`",
+        group=SCENE,
+    )
+    sweeps: Text | None = stated(
+        None,
+        "Recorded sweeps: an archive, ARCHIVE/runs/NAME, a folder of ENVI cubes or of a Headwall"
+        " camera, or one ENVI or Zarr cube. Without another scan or budget, every line is used as it was taken",
+        example="sweeps",
+        group=SCENE,
+    )
+    pointing: Text | None = stated(
+        None,
+        "Pointing of the recorded lines: a table with one row per line (CSV), or a folder with one table per cube;"
+        " default: NAME.pointing.csv beside each cube",
+        example="pointing.csv",
+    )
+    dark: Text | None = stated(
+        None, "Dark frame of recorded sweeps, ENVI or .npy; default: NAME.dark.hdr or dark*.hdr", example="dark.hdr"
+    )
+    white: Text | None = stated(
+        None, "White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr", example="white.hdr"
+    )
+    size: Size | None = stated(
+        None, f"Size of a built-in scene, width x height; default: {USUAL_SIZE}", "px", example=USUAL_SIZE, group=SCENE
+    )
+    day: int | None = stated(
+        None, f"Day of the year of a built-in scene; default: {USUAL_DAY} (21 June)", "", 1, 366, example=USUAL_DAY
+    )
+    hour: float | None = stated(
+        None, f"True solar time of a built-in scene; default: {USUAL_HOUR:g}", "h", 0, 24, example=USUAL_HOUR
+    )
+    interest: float | None = stated(
+        None,
+        "Fraction of the scene scouting with weeds, bare ground, poor growth or lodging; default: 0.02 to 0.1 by seed",
+        "",
+        0,
+        1,
+        example=0.0625,
+    )
+    seed: int = stated(0, "Random seed of built-in scenes and of all noise", "", 0, 2**63 - 1)
+    name: Name | None = stated(None, "Field name; default: the scene's", example="north", group=SCENE)
+    visit: VisitName | None = stated(
+        None,
+        "Visit: a date as YYYY-MM-DD, or any text. A new visit captures again; the same visit resumes",
+        example="first of June",
+        group=SCENE,
+    )
+    prior: Text = stated(
+        AUTO,
+        "Prior map of the field: latest (newest run), a run's name, or none; auto: latest under `serve`, else none",
+        group=SCENE,
+    )
+    area: Text | None = stated(
+        None,
+        "Area of interest: polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile, in any CRS; limits capture,"
+        " map and accuracy; a hole is a no-go zone. Needs a [pose] or a georeferenced scene",
+        example="area.geojson",
+        group=SCENE,
+    )
+    plots: Text | None = stated(
+        None,
+        "Plots, likewise; the receipt has area, classes and confidence of each",
+        example="plots.gpkg:plots",
+        group=SCENE,
+    )
+    plots_name: Text | None = stated(
+        None, "Attribute with the plot names; default: name, plot, id, label or the like", example="name"
+    )
+    seconds: float | None = stated(
+        None,
+        "Time budget of the capture; selects the uniform scan or the two passes with the highest expected mIoU",
+        "s",
+        0.1,
+        1e6,
+        example=30.0,
+        group=TIME,
+    )
+    budget: Budget | None = stated(
+        None,
+        "Time budget of a two-pass survey, as a fraction of the full scan's time: every 4th line first, then lines"
+        " chosen by the policy",
+        example=0.5,
+        group=TIME,
+    )
+    zoom: Literal["auto", "never", "always"] = stated(
+        AUTO,
+        "Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain; auto: with --seconds,"
+        " for fields of eight swaths or more, if the weights' table of scans expects as much as of a uniform scan",
+        group=TIME,
+    )
+    scan_step: int | None = stated(
+        None,
+        "Line spacing of the uniform scan; with --zoom always that of the first pass",
+        "px",
+        1,
+        MOST_STEP,
+        example=2,
+    )
+    scan_exposure_ms: float | None = stated(
+        None,
+        "Exposure of the uniform scan, or of the first pass; default: the camera's, or optimised",
+        "ms",
+        0.5,
+        10_000,
+        example=25.0,
+    )
+    extent: Extent = stated(
+        WHOLE,
+        "Extent of a uniform scan: whole; part (lines of the highest expected gain; needs --seconds and a prior map;"
+        " default with --seconds and a stated --prior); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40",
+    )
+    max_age: float | None = stated(
+        None,
+        "With --extent part: maximum age of any place in the prior map; older places are captured first",
+        "d",
+        0.04,
+        3660,
+        example=14.0,
+    )
+    macs: Compute | None = stated(
+        None,
+        "MAC budget, as a fraction of full-resolution inference (50%) or as a number (4e9), beside the fusion of a"
+        " prior map; patches with the highest expected gain come first, the rest is the overview",
+        example="50%",
+        group=TIME,
+    )
+    expected_loss: float = stated(
+        0.3,
+        "Accepted mIoU loss by reading only a part of the patches at full resolution; 0 reads all patches",
+        "points",
+        0,
+        100,
+    )
+    policy: Policy = stated("gain", "Policy that ranks patches, for the second pass or --macs")
+    mask: Text | None = stated(
+        None, "Image of patches to capture again, or to read, for policy mask", example="mask.png"
+    )
+    weights: Text | None = stated(
+        None,
+        "Model weights (.safetensors); farm: the built-in weights, the default for built-in scenes",
+        example="weights.safetensors",
+        group=TIME,
+    )
+    accuracy: bool = stated(True, "Compute the accuracy if there are labels")
+    controls: bool = stated(False, "Also simulate and judge the best uniform scan of the same seconds")
+    effects: Effects = stated(
+        AUTO,
+        "Effects of the simulated rig: auto (those that exceed tol), all, none, or names:"
+        " rotation,slit,smear,vignetting,shot,read-noise",
+    )
+    tol: Limit = stated(
+        Tolerance(),
+        "Maximum simulation error from omitted effects: in noise sigmas (0.1) or DN (0.5dn); 0: exact; inf: no limit",
+        example=Tolerance().value,
+    )
+    resampling: Kernel = stated("catmull-rom", "Resampling kernel; nearest does not mix spectra")
+    pointing_px: float = stated(
+        0.0, "Maximum pointing error of the mirror; above 0 sweeps overlap and are registered", "px", 0, 300
+    )
+    out: Text = stated("archive", "Folder of the archive", group=OUTPUT)
+    keep: Literal["signal", "raw"] = stated(
+        "signal",
+        "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), or raw",
+        group=OUTPUT,
+    )
+    until: Literal["capture", "mosaic"] | None = stated(
+        None,
+        "Stop when this stage is stored: capture (all lines) or mosaic; the same survey without it"
+        " continues, also on another machine with a copy of the archive",
+        example="capture",
+        group=OUTPUT,
+    )
+    engine: Literal["prefect", "plain"] = stated("prefect", "Workflow engine; plain runs without a server")
+    memory: Memory = stated(4 * 1024**3, "Memory limit for tiles and regions", example="4GiB", group=MACHINE)
+    workers: int | None = stated(
+        None, "Number of workers; default: one per core", "", 1, 1024, example=2, group=MACHINE
+    )
+    scheduler: Scheduler = stated(
+        "threads", "Worker pool: threads, processes, or the address of a dask scheduler, tcp://host:port"
+    )
+    bucket: Text | None = stated(
+        None, "Bucket by which workers of a dask scheduler get stores that they lack", example="s3://bucket/prefix"
+    )
+    device: Device = stated(
+        PROCESSOR,
+        "Device of the network; auto: cuda or mps if available, else cpu. Maps of different devices may differ by"
+        " rounding",
+        group=MACHINE,
+    )
+    camera: LineCamera = Field(default=LineCamera(), description="Line camera.")
+    optics: Optics = Field(
+        default=Optics(), description="Optics of the simulated rig. No value was measured on a unit."
+    )
+    mirror: MirrorMotion = Field(default=MirrorMotion(), description="Dynamics of the simulated mirror.")
+    detector: Detector = Field(
+        default=Detector(), description="Faults of the simulated detector, beyond the camera's gain and noise."
+    )
+    air: Air = Field(
+        default=Air(), description="Air between rig and scene. Without a distance, the scene is light at the aperture."
+    )
+    sky: Sky = Field(
+        default=Sky(),
+        description="Illumination. Without a start time, the sun does not move; its course is that at the [pose].",
+    )
+    signal: SignalChoice = Field(default=SignalChoice(), description="Spectral compression.")
+    cost: CostModel = Field(default=CostModel(), description="Time model of captures.")
+    rig: SurveyRig = Field(
+        default=SurveyRig(),
+        description='Hardware, for source = "rig". The drivers follow the documented protocols and are tested against '
+        "scripted bytes, never on hardware: verify values marked assumed, and record it in provenance. The scene is "
+        'then the reference for accuracy, or "field" with name, size and wavelengths.',
+    )
+    pose: RigPose | None = Field(
+        default=None, description="Pose of the rig; adds a map on the ground with the area of each class."
+    )
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_one_sentence(cls, table: Any, read: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
+        """Complete a table of settings and read it; the first mistake is one sentence that names its flag or file.
+
+        The context is the origin of each key: ``flag`` or the name of a file.
+        """
+        if not isinstance(table, Mapping):
+            return read(table)
+        origin = info.context
+        if origin is None:  # of a server or of Python
+            table, origin = _over_file(table)
+        table = known_only(table, cls, origin)
+        try:
+            found = read(table if origin is AS_STORED else completed(table))
+        except ValidationError as error:
+            raise sentence_of(error, cls, origin) from None
+        for check in (mistakes,) if origin is AS_STORED else (contradictions, mistakes):
+            for wrong in check(found, origin):
+                raise SettingsError(wrong)
+        return found
+
+    @model_serializer(mode="wrap")
+    def _changed_only(self, write: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
+        """Return all values; for a server those that differ from the defaults."""
+        tables = declared(type(self))
+        table: dict[str, Any] = {
+            name: {key: value[key] for key in tables[name] if key in value} if name in tables and value else value
+            for name, value in write(self).items()
+        }
+        if info.mode == "python" or info.context is EVERY:
+            return table
+        usual = Settings().to_dict()
+        changed = {name: value for name, value in table.items() if value != usual[name]}
+        for name, value in changed.items():  # of a table only the keys that differ
+            if isinstance(value, dict) and isinstance(usual[name], dict):
+                changed[name] = {key: one for key, one in value.items() if one != usual[name][key]}
+        return changed
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for the receipt, without the password; `parse_settings` reads them back."""
+        return self.model_dump(mode="json", context=EVERY)
+
+    def but(self, **changes: object) -> Self:
+        """Return the settings with other values, which are not checked."""
+        return self.model_copy(update=changes)
+
+    @property
+    def plain(self) -> bool:
+        """Return whether the field is captured in one pass: by a uniform scan, or as a raster."""
+        return self.is_map or (
+            not self.zooms and (self.as_taken or self.seconds is not None or self.scan_step is not None)
+        )
+
+    @property
+    def as_taken(self) -> bool:
+        """Return whether every line of a recording is used as it was taken: no scan or budget is requested."""
+        free = self.budget is None and self.seconds is None and self.scan_step is None
+        return self.source == RECORDED and self.zoom != ALWAYS and free
+
+    @property
+    def zooms(self) -> bool:
+        """Return whether the field is captured in two passes."""
+        return not self.is_map and (self.budget is not None or self.zoom == ALWAYS)
+
+    @property
+    def may_zoom(self) -> bool:
+        """Return whether the planner may choose two passes: a time budget is the only limit of the capture."""
+        free = self.seconds is not None and self.macs is None and self.scan_step is None
+        whole = self.extent == WHOLE and not self.pointing_px
+        return self.zoom == AUTO and free and whole and self.source in (SIM, RIG)
+
+    @property
+    def is_map(self) -> bool:
+        """Return whether the scene is a raster whose pixels are used as they are, without a camera."""
+        return self.source == RASTER
+
+    @property
+    def ends_unread(self) -> bool:
+        """Return whether a survey without weights ends before a network reads its mosaic."""
+        without = self.weights is None and self.scene not in BUILT_IN_SCENES
+        return without and self.until is not None and self.plain
+
+    @property
+    def on_hardware(self) -> bool:
+        """Return whether a rig captures, of which no other survey may use the mirror meanwhile."""
+        return self.source == RIG and self.rig.mirror_driver != FAKE
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """Return (y, x) of the built-in scene [px]; None for its default."""
+        return None if self.size is None else (self.size[1], self.size[0])
+
+    @property
+    def law(self) -> str:
+        """Return the law of the built-in scene; empty for other scenes."""
+        return LAWS.get(self.scene, "")
+
+    @property
+    def moment(self) -> tuple[int, float] | None:
+        """Return day of the year and true solar time [h] of a built-in scene; None for other scenes."""
+        if self.scene not in BUILT_IN_SCENES:
+            return None
+        return USUAL_DAY if self.day is None else self.day, USUAL_HOUR if self.hour is None else self.hour
+
+    @property
+    def simulated_rig(self) -> Rig:
+        """Return the model of the rig for the simulator, with the sun's course at the pose, if there is one."""
+        sky = self.sky
+        if self.pose is not None:
+            sky = replace(sky, latitude_deg=self.pose.lat_deg, longitude_deg=self.pose.lon_deg)
+        return Rig(self.camera, self.optics, self.mirror, self.detector, self.air, sky)
+
+
+def load_settings(
+    path: str | Path | None = None,
+    flags: Mapping[str, object] | None = None,
+    *,
+    usual: Mapping[str, object] | None = None,
+) -> Settings:
+    """Return the checked settings of a TOML file (None: no file) and of flags, which override it.
+
+    Relative paths in the file start at its folder, those of flags at the current one. Flags have the keys of the file,
+    with ``camera.exposure_ms`` for a key in a table; a value None is ignored. ``usual`` overrides the defaults.
+    Raises SettingsError, BudgetError: the first key that is not allowed, with its place and the allowed values.
+    """
+    table, origin = read_file(path)
+    below = merged(usual or {}, table)
+    given = {key: value for key, value in (flags or {}).items() if value is not None}
+    return _checked(merged(below, nested(given)), origin | dict.fromkeys(given, FLAG))
+
+
+def parse_settings(table: Mapping[str, object]) -> Settings:
+    """Return the settings of a receipt, of which nothing follows. Raises SettingsError: a value is not allowed."""
+    return _checked(table, AS_STORED)
+
+
+def _checked(table: Mapping[str, object], origin: Mapping[str, str]) -> Settings:
+    try:
+        return Settings.model_validate(table, context=origin)
+    except ValidationError as error:
+        raise error.errors()[0]["ctx"]["error"] from None
+
+
+def _over_file(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the parameters of a run over those of its settings file, and the file of each key."""
+    rig = table.get("rig")
+    if isinstance(rig, Mapping) and rig.get("password") is not None:
+        raise SettingsError(
+            "rig.password is not allowed as a parameter, since a server stores it; write it into settings_file"
+        )
+    below, origin = read_file(table.get("settings_file"))
+    return merged(below, {key: value for key, value in table.items() if key != "settings_file"}), origin
