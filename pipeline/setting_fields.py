@@ -17,6 +17,17 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 Table = TypeVar("Table")
+
+
+def without_null(schema: dict[str, Any]) -> None:
+    """Write a setting that may be absent as its value alone: forms and help offer no null. Changes the schema."""
+    for name, about in schema.get("properties", {}).items():
+        kinds = [one for one in about.get("anyOf", ()) if one.get("type") != "null"]
+        if len(kinds) == 1:
+            schema["properties"][name] = {key: one for key, one in about.items() if key != "anyOf"} | kinds[0]
+
+
+CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra=without_null)
 REQUIRED: Any = ...  # default of a setting that has none
 
 
@@ -51,7 +62,7 @@ assumed = partial(stated, source="assumed")  # the default is not confirmed on a
 @dataclass_transform(frozen_default=True)
 def settings_table(make: type[Table]) -> type[Table]:
     """Turn a class into a table of settings: a frozen dataclass that checks its values (pydantic.ValidationError)."""
-    table: type[Table] = dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))(make)  # type: ignore[assignment]
+    table: type[Table] = dataclass(frozen=True, config=CONFIG)(make)  # type: ignore[assignment]
     return table
 
 

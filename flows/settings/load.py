@@ -21,14 +21,6 @@ PATHS = ("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask"
 Schema = dict[str, Any]  # of one setting, in JSON: its type, limits, default and help
 
 
-def without_null(schema: Schema) -> None:
-    """Write a setting that may be absent as its value alone: forms and help offer no null. Changes the schema."""
-    for name, about in schema.get("properties", {}).items():
-        kinds = [one for one in about.get("anyOf", ()) if one.get("type") != "null"]
-        if len(kinds) == 1:
-            schema["properties"][name] = {key: one for key, one in about.items() if key != "anyOf"} | kinds[0]
-
-
 @cache
 def declared(model: type[BaseModel]) -> dict[str, dict[str, Schema]]:
     """Return the schema of each setting by its table and name; the table "" has those of no table."""
@@ -36,13 +28,9 @@ def declared(model: type[BaseModel]) -> dict[str, dict[str, Schema]]:
     found: dict[str, dict[str, Schema]] = {"": {}}
     for name, about in whole["properties"].items():
         link = about.get("$ref")
-        keys = {name: about} if link is None else dict(whole["$defs"][link.rpartition("/")[2]])
-        if link is not None:
-            without_null(keys)
-            keys = keys["properties"]
-        found.setdefault("" if link is None else name, {}).update(
-            {key: one for key, one in keys.items() if "group" in one}  # others are parameters of models
-        )
+        keys = {name: about} if link is None else whole["$defs"][link.rpartition("/")[2]]["properties"]
+        settings = {key: one for key, one in keys.items() if "group" in one}  # others are parameters of models
+        found.setdefault("" if link is None else name, {}).update(settings)
     return found
 
 

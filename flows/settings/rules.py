@@ -38,8 +38,8 @@ OF_THE_PLAN = ("zoom", "seconds", "scan_step", "budget", "policy", "mask", "macs
 OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # these give the IFOV, which a [pose] needs
 
 
-def completed(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table of settings with what follows from those that are stated."""
+def with_source(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table of settings with the actual source in place of ``auto``."""
     found = dict(table)
     scene = found.get("scene", BUILT_IN_SCENES[0])
     if found.get("source", AUTO) == AUTO:
@@ -47,6 +47,12 @@ def completed(table: Mapping[str, Any]) -> dict[str, Any]:
         found["source"] = RECORDED if "sweeps" in found else of_scene
     if found["source"] == RECORDED:
         found.setdefault("scene", RIG_FIELD)
+    return found
+
+
+def completed(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table of settings with what follows from those that are stated."""
+    found = with_source(table)
     if found["source"] == RASTER:
         return found
     zooms = found.get("zoom") == ALWAYS

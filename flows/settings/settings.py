@@ -23,17 +23,8 @@ from pydantic import (
     model_validator,
 )
 
-from spectralzoom.flows.settings.load import (
-    FLAG,
-    declared,
-    known_only,
-    merged,
-    nested,
-    read_file,
-    sentence_of,
-    without_null,
-)
-from spectralzoom.flows.settings.rules import completed, contradictions, mistakes
+from spectralzoom.flows.settings.load import FLAG, declared, known_only, merged, nested, read_file, sentence_of
+from spectralzoom.flows.settings.rules import completed, contradictions, mistakes, with_source
 from spectralzoom.flows.settings.values import (
     ALWAYS,
     AUTO,
@@ -65,7 +56,7 @@ from spectralzoom.pipeline.geometry.scan import CostModel
 from spectralzoom.pipeline.ground.view import RigPose
 from spectralzoom.pipeline.rectify.kernels import Kernel
 from spectralzoom.pipeline.rig.device_settings import FAKE, SurveyRig
-from spectralzoom.pipeline.setting_fields import Text, settings_table, stated
+from spectralzoom.pipeline.setting_fields import CONFIG, Text, settings_table, stated
 from spectralzoom.pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from spectralzoom.pipeline.simulator.scenes.built_in import LAWS
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, USUAL_DAY, USUAL_HOUR
@@ -94,7 +85,7 @@ class Settings(BaseModel):
     Raises pydantic.ValidationError, with one sentence on the first mistake (`SettingsError`, `BudgetError`).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, json_schema_extra=without_null)
+    model_config = ConfigDict(frozen=True, **CONFIG)
 
     settings_file: str | None = Field(
         default=None,
@@ -352,7 +343,7 @@ class Settings(BaseModel):
             table, origin = _over_file(table)
         table = known_only(table, cls, origin)
         try:
-            found = read(table if origin is AS_STORED else completed(table))
+            found = read(with_source(table) if origin is AS_STORED else completed(table))
         except ValidationError as error:
             raise sentence_of(error, cls, origin) from None
         for check in (mistakes,) if origin is AS_STORED else (contradictions, mistakes):
@@ -364,14 +355,18 @@ class Settings(BaseModel):
     def _changed_only(self, write: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
         """Return all values; for a server those that differ from the defaults."""
         tables = declared(type(self))
-        table: dict[str, Any] = {
-            name: {key: value[key] for key in tables[name] if key in value} if name in tables and value else value
-            for name, value in write(self).items()
-        }
+
+        def plain(settings: Settings) -> dict[str, Any]:
+            """Return all values, in tables only those of settings."""
+            return {
+                name: {key: value[key] for key in tables[name] if key in value} if name in tables and value else value
+                for name, value in write(settings).items()
+            }
+
         if info.mode == "python" or info.context is EVERY:
-            return table
-        usual = Settings().to_dict()
-        changed = {name: value for name, value in table.items() if value != usual[name]}
+            return plain(self)
+        usual = plain(Settings())
+        changed = {name: value for name, value in plain(self).items() if value != usual[name]}
         for name, value in changed.items():  # of a table only the keys that differ
             if isinstance(value, dict) and isinstance(usual[name], dict):
                 changed[name] = {key: one for key, one in value.items() if one != usual[name][key]}

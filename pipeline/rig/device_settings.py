@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.geometry.mirror import Axes, Mounting
 from spectralzoom.pipeline.geometry.scan import Ends
-from spectralzoom.pipeline.setting_fields import assumed, settings_table, stated
+from spectralzoom.pipeline.setting_fields import Text, assumed, settings_table, stated
 
 FAKE = "fake"  # of a driver's name
 CONTROL_PORT = 8100  # of the camera's commands; the maker's
@@ -55,7 +55,7 @@ class SurveyRig:
     ``provenance`` says which of the assumed values are confirmed.
     """
 
-    port: str = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
+    port: Text = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
     # public software opens 115200
     baud: int = assumed(
         115200, "Bits per second; over USB any works; the manual of a later model says 256000", "", 1200, 4_000_000
@@ -84,12 +84,16 @@ class SurveyRig:
         Mounting.offset_x, "The device's X where the mirror looks straight ahead, of -1 to 1", "", -0.5, 0.5
     )
     mirror_offset_y: float = stated(Mounting.offset_y, "The device's Y there", "", -0.5, 0.5)
-    host: str = stated(FileServer.host, "Address of the camera; the maker's by default")
-    user: str = stated(FileServer.user, "User of its FTP server")
-    password: str = stated(FileServer.password, "Password of that user; receipts do not repeat it")
+    host: Text = stated(FileServer.host, "Address of the camera; the maker's by default")
+    user: Text = stated(FileServer.user, "User of its FTP server")
+    password: Text = stated(
+        FileServer.password,
+        "Password of that user; only in a settings file, and not repeated in receipts",
+        exclude=True,
+    )
     white_reference: float = stated(1.0, "Value of the white reference", "", 1e-6, 1e6)
     white_at_rest: bool = stated(True, "The white frame was taken through the mirror at 0; 0")
-    provenance: str = stated("assumed", "Person who confirmed the assumed values")
+    provenance: Text = stated("assumed", "Person who confirmed the assumed values")
 
     @property
     def mounting(self) -> Mounting:

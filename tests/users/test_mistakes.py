@@ -78,7 +78,7 @@ CASES = {
     "labels of a long name": (1, SURVEY + "field.png --labels " + "x" * 300 + ".png", "name is too long"),
     "weights in a folder": (1, "evaluate bare --weights apart", "the weights apart are a folder, expected a file"),
     # settings
-    "sweeps that are no path": (2, "survey sweeps.toml", "'sweeps' .*must be a path, got True"),
+    "sweeps that are no path": (2, "survey sweeps.toml", "'sweeps' .*must be text that is not empty, got True"),
     "home of nobody": (2, "survey nobody.toml", "'scene': there is no user of '~nobody-here'"),
     "unknown setting": (2, "survey unknown.toml", "buget"),
     "broken settings": (2, "survey broken.toml", "broken.toml.*line 1"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +46,7 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     given = {"size": "192x128", "bands": BANDS, "budget": "0.9", "engine": "plain", "seed": "1"}
     settings = load_settings(None, {**given, "out": str(archive)})
     with without_effects():
-        published = run_survey(replace(settings, pose=POSE), QUIET)
+        published = run_survey(settings.but(pose=POSE), QUIET)
     return exported(archive, out, published.receipt, **FLAGS)
 
 

@@ -183,7 +183,7 @@ def test_plans_use_the_recorded_exposure(tmp_path: Path, full_scan: FullScan, ma
     asked = {"weights": str(make_weights(scans=RECORD)), "seconds": 15, "zoom": "always", "keep": "raw"}
     receipt = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt
     assert receipt["recording"]["passes_s"] <= 15
-    assert (receipt["plan"]["lines"] > 0, receipt["settings"]["coarse_exposure_ms"]) == (True, None)
+    assert (receipt["plan"]["lines"] > 0, receipt["settings"]["scan_exposure_ms"]) == (True, None)
     assert "100 ms" in receipt["plan"]["reason"]
 
 
@@ -203,7 +203,7 @@ def test_a_recorded_scan_is_compared_with_all_of_its_lines(tmp_path: Path, full_
     at = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(7.6, 51.96)
     corner = sketch(tmp_path / "area.gpkg", {"corner": shapely.box(*at, at[0] + 5, at[1] + 5)}, 32632)
     pose = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 100, "heading_deg": 0, "tilt_deg": 90}
-    asked = {"weights": str(weights), "zones.area": corner, "pose": pose}
+    asked = {"weights": str(weights), "area": corner, "pose": pose}
     savings = survey_sweeps(tmp_path / "a", full_scan[2], **asked).receipt["savings"]
     assert [savings[name]["ratio"] for name in ("lines", "samples", "capture_s")] == [1, 1, 1]
 
@@ -221,7 +221,7 @@ def test_a_survey_of_a_run_keeps_its_reference(tmp_path: Path, survey_png: Surve
     asked: dict[str, Any] = {"weights": str(make_weights(scans=RECORD)), "zoom": "always", "seconds": "15"}
     own = {"expected_loss": 0, "signal.step": 2}
     run = survey_png(tmp_path / "sim", budget=None, keep="raw", labels=None, **NARROW, **asked, **own)
-    assert run.receipt["settings"]["coarse_exposure_ms"] < 100
+    assert run.receipt["settings"]["scan_exposure_ms"] < 100
     again = survey_sweeps(tmp_path / "again", run.folder).receipt
     assert [again["settings"][name] for name in ("expected_loss", "signal")] == [0, run.receipt["settings"]["signal"]]
     assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]
@@ -366,7 +366,7 @@ BAD = {  # flags, and the message
     "simulated rig": ("--source sim", "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded"),
     "a part of the field": ("--extent part --seconds 5", "--extent = 'part' chooses lines to capture"),
     "a scan's exposure": ("--scan-step 1 --scan-exposure-ms 5", "--scan-exposure-ms is for a camera.* leave it out"),
-    "an exposure": ("--budget 0.5 --coarse-exposure-ms 25", "--coarse-exposure-ms is for a camera.* leave it out"),
+    "an exposure": ("--budget 0.5 --scan-exposure-ms 25", "--scan-exposure-ms is for a camera.* leave it out"),
     "too little time": ("--budget 0.01", "full scan's [0-9.]+ s; give more, or take one uniform scan"),
 }
 

@@ -79,6 +79,6 @@ def test_hectares_are_those_of_the_area(flags_png: Flags, tmp_path: Path) -> Non
     at = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(7.6, 51.96)
     path = sketch(tmp_path / "half.geojson", {"half": shapely.box(at[0] - 5, at[1], at[0] + 5, at[1] + 5)}, 32632)
     assert whole["hectares"] == pytest.approx(128 * 96 * (100 * 7.4e-3 / 70) ** 2 / 1e4, rel=1e-6)
-    half = plan_content(load_settings(None, asked | {"zones.area": path}))["field"]
+    half = plan_content(load_settings(None, asked | {"area": path}))["field"]
     assert half["hectares"] == pytest.approx(whole["hectares"] / 2, rel=0.05)
     assert half["kept_fraction"] == pytest.approx(0.5, abs=0.03)

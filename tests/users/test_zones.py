@@ -79,8 +79,8 @@ def zones(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Return files of an area with a hole, and of plots."""
     folder = tmp_path_factory.mktemp("zones")
     return {
-        "zones.area": sketch(folder / "area.geojson", {"field": on_map(AREA)}, 32632),
-        "zones.plots": sketch(folder / "plots.gpkg", {name: on_map(shape) for name, shape in PLOTS.items()}, 32632),
+        "area": sketch(folder / "area.geojson", {"field": on_map(AREA)}, 32632),
+        "plots": sketch(folder / "plots.gpkg", {name: on_map(shape) for name, shape in PLOTS.items()}, 32632),
     }
 
 
@@ -190,7 +190,7 @@ def test_an_area_of_the_whole_field_changes_no_key(
     """Every store has its key without zones, so the survey makes no new store."""
     shutil.copytree(whole[0], tmp_path / "archive")
     area = sketch(tmp_path / "all.geojson", {"all": on_map(shapely.box(-5, -5, 200, 200))}, 32632)
-    published = survey_png(tmp_path / "archive", scene=scene, **{"zones.area": area})
+    published = survey_png(tmp_path / "archive", scene=scene, **{"area": area})
     assert {stage["state"] for stage in published.receipt["stages"]} == {"cached"}
     assert "zones" not in published.receipt
 
@@ -239,7 +239,7 @@ def test_zones_of_a_field_without_a_place_are_refused(opened: Opened, scene_file
 def test_plots_name_without_plots_is_refused() -> None:
     """The message names the missing flag."""
     with pytest.raises(SettingsError, match="give --plots FILE too"):
-        load_settings(None, {"zones.plots_name": "variety"})
+        load_settings(None, {"plots_name": "variety"})
 
 
 def test_paths_of_zones_are_relative_to_the_settings_file(tmp_path: Path) -> None:

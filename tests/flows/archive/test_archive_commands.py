@@ -181,10 +181,10 @@ def test_commands_repeat_the_settings_of_a_run(tmp_path: Path) -> None:
     ("chosen", "told"),
     [
         ({"zoom": "never", "seconds": 25.0, "scan_step": 1, "scan_exposure_ms": 9.9}, "--scan-exposure-ms 9.9"),
-        ({"zoom": "always", "seconds": 8.0, "scan_step": 4, "coarse_exposure_ms": 84.3}, "--coarse-exposure-ms 84.3"),
+        ({"zoom": "always", "seconds": 8.0, "scan_step": 4, "scan_exposure_ms": 84.3}, "--scan-exposure-ms 84.3"),
         ({"sweeps": __file__, "scan_step": 2, "scan_exposure_ms": 25.0}, "--scan-step 2"),
         (
-            {"sweeps": __file__, "zoom": "always", "seconds": 8.0, "scan_step": 4, "coarse_exposure_ms": 84.3},
+            {"sweeps": __file__, "zoom": "always", "seconds": 8.0, "scan_step": 4, "scan_exposure_ms": 84.3},
             f"--sweeps {__file__}",
         ),
     ],

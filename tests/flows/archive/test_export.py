@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -38,7 +37,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> list[Exported]:
     flags = {"size": "128x96", "bands": "20,60,100,150,200", "budget": "0.9", "engine": "plain"}
     settings = load_settings(None, {**flags, "out": str(archive), "seed": "1"})
     with without_effects():
-        published = [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
+        published = [run_survey(settings, QUIET), run_survey(settings.but(pose=POSE), QUIET)]
     return [
         Exported(archive, one.receipt, out, run_export(archive, one.folder.name, out, console=QUIET))
         for one in published

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +57,7 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         for scene, visit, extent in zip(harvested(folder, request.param), VISITS, ("whole", "1:40-90"), strict=True):
             asked = {"scene": str(scene), "source": "sim", "visit": visit, "scan_step": 1, "extent": extent}
             settings = load_settings(None, given | asked)
-            posed = replace(settings, pose=POSE) if request.param == "posed" else settings
+            posed = settings.but(pose=POSE) if request.param == "posed" else settings
             runs.append(run_survey(posed, QUIET))
     return [
         Exported(archive, run.receipt, out, run_export(archive, run.folder.name, out, console=QUIET)) for run in runs

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,7 +42,7 @@ def archive(surveyed_png: Survey, tmp_path: Path) -> Path:
 
 
 def _plan(settings: Settings, out: Path, **changes: Any) -> dict[str, SimpleNamespace]:
-    content = plan_content(replace(settings, out=str(out), **changes))
+    content = plan_content(settings.but(out=str(out), **changes))
     return {row["stage"]: SimpleNamespace(**row) for row in content["stages"]}
 
 
@@ -122,7 +121,7 @@ def test_a_field_beyond_memory_is_planned(settings: Settings, tmp_path: Path, mo
     monkeypatch.setattr("spectralzoom.pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
     memory = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**18}
     monkeypatch.setattr("spectralzoom.storage.readers.cube_sources.os.sysconf", memory.__getitem__)
-    asked = replace(settings, scene="farm", size=(4096, 4096), labels=None, weights=None, out=str(tmp_path / "a"))
+    asked = settings.but(scene="farm", size=(4096, 4096), labels=None, weights=None, out=str(tmp_path / "a"))
     found = plan_content(asked)
     assert {row["state"] for row in found["stages"]} == {"to run"}
     with pytest.raises(SettingsError, match="this machine has 1; take a smaller one") as refused:
@@ -157,7 +156,7 @@ def test_a_damaged_store_blocks_its_stage(settings: Settings, archive: Path, tmp
 
 def test_a_raster_has_estimates(settings: Settings, tmp_path: Path) -> None:
     """Each has its source; without scan performance the mIoU is None; multiply-adds are those of the survey."""
-    asked = replace(settings, source="raster", budget=None, out=str(tmp_path / "archive"))
+    asked = settings.but(source="raster", budget=None, out=str(tmp_path / "archive"))
     found = plan_content(asked)["estimate"]
     assert list(found) == ["multiply_adds", "miou"]
     assert found["miou"]["value"] is None
@@ -175,14 +174,14 @@ def test_estimates_of_a_capture_are_upper_bounds(settings: Settings, archive: Pa
         "bytes_captured": receipt["data_bytes"]["captured"],
         "multiply_adds": receipt["savings"]["multiply_adds"]["done"],
     }
-    ahead = plan_content(replace(settings, out=str(tmp_path / "new")))["estimate"]
-    planned = plan_content(replace(settings, out=str(archive)))["estimate"]
+    ahead = plan_content(settings.but(out=str(tmp_path / "new")))["estimate"]
+    planned = plan_content(settings.but(out=str(archive)))["estimate"]
     for name, value in told.items():
         assert ahead[name]["at_most"]
         assert value <= ahead[name]["value"] * (1 + 1e-9), name
         assert (planned[name]["value"], planned[name]["at_most"]) == (pytest.approx(value), False), name
     shown = io.StringIO()
-    show_plan(plan_content(replace(settings, out=str(tmp_path / "new"))), Console(file=shown, width=160))
+    show_plan(plan_content(settings.but(out=str(tmp_path / "new"))), Console(file=shown, width=160))
     assert "Estimates: nothing of this has run" in shown.getvalue()
     assert f"at most {format_seconds(ahead['capture_s']['value'])}" in shown.getvalue()
 
@@ -219,7 +218,7 @@ def test_a_plan_shows_two_passes_beside_uniform_scans(tmp_path: Path, seconds: s
 def test_a_partial_scan_has_no_expected_miou_and_reads_captured_patches(settings: Settings, tmp_path: Path) -> None:
     """Other patches keep the prior map, and scan performance does not cover their accuracy."""
     one_scan = {"budget": None, "scan_step": 1, "out": str(tmp_path)}
-    whole, part = (plan_content(replace(settings, extent=one, **one_scan))["estimate"] for one in ("whole", "0:0-20"))
+    whole, part = (plan_content(settings.but(extent=one, **one_scan))["estimate"] for one in ("whole", "0:0-20"))
     assert part["multiply_adds"]["value"] < 0.5 * whole["multiply_adds"]["value"]
     assert part["miou"]["value"] is None
     assert "a part of the field" in part["miou"]["known_from"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from functools import reduce
@@ -11,7 +12,7 @@ import pytest
 
 from spectralzoom.flows.cli import main as cli
 from spectralzoom.flows.cli.main import GOES_ON, VERBS, build_app
-from spectralzoom.flows.settings.flags import IN_TABLES
+from spectralzoom.flows.settings.flags import GROUPS, KEYS
 from tests.flows.conftest import python
 
 ONE_THREAD = """
@@ -56,8 +57,22 @@ def test_help_lists_every_command_and_imports_none(capsys: pytest.CaptureFixture
 
 @pytest.mark.parametrize("verb", ["survey", "plan"])
 def test_survey_and_plan_have_a_flag_for_every_setting(verb: str) -> None:
-    """Settings in tables are the exception."""
-    assert {f"--{name.replace('_', '-')}" for name in {*SURVEY, *IN_TABLES} - set(TABLES)} <= set(_flags(verb))
+    """Those of tables have the name of their table: --camera.exposure-ms."""
+    assert {f"--{key.replace('_', '-')}" for key in KEYS} <= set(_flags(verb))
+
+
+def test_the_first_page_of_help_is_short(capsys: pytest.CaptureFixture[str]) -> None:
+    """It has at most 25 flags in groups; --help-all has the flag of every setting."""
+    with pytest.raises(SystemExit):
+        cli.main(["survey", "--help"])
+    page = capsys.readouterr().out
+    assert len(re.findall(r"^│ --", page, re.MULTILINE)) <= 25
+    assert [page.index(f"─ {group} ─") for group in GROUPS] == sorted(page.index(f"─ {group} ─") for group in GROUPS)
+    with pytest.raises(SystemExit):
+        cli.main(["survey", "--help-all"])
+    shown = capsys.readouterr().out.split()
+    assert {f"--{key.replace('_', '-')}" for key in KEYS} - set(shown) == {"--accuracy"}
+    assert "--no-accuracy" in shown
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -37,7 +37,7 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
         "scene": "farm",
         "size": "448x256",
         "camera.samples": "384",  # two swaths
-        "coarse_exposure_ms": "50",
+        "scan_exposure_ms": "50",
         "bands": FEW_BANDS,
         "effects": "rotation,slit,smear,vignetting,shot,read-noise",  # without blur: lines far apart are not alike
         "seed": str(SEED),

@@ -61,7 +61,7 @@ def test_stores_of_another_run_are_not_cleared(tmp_path: Path, monkeypatch: pyte
     np.save(tmp_path / "nothing.npy", np.zeros((96, 96), np.float32))
     bands = ",".join(map(str, range(5, 265, 40)))
     given: dict[str, Any] = {"scene": "farm", "size": (96, 96), "bands": bands, "out": str(tmp_path / "archive")}
-    given |= {"engine": "plain", "accuracy": False, "budget": 0.95, "coarse_exposure_ms": 4.0, "zoom": "always"}
+    given |= {"engine": "plain", "accuracy": False, "budget": 0.95, "scan_exposure_ms": 4.0, "zoom": "always"}
     others: list[Path] = []
 
     def meanwhile(*survey_of: Any) -> None:

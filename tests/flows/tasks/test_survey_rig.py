@@ -116,7 +116,7 @@ def test_a_broken_visit_resumes_and_a_new_one_is_captured(tmp_path: Path, monkey
     assert not list((tmp_path / "spool").iterdir())
     others = {"visit": "second"}, {"name": "west"}, {"rig": replace(settings.rig, mirror_axes="-x,-y")}
     for count, other in enumerate(others, 2):  # another visit, another field of the same settings, another mounting
-        run_survey(replace(settings, **other), QUIET)
+        run_survey(settings.but(**other), QUIET)
         assert coarse() == count
     assert {finding.kind for finding in verify_everything(Archive.open(tmp_path))} == {"whole"}
 
@@ -126,7 +126,7 @@ def test_a_rig_on_hardware_is_for_one_survey(tmp_path: Path) -> None:
     settings = fake_settings(tmp_path, **{"rig.port": f"/dev/tty{tmp_path.name}"})
     with rig_to_oneself(settings.rig.port):  # by another survey
         run_survey(settings, QUIET)
-        real = replace(settings, visit="second", rig=replace(settings.rig, mirror_driver=""))
+        real = settings.but(visit="second", rig=replace(settings.rig, mirror_driver=""))
         with pytest.raises(RigError, match="in use by another survey"):
             run_survey(real, QUIET)
         assert run_survey(replace(real, visit="first"), QUIET).receipt["products"]["mosaic"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +41,19 @@ def test_a_stopped_survey_goes_on(tmp_path: Path, scan: dict[str, str], engine: 
     """Lines are captured once, and the map equals that of a survey in one go; no network reads a uniform mosaic."""
     asked = small(tmp_path / "a", **scan, engine=engine)
     with pytest.raises(SurveyStopped, match=r"stopped after capture: stored in .*; the same command without --until"):
-        run_survey(replace(asked, until="capture"), QUIET)
+        run_survey(asked.but(until="capture"), QUIET)
     shutil.copytree(tmp_path / "a" / "stages", tmp_path / "copy" / "stages")  # as on another machine
-    asked = replace(asked, out=str(tmp_path / "copy"))
+    asked = asked.but(out=str(tmp_path / "copy"))
     archive = Archive.open(tmp_path / "copy")
     before = {ref.uri: ref.path.stat().st_mtime_ns for ref in archive.refs("capture")}
     assert len(before) == (1 if scan is UNIFORM else 2)
     assert "segment" not in stages(tmp_path / "copy")
     with pytest.raises(SurveyStopped, match="stopped after mosaic"):
-        run_survey(replace(asked, until="mosaic", keep="raw"), QUIET)
+        run_survey(asked.but(until="mosaic", keep="raw"), QUIET)
     assert (stages(tmp_path / "copy") & {"score", "segment"}) == (set() if scan is UNIFORM else {"score"})
-    published = run_survey(replace(asked, keep="raw"), QUIET)
+    published = run_survey(asked.but(keep="raw"), QUIET)
     assert {ref.uri: ref.path.stat().st_mtime_ns for ref in archive.refs("capture")} == before
-    whole = run_survey(replace(asked, out=str(tmp_path / "b")), QUIET)
+    whole = run_survey(asked.but(out=str(tmp_path / "b")), QUIET)
     assert published.receipt["products"]["class_map"] == whole.receipt["products"]["class_map"]
 
 

@@ -174,7 +174,7 @@ def test_the_cheapest_good_scan_is_the_usual(survey_png: Survey, recorded: Path,
     assert taken["expected_miou"] >= 0.94 - 0.005
 
 
-@pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("coarse_exposure_ms", "20")])
+@pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("scan_exposure_ms", "20")])
 def test_flags_of_two_passes_select_two_passes(recorded: Path, name: str, value: str) -> None:
     """A flag without a use in a uniform scan is not ignored."""
     flags = {"scene": "farm", "weights": str(recorded)}
@@ -211,7 +211,7 @@ def test_spacings_that_do_not_fit_are_no_candidates(tmp_path: Path) -> None:
 def test_a_faster_coarse_pass_gives_its_seconds_to_the_fine_pass(survey_png: Any, tmp_path: Path) -> None:
     """The budget is the same; the cubes hold the exposure of each pass."""
     usual = survey_png(tmp_path / "usual", budget="0.6").receipt
-    fast = survey_png(tmp_path / "fast", budget="0.6", coarse_exposure_ms="25").receipt
+    fast = survey_png(tmp_path / "fast", budget="0.6", scan_exposure_ms="25").receipt
     found = (tmp_path / "fast").glob("stages/condense*/*/*.zarr")
     cubes = {path.stem: xr.open_zarr(path, consolidated=False) for path in found}
     coarse = [cube for name, cube in cubes.items() if name.startswith("coarse")]
