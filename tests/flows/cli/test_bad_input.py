@@ -142,11 +142,11 @@ def test_unusual_input_works(
 def test_a_survey_without_a_valid_spectrum_is_refused(
     folder: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The light saturates every pixel; the captured lines are kept."""
+    """A long exposure saturates every pixel; the captured lines are kept."""
     monkeypatch.chdir(folder)
-    (tmp_path / "hot.toml").write_text(f"{CAMERA}electrons_per_dn = 0.001\n")
-    words = survey_words("--scan-step 1 --effects shot", str(tmp_path / "archive"))
-    ended = command_line(*words, str(tmp_path / "hot.toml"))
+    (tmp_path / "bright.toml").write_text(CAMERA)
+    words = survey_words("--scan-step 1 --scan-exposure-ms 10000 --effects shot", str(tmp_path / "archive"))
+    ended = command_line(*words, str(tmp_path / "bright.toml"))
     ended.refused(1, "no spectrum of the sweeps is valid: .* saturated .* shorter exposure")
     assert Archive.open(tmp_path / "archive").refs("capture")
 

@@ -90,7 +90,7 @@ def test_documents_have_every_setting_with_its_default():
     of_others = {"mask", "max_age", "plots_name", "interest", "scan_exposure_ms", "pointing", "dark", "white", "sweeps"}
     for name, key, one in keys:
         assert one["description"], key
-        value = one["example"] if one.get("default") is None else one["default"]
+        value = one.get("default") if one["example"] is None else one["example"]
         if not name and key not in of_others:
             assert parse_settings({"scene": "farm", key: value}) is not None
 
