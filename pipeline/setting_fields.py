@@ -1,7 +1,6 @@
 """Declare settings where they are used: type, default, range, unit, help and source of the default.
 
-A table of settings is a dataclass that checks its values. A field without `stated` is a parameter of a model, and no
-setting.
+A field of a table without `stated` is a parameter of a model, and no setting.
 """
 
 from __future__ import annotations
@@ -9,12 +8,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from functools import partial
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 from pydantic import BeforeValidator, ConfigDict, Field
-from pydantic.dataclasses import dataclass
+from pydantic.fields import FieldInfo
 
 Table = TypeVar("Table")
 
@@ -33,7 +33,7 @@ REQUIRED: Any = ...  # default of a setting that has none
 
 def stated(
     default: Any,
-    about: str,
+    about: str | None = None,
     unit: str = "",
     ge: float | None = None,
     le: float | None = None,
@@ -45,10 +45,11 @@ def stated(
 ) -> Any:
     """Return a field with the complete description of a setting.
 
-    A number is finite, unless its default is infinite. ``about`` is one line of help, ``ge`` and ``le`` the least and
-    greatest allowed value [unit]. ``source`` says where the default comes from: only "measured" ones were measured on a
-    unit. Help shows ``example`` if there is no default, or if the default is written in another way. Settings of a
-    ``group`` are on the first page of the help. ``more`` are options of pydantic's Field.
+    A number is finite, unless its default is infinite. ``about`` is the help; without it, the docstring below the field
+    is. ``ge`` and ``le`` are the least and greatest allowed value [unit]. ``source`` says where the default comes from:
+    only "measured" ones were measured on a unit. Help shows ``example`` if there is no default, or if the default is
+    written in another way. Settings of a ``group`` are on the first page of the help. ``more`` are options of
+    pydantic's Field.
     """
     extra: dict[str, Any] = {"unit": unit, "source": source, "example": example, "group": group}
     if isinstance(default, float) and math.isinf(default):
@@ -61,9 +62,20 @@ assumed = partial(stated, source="assumed")  # the default is not confirmed on a
 
 @dataclass_transform(frozen_default=True)
 def settings_table(make: type[Table]) -> type[Table]:
-    """Turn a class into a table of settings: a frozen dataclass that checks its values (pydantic.ValidationError)."""
-    table: type[Table] = dataclass(frozen=True, config=CONFIG)(make)  # type: ignore[assignment]
-    return table
+    """Turn a class into a table of settings: a frozen dataclass, whose values a model of pydantic checks as it reads.
+
+    Programs may give other values, such as the camera of a recording with fewer samples than a setting allows.
+    """
+    for name, kind in make.__annotations__.items():
+        about = make.__dict__.get(name)
+        if isinstance(about, FieldInfo):
+            make.__annotations__[name] = Annotated[kind, about]
+            if about.is_required():
+                delattr(make, name)
+            else:
+                setattr(make, name, about.default)
+    make.__pydantic_config__ = CONFIG  # type: ignore[attr-defined]
+    return dataclass(frozen=True)(make)
 
 
 def parse_text(value: object) -> str:

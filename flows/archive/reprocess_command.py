@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
 from typing import Any
@@ -143,7 +142,7 @@ def _settings_of(
     gone = settings.source == RIG and any(row.state != "cached" for row in captures)  # that light is over
     otherwise = settings.source == RECORDED and any(row.ref.key and row.ref.uri not in run.names for row in captures)
     if gone or otherwise or not shown:
-        return replace(from_raw_cubes(catalogue, run, settings), **here)
+        return from_raw_cubes(catalogue, run, settings).but(**here)
     return settings
 
 

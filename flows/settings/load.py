@@ -30,6 +30,8 @@ def declared(model: type[BaseModel]) -> dict[str, dict[str, Schema]]:
         link = about.get("$ref")
         keys = {name: about} if link is None else whole["$defs"][link.rpartition("/")[2]]["properties"]
         settings = {key: one for key, one in keys.items() if "group" in one}  # others are parameters of models
+        for one in settings.values():
+            one["description"] = " ".join(one["description"].split())
         found.setdefault("" if link is None else name, {}).update(settings)
     return found
 

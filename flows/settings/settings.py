@@ -85,56 +85,34 @@ class Settings(BaseModel):
     Raises pydantic.ValidationError, with one sentence on the first mistake (`SettingsError`, `BudgetError`).
     """
 
-    model_config = ConfigDict(frozen=True, **CONFIG)
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True, **CONFIG)
 
-    settings_file: str | None = Field(
-        default=None,
-        exclude=True,
-        description="Settings file (TOML) on the machine of the survey; other parameters override it",
-    )
-    scene: Text = stated(
-        "farm",
-        "Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and"
-        " others. A folder of tiles, or tiles/*.tif, is one run a tile on the command line."
-        " Pattern for repeated visits: {date:%Y-%m-%d}.tif",
-        group=SCENE,
-    )
-    labels: Text | None = stated(
-        None,
-        "Label image on the scene's pixels (class colours or numbers); enables accuracy",
-        example="labels.png",
-        group=SCENE,
-    )
-    bands: Bands | None = stated(None, "Band numbers to use, counted from 0: 0,1 or 0-3; default: all", example=(0, 1))
-    wavelengths: Wavelengths | None = stated(
-        None, "Centre wavelengths of these bands: 660,800", "nm", example=(660.0, 800.0), group=SCENE
-    )
-    source: Literal["auto", "sim", "rig", "raster", "recorded"] = stated(
-        AUTO,
-        "Pixel source: sim (simulated rig), rig (hardware of table [rig]), raster (pixels of the file as they are),"
-        " recorded (the sweeps of --sweeps); auto: recorded with --sweeps, raster for files, sim for built-in scenes,"
-        " rig for the scene `field`",
-        group=SCENE,
-    )
-    sweeps: Text | None = stated(
-        None,
-        "Recorded sweeps: an archive, ARCHIVE/runs/NAME, a folder of ENVI cubes or of a Headwall"
-        " camera, or one ENVI or Zarr cube. Without another scan or budget, every line is used as it was taken",
-        example="sweeps",
-        group=SCENE,
-    )
-    pointing: Text | None = stated(
-        None,
-        "Pointing of the recorded lines: a table with one row per line (CSV), or a folder with one table per cube;"
-        " default: NAME.pointing.csv beside each cube",
-        example="pointing.csv",
-    )
-    dark: Text | None = stated(
-        None, "Dark frame of recorded sweeps, ENVI or .npy; default: NAME.dark.hdr or dark*.hdr", example="dark.hdr"
-    )
-    white: Text | None = stated(
-        None, "White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr", example="white.hdr"
-    )
+    settings_file: str | None = Field(default=None, exclude=True)
+    """Settings file (TOML) on the machine of the survey; other parameters override it"""
+    scene: Text = stated("farm", group=SCENE)
+    """Scene: farm, scouting or trial (built in; --seed gives another), or a file: PNG, GeoTIFF, ENVI, Zarr and others.
+    A folder of tiles, or tiles/*.tif, is one run a tile on the command line. Pattern for repeated visits:
+    {date:%Y-%m-%d}.tif"""
+    labels: Text | None = stated(None, example="labels.png", group=SCENE)
+    """Label image on the scene's pixels (class colours or numbers); enables accuracy"""
+    bands: Bands | None = stated(None, example=(0, 1))
+    """Band numbers to use, counted from 0: 0,1 or 0-3; default: all"""
+    wavelengths: Wavelengths | None = stated(None, unit="nm", example=(660.0, 800.0), group=SCENE)
+    """Centre wavelengths of these bands: 660,800"""
+    source: Literal["auto", "sim", "rig", "raster", "recorded"] = stated(AUTO, group=SCENE)
+    """Pixel source: sim (simulated rig), rig (hardware of table [rig]), raster (pixels of the file as they are),
+    recorded (the sweeps of --sweeps); auto: recorded with --sweeps, raster for files, sim for built-in scenes, rig for
+    the scene `field`"""
+    sweeps: Text | None = stated(None, example="sweeps", group=SCENE)
+    """Recorded sweeps: an archive, ARCHIVE/runs/NAME, a folder of ENVI cubes or of a Headwall camera, or one ENVI or
+    Zarr cube. Without another scan or budget, every line is used as it was taken"""
+    pointing: Text | None = stated(None, example="pointing.csv")
+    """Pointing of the recorded lines: a table with one row per line (CSV), or a folder with one table per cube;
+    default: NAME.pointing.csv beside each cube"""
+    dark: Text | None = stated(None, example="dark.hdr")
+    """Dark frame of recorded sweeps, ENVI or .npy; default: NAME.dark.hdr or dark*.hdr"""
+    white: Text | None = stated(None, example="white.hdr")
+    """White frame of recorded sweeps, likewise; default: NAME.white.hdr or white*.hdr"""
     size: Size | None = stated(
         None, f"Size of a built-in scene, width x height; default: {USUAL_SIZE}", "px", example=USUAL_SIZE, group=SCENE
     )
@@ -144,190 +122,106 @@ class Settings(BaseModel):
     hour: float | None = stated(
         None, f"True solar time of a built-in scene; default: {USUAL_HOUR:g}", "h", 0, 24, example=USUAL_HOUR
     )
-    interest: float | None = stated(
-        None,
-        "Fraction of the scene scouting with weeds, bare ground, poor growth or lodging; default: 0.02 to 0.1 by seed",
-        "",
-        0,
-        1,
-        example=0.0625,
-    )
-    seed: int = stated(0, "Random seed of built-in scenes and of all noise", "", 0, 2**63 - 1)
-    name: Name | None = stated(None, "Field name; default: the scene's", example="north", group=SCENE)
-    visit: VisitName | None = stated(
-        None,
-        "Visit: a date as YYYY-MM-DD, or any text. A new visit captures again; the same visit resumes",
-        example="first of June",
-        group=SCENE,
-    )
-    prior: Text = stated(
-        AUTO,
-        "Prior map of the field: latest (newest run), a run's name, or none; auto: latest under `serve`, else none",
-        group=SCENE,
-    )
-    area: Text | None = stated(
-        None,
-        "Area of interest: polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile, in any CRS; limits capture,"
-        " map and accuracy; a hole is a no-go zone. Needs a [pose] or a georeferenced scene",
-        example="area.geojson",
-        group=SCENE,
-    )
-    plots: Text | None = stated(
-        None,
-        "Plots, likewise; the receipt has area, classes and confidence of each",
-        example="plots.gpkg:plots",
-        group=SCENE,
-    )
-    plots_name: Text | None = stated(
-        None, "Attribute with the plot names; default: name, plot, id, label or the like", example="name"
-    )
-    seconds: float | None = stated(
-        None,
-        "Time budget of the capture; selects the uniform scan or the two passes with the highest expected mIoU",
-        "s",
-        0.1,
-        1e6,
-        example=30.0,
-        group=TIME,
-    )
-    budget: Budget | None = stated(
-        None,
-        "Time budget of a two-pass survey, as a fraction of the full scan's time: every 4th line first, then lines"
-        " chosen by the policy",
-        example=0.5,
-        group=TIME,
-    )
-    zoom: Literal["auto", "never", "always"] = stated(
-        AUTO,
-        "Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain; auto: with --seconds,"
-        " for fields of eight swaths or more, if the weights' table of scans expects as much as of a uniform scan",
-        group=TIME,
-    )
-    scan_step: int | None = stated(
-        None,
-        "Line spacing of the uniform scan; with --zoom always that of the first pass",
-        "px",
-        1,
-        MOST_STEP,
-        example=2,
-    )
-    scan_exposure_ms: float | None = stated(
-        None,
-        "Exposure of the uniform scan, or of the first pass; default: the camera's, or optimised",
-        "ms",
-        0.5,
-        10_000,
-        example=25.0,
-    )
-    extent: Extent = stated(
-        WHOLE,
-        "Extent of a uniform scan: whole; part (lines of the highest expected gain; needs --seconds and a prior map;"
-        " default with --seconds and a stated --prior); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40",
-    )
-    max_age: float | None = stated(
-        None,
-        "With --extent part: maximum age of any place in the prior map; older places are captured first",
-        "d",
-        0.04,
-        3660,
-        example=14.0,
-    )
-    macs: Compute | None = stated(
-        None,
-        "MAC budget, as a fraction of full-resolution inference (50%) or as a number (4e9), beside the fusion of a"
-        " prior map; patches with the highest expected gain come first, the rest is the overview",
-        example="50%",
-        group=TIME,
-    )
-    expected_loss: float = stated(
-        0.3,
-        "Accepted mIoU loss by reading only a part of the patches at full resolution; 0 reads all patches",
-        "points",
-        0,
-        100,
-    )
-    policy: Policy = stated("gain", "Policy that ranks patches, for the second pass or --macs")
-    mask: Text | None = stated(
-        None, "Image of patches to capture again, or to read, for policy mask", example="mask.png"
-    )
-    weights: Text | None = stated(
-        None,
-        "Model weights (.safetensors); farm: the built-in weights, the default for built-in scenes",
-        example="weights.safetensors",
-        group=TIME,
-    )
-    accuracy: bool = stated(True, "Compute the accuracy if there are labels")
-    controls: bool = stated(False, "Also simulate and judge the best uniform scan of the same seconds")
-    effects: Effects = stated(
-        AUTO,
-        "Effects of the simulated rig: auto (those that exceed tol), all, none, or names:"
-        " rotation,slit,smear,vignetting,shot,read-noise",
-    )
-    tol: Limit = stated(
-        Tolerance(),
-        "Maximum simulation error from omitted effects: in noise sigmas (0.1) or DN (0.5dn); 0: exact; inf: no limit",
-        example=Tolerance().value,
-    )
-    resampling: Kernel = stated("catmull-rom", "Resampling kernel; nearest does not mix spectra")
-    pointing_px: float = stated(
-        0.0, "Maximum pointing error of the mirror; above 0 sweeps overlap and are registered", "px", 0, 300
-    )
-    out: Text = stated("archive", "Folder of the archive", group=OUTPUT)
-    keep: Literal["signal", "raw"] = stated(
-        "signal",
-        "Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), or raw",
-        group=OUTPUT,
-    )
-    until: Literal["capture", "mosaic"] | None = stated(
-        None,
-        "Stop when this stage is stored: capture (all lines) or mosaic; the same survey without it"
-        " continues, also on another machine with a copy of the archive",
-        example="capture",
-        group=OUTPUT,
-    )
-    engine: Literal["prefect", "plain"] = stated("prefect", "Workflow engine; plain runs without a server")
-    memory: Memory = stated(4 * 1024**3, "Memory limit for tiles and regions", example="4GiB", group=MACHINE)
-    workers: int | None = stated(
-        None, "Number of workers; default: one per core", "", 1, 1024, example=2, group=MACHINE
-    )
-    scheduler: Scheduler = stated(
-        "threads", "Worker pool: threads, processes, or the address of a dask scheduler, tcp://host:port"
-    )
-    bucket: Text | None = stated(
-        None, "Bucket by which workers of a dask scheduler get stores that they lack", example="s3://bucket/prefix"
-    )
-    device: Device = stated(
-        PROCESSOR,
-        "Device of the network; auto: cuda or mps if available, else cpu. Maps of different devices may differ by"
-        " rounding",
-        group=MACHINE,
-    )
-    camera: LineCamera = Field(default=LineCamera(), description="Line camera.")
-    optics: Optics = Field(
-        default=Optics(), description="Optics of the simulated rig. No value was measured on a unit."
-    )
-    mirror: MirrorMotion = Field(default=MirrorMotion(), description="Dynamics of the simulated mirror.")
-    detector: Detector = Field(
-        default=Detector(), description="Faults of the simulated detector, beyond the camera's gain and noise."
-    )
-    air: Air = Field(
-        default=Air(), description="Air between rig and scene. Without a distance, the scene is light at the aperture."
-    )
-    sky: Sky = Field(
-        default=Sky(),
-        description="Illumination. Without a start time, the sun does not move; its course is that at the [pose].",
-    )
-    signal: SignalChoice = Field(default=SignalChoice(), description="Spectral compression.")
-    cost: CostModel = Field(default=CostModel(), description="Time model of captures.")
-    rig: SurveyRig = Field(
-        default=SurveyRig(),
-        description='Hardware, for source = "rig". The drivers follow the documented protocols and are tested against '
-        "scripted bytes, never on hardware: verify values marked assumed, and record it in provenance. The scene is "
-        'then the reference for accuracy, or "field" with name, size and wavelengths.',
-    )
-    pose: RigPose | None = Field(
-        default=None, description="Pose of the rig; adds a map on the ground with the area of each class."
-    )
+    interest: float | None = stated(None, ge=0, le=1, example=0.0625)
+    """Fraction of the scene scouting with weeds, bare ground, poor growth or lodging; default: 0.02 to 0.1 by seed"""
+    seed: int = stated(0, ge=0, le=2**63 - 1)
+    """Random seed of built-in scenes and of all noise"""
+    name: Name | None = stated(None, example="north", group=SCENE)
+    """Field name; default: the scene's"""
+    visit: VisitName | None = stated(None, example="first of June", group=SCENE)
+    """Visit: a date as YYYY-MM-DD, or any text. A new visit captures again; the same visit resumes"""
+    prior: Text = stated(AUTO, group=SCENE)
+    """Prior map of the field: latest (newest run), a run's name, or none; auto: latest under `serve`, else none"""
+    area: Text | None = stated(None, example="area.geojson", group=SCENE)
+    """Area of interest: polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile, in any CRS; limits capture, map
+    and accuracy; a hole is a no-go zone. Needs a [pose] or a georeferenced scene"""
+    plots: Text | None = stated(None, example="plots.gpkg:plots", group=SCENE)
+    """Plots, likewise; the receipt has area, classes and confidence of each"""
+    plots_name: Text | None = stated(None, example="name")
+    """Attribute with the plot names; default: name, plot, id, label or the like"""
+    seconds: float | None = stated(None, unit="s", ge=0.1, le=1e6, example=30.0, group=TIME)
+    """Time budget of the capture; selects the uniform scan or the two passes with the highest expected mIoU"""
+    budget: Budget | None = stated(None, example=0.5, group=TIME)
+    """Time budget of a two-pass survey, as a fraction of the full scan's time: every 4th line first, then lines chosen
+    by the policy"""
+    zoom: Literal["auto", "never", "always"] = stated(AUTO, group=TIME)
+    """Two-pass survey: every 4th or 8th line first, then the lines of highest expected gain; auto: with --seconds, for
+    fields of eight swaths or more, if the weights' table of scans expects as much as of a uniform scan"""
+    scan_step: int | None = stated(None, unit="px", ge=1, le=MOST_STEP, example=2)
+    """Line spacing of the uniform scan; with --zoom always that of the first pass"""
+    scan_exposure_ms: float | None = stated(None, unit="ms", ge=0.5, le=10_000, example=25.0)
+    """Exposure of the uniform scan, or of the first pass; default: the camera's, or optimised"""
+    extent: Extent = stated(WHOLE)
+    """Extent of a uniform scan: whole; part (lines of the highest expected gain; needs --seconds and a prior map;
+    default with --seconds and a stated --prior); or lines as SWEEP:FIRST-STOP, such as 0:12-310,1:0-40"""
+    max_age: float | None = stated(None, unit="d", ge=0.04, le=3660, example=14.0)
+    """With --extent part: maximum age of any place in the prior map; older places are captured first"""
+    macs: Compute | None = stated(None, example="50%", group=TIME)
+    """MAC budget, as a fraction of full-resolution inference (50%) or as a number (4e9), beside the fusion of a prior
+    map; patches with the highest expected gain come first, the rest is the overview"""
+    expected_loss: float = stated(0.3, unit="points", ge=0, le=100)
+    """Accepted mIoU loss by reading only a part of the patches at full resolution; 0 reads all patches"""
+    policy: Policy = stated("gain")
+    """Policy that ranks patches, for the second pass or --macs"""
+    mask: Text | None = stated(None, example="mask.png")
+    """Image of patches to capture again, or to read, for policy mask"""
+    weights: Text | None = stated(None, example="weights.safetensors", group=TIME)
+    """Model weights (.safetensors); farm: the built-in weights, the default for built-in scenes"""
+    accuracy: bool = stated(True)
+    """Compute the accuracy if there are labels"""
+    controls: bool = stated(False)
+    """Also simulate and judge the best uniform scan of the same seconds"""
+    effects: Effects = stated(AUTO)
+    """Effects of the simulated rig: auto (those that exceed tol), all, none, or names:
+    rotation,slit,smear,vignetting,shot,read-noise"""
+    tol: Limit = stated(Tolerance(), example=Tolerance().value)
+    """Maximum simulation error from omitted effects: in noise sigmas (0.1) or DN (0.5dn); 0: exact; inf: no limit"""
+    resampling: Kernel = stated("catmull-rom")
+    """Resampling kernel; nearest does not mix spectra"""
+    pointing_px: float = stated(0.0, unit="px", ge=0, le=300)
+    """Maximum pointing error of the mirror; above 0 sweeps overlap and are registered"""
+    out: Text = stated("archive", group=OUTPUT)
+    """Folder of the archive"""
+    keep: Literal["signal", "raw"] = stated("signal", group=OUTPUT)
+    """Captured data to keep: signal (raw lines are deleted once the compressed signal is verified), or raw"""
+    until: Literal["capture", "mosaic"] | None = stated(None, example="capture", group=OUTPUT)
+    """Stop when this stage is stored: capture (all lines) or mosaic; the same survey without it continues, also on
+    another machine with a copy of the archive"""
+    engine: Literal["prefect", "plain"] = stated("prefect")
+    """Workflow engine; plain runs without a server"""
+    memory: Memory = stated(4 * 1024**3, example="4GiB", group=MACHINE)
+    """Memory limit for tiles and regions"""
+    workers: int | None = stated(None, ge=1, le=1024, example=2, group=MACHINE)
+    """Number of workers; default: one per core"""
+    scheduler: Scheduler = stated("threads")
+    """Worker pool: threads, processes, or the address of a dask scheduler, tcp://host:port"""
+    bucket: Text | None = stated(None, example="s3://bucket/prefix")
+    """Bucket by which workers of a dask scheduler get stores that they lack"""
+    device: Device = stated(PROCESSOR, group=MACHINE)
+    """Device of the network; auto: cuda or mps if available, else cpu. Maps of different devices may differ by
+    rounding"""
+    camera: LineCamera = LineCamera()
+    """Line camera."""
+    optics: Optics = Optics()
+    """Optics of the simulated rig. No value was measured on a unit."""
+    mirror: MirrorMotion = MirrorMotion()
+    """Dynamics of the simulated mirror."""
+    detector: Detector = Detector()
+    """Faults of the simulated detector, beyond the camera's gain and noise."""
+    air: Air = Air()
+    """Air between rig and scene. Without a distance, the scene is light at the aperture."""
+    sky: Sky = Sky()
+    """Illumination. Without a start time, the sun does not move; its course is that at the [pose]."""
+    signal: SignalChoice = SignalChoice()
+    """Spectral compression."""
+    cost: CostModel = CostModel()
+    """Time model of captures."""
+    rig: SurveyRig = SurveyRig()
+    """Hardware, for source = "rig". The drivers follow the documented protocols and are tested against scripted bytes,
+    never on hardware: verify values marked assumed, and record it in provenance. The scene is then the reference for
+    accuracy, or "field" with name, size and wavelengths."""
+    pose: RigPose | None = None
+    """Pose of the rig; adds a map on the ground with the area of each class."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -363,14 +257,10 @@ class Settings(BaseModel):
                 for name, value in write(settings).items()
             }
 
-        if info.mode == "python" or info.context is EVERY:
+        if info.context is EVERY:
             return plain(self)
         usual = plain(Settings())
-        changed = {name: value for name, value in plain(self).items() if value != usual[name]}
-        for name, value in changed.items():  # of a table only the keys that differ
-            if isinstance(value, dict) and isinstance(usual[name], dict):
-                changed[name] = {key: one for key, one in value.items() if one != usual[name][key]}
-        return changed
+        return {name: value for name, value in plain(self).items() if value != usual[name]}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for the receipt, without the password; `parse_settings` reads them back."""

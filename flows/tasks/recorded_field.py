@@ -127,7 +127,7 @@ def open_recorded(settings: Settings) -> OpenedRecording:
     sweeps, out = Path(str(settings.sweeps)).resolve(), Path(settings.out).resolve()
     if out == (sweeps.parent if sweeps.is_file() else sweeps) and not is_archive(settings.out):
         raise SettingsError(
-            f"--out {settings.out} is the folder of the sweeps, and would hide them; choose another one"
+            f"--out = {settings.out!r} is the folder of the sweeps, and would hide them; choose another one"
         )
     settings = as_its_run(settings)
     recording = open_recording(

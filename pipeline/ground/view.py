@@ -40,7 +40,7 @@ class RigPose:
 
     Give ``height_m`` above the foot, or ``range_m`` to the ground along the undeflected direction.
 
-    Raises pydantic.ValidationError: a value is not finite or out of range, or not one of height and range is given.
+    Raises PoseError: not exactly one of height and range is given.
     """
 
     lon_deg: float = stated(REQUIRED, "Longitude, WGS 84; west is negative", "deg", -180, 180, example=9.5)

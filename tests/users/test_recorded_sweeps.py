@@ -23,6 +23,7 @@ from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.tasks.recorded_field import as_its_run
 from spectralzoom.flows.terminal.processes import DONE, PARTLY
 from spectralzoom.models.weights.files import save_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
@@ -211,9 +212,9 @@ def test_a_recorded_scan_is_compared_with_all_of_its_lines(tmp_path: Path, full_
 def test_recorded_lines_of_a_run_have_its_date(full_scan: FullScan) -> None:
     """Exports, histories and prior maps then use the date of capture; an explicit visit takes precedence."""
     sweeps = str(full_scan[1].folder)
-    visit = load_settings(None, {"sweeps": sweeps}).visit
+    visit = as_its_run(load_settings(None, {"sweeps": sweeps})).visit
     assert datetime.fromisoformat(visit) == datetime.fromisoformat(full_scan[1].receipt["started"])
-    assert load_settings(None, {"sweeps": sweeps, "visit": "mine"}).visit == "mine"
+    assert as_its_run(load_settings(None, {"sweeps": sweeps, "visit": "mine"})).visit == "mine"
 
 
 def test_a_survey_of_a_run_keeps_its_reference(tmp_path: Path, survey_png: Survey, make_weights: WeightsMaker) -> None:

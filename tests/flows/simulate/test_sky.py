@@ -25,7 +25,10 @@ SMALL: dict[str, Any] = {"scene": "scouting", "size": "96x64", "bands": "20,80,1
         ({"sky.light_fraction": 2}, "--sky.light-fraction must be a number from 0.01 to 1"),
         ({"interest": 1.2}, "--interest must be a number from 0 to 1"),
         ({"scene": "farm", "interest": 0.2}, "--interest = 0.2 is for the scene scouting, and the scene is farm"),
-        ({"scene": "field.png", "sky.light": "overcast"}, "--sky.light is of a camera, and the scene field.png is a raster"),
+        (
+            {"scene": "field.png", "sky.light": "overcast"},
+            "--sky.light is of a camera, and the scene field.png is a raster",
+        ),
     ],
 )
 def test_bad_sky_settings_are_refused(flags: dict[str, Any], words: str) -> None:
