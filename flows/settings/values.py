@@ -75,17 +75,6 @@ def parse_budget(value: object) -> float:
     return number
 
 
-def parse_bytes(value: object) -> int:
-    """Return bytes above 0, from a whole number or text such as 4GiB or 500 MB."""
-    try:
-        count = 0 if "%" in str(value) else int(_BYTES.validate_python(value))
-    except ValidationError:
-        count = 0
-    if count <= 0:
-        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}")
-    return count
-
-
 def parse_compute(value: object) -> str:
     """Return a fraction of the multiply-adds of a full reading, such as 50%, or a number such as 4e9."""
     percent = _amount(value, {"%": 1.0})
@@ -101,8 +90,13 @@ def parse_compute(value: object) -> str:
 
 
 def parse_memory(value: object) -> int:
-    """Return bytes that suffice for one process, as `parse_bytes` reads them."""
-    count = parse_bytes(value)
+    """Return bytes that suffice for one process, from a whole number or text such as 4GiB or 500 MB."""
+    try:
+        count = 0 if "%" in str(value) else int(_BYTES.validate_python(value))
+    except ValidationError:
+        count = 0
+    if count <= 0:
+        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}")
     if count < LEAST_MEMORY:
         raise ValueError(f"must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
     return count
