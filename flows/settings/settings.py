@@ -23,7 +23,16 @@ from pydantic import (
     model_validator,
 )
 
-from spectralzoom.flows.settings.load import FLAG, declared, known_only, merged, nested, read_file, sentence_of
+from spectralzoom.flows.settings.load import (
+    FLAG,
+    anchor_paths,
+    declared,
+    known_only,
+    merged,
+    nested,
+    read_file,
+    sentence_of,
+)
 from spectralzoom.flows.settings.rules import completed, contradictions, mistakes, with_source
 from spectralzoom.flows.settings.values import (
     ALWAYS,
@@ -247,7 +256,7 @@ class Settings(BaseModel):
 
     @model_serializer(mode="wrap")
     def _changed_only(self, write: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
-        """Return all values; for a server those that differ from the defaults."""
+        """Return all values; for a server those that differ from the defaults, with absolute paths."""
         tables = declared(type(self))
 
         def plain(settings: Settings) -> dict[str, Any]:
@@ -259,8 +268,8 @@ class Settings(BaseModel):
 
         if info.context is EVERY:
             return plain(self)
-        usual = plain(Settings())
-        return {name: value for name, value in plain(self).items() if value != usual[name]}
+        usual = plain(Settings()) | {"source": AUTO}
+        return {name: value for name, value in anchor_paths(plain(self), Path.cwd()).items() if value != usual[name]}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for the receipt, without the password; `parse_settings` reads them back."""

@@ -191,7 +191,7 @@ def test_keywords_override_a_settings_file(asked: dict[str, object], tmp_path: P
     """A table in a keyword changes only its own keys."""
     (tmp_path / "survey.toml").write_text("budget = 0.3\nengine = 'plain'\n[camera]\nsamples = 320\nbits = 10\n")
     same = {"source": "sim", "scene": asked["scene"], "weights": asked["weights"], "out": tmp_path / "archive"}
-    with pytest.raises(spectralzoom.Error, match=r"'camera.bits' must be a whole number from 8 to 16"):
+    with pytest.raises(spectralzoom.Error, match=r"--camera.bits must be a whole number from 8 to 16"):
         spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 40})
     (tmp_path / "survey.toml").write_text("[camera]\nsamples = 3\n")
     with pytest.raises(spectralzoom.Error, match=r"'camera.samples' in .*survey.toml must be"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import fields
 from pathlib import Path
 
 import pyproj
@@ -13,7 +12,8 @@ import shapely
 
 from spectralzoom.flows.archive.plan_command import plan_content
 from spectralzoom.flows.publish.receipt_table import finding_rows
-from spectralzoom.flows.settings.settings import load_settings
+from spectralzoom.flows.settings.load import declared
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.tasks.zones import place_of_field
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.ground.field_places import scale_of_pixels, scale_of_view
@@ -29,7 +29,7 @@ def test_example_poses_see_the_farms_ground_pixel() -> None:
     """The settings' examples, by height and by range, and the page on the ground agree within 1 % (hectares 3 %)."""
     shape = (1024, 1280)
     camera = LineCamera()
-    told = {one.name: one.metadata["json_schema_extra"]["example"] for one in fields(RigPose)}
+    told = {name: one["example"] for name, one in declared(Settings)["pose"].items()}
     common = {name: told[name] for name in ("lon_deg", "lat_deg", "heading_deg", "tilt_deg")}
     (block,) = re.findall(r"```toml\n(\[pose\].*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     own = scale_of_pixels(shape, camera.ifov_rad, FARM_PIXEL_M)

@@ -183,7 +183,7 @@ def test_a_second_visit_uses_the_first_as_prior_map(surveyed: Raster, scene_file
 )
 def test_a_setting_of_a_camera_is_refused(scene_files: Path, name: str, value: object) -> None:
     """For a raster one message names the setting, and the source with which the rig scans the file."""
-    flag = f"'{name}'" if "." in name else "--" + name.replace("_", "-")
+    flag = "--" + name.replace("_", "-")
     with pytest.raises(SettingsError, match=rf"{flag} is of a camera, .* leave it out, or give --source sim"):
         load_settings(None, {"scene": str(scene_files / "scene.png"), name: value})
 

@@ -180,7 +180,7 @@ def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
     assert north.concurrency_options.collision_strategy.value == "CANCEL_NEW"
     schedules = [(one.schedule.cron, one.schedule.timezone) for one in north.schedules]
     assert schedules == [("0 6-20 * * *", "Europe/Berlin")]
-    known = survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"]
+    known = survey.parameters.model_dump()["definitions"]["Settings"]["properties"]
     assert set(north.parameters["settings"]) <= set(known)
     reprocess.validate_parameters(archive.parameters)
 

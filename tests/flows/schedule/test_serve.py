@@ -117,7 +117,7 @@ def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], 
 
     ((file, north),) = load_fields([field_file("north")], out=str(tmp_path / "other")).items()
     made = survey_deployment(file, north, schedule_of("0 6 * * *", None, "Europe/Berlin"))
-    settings = survey.validate_parameters(made.parameters)["settings"].settings()
+    settings = survey.validate_parameters(made.parameters)["settings"]
     assert (settings.name, settings.out, settings.budget) == ("north", str(tmp_path / "other"), 0.8)
     assert (made.concurrency_limit, made.concurrency_options.collision_strategy.value) == (1, "CANCEL_NEW")
     (schedule,) = made.schedules

@@ -120,7 +120,7 @@ def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path)
     rows = np.zeros((64, 80, 3), np.float32)
     rows[1::2] = 1
     np.save(tmp_path / "rows.npy", rows)
-    flags = ["--wavelengths", "640,550,460", "--exposure-ms", "10000", "-o", str(tmp_path / "scan"), "--json"]
+    flags = ["--wavelengths", "640,550,460", "--camera.exposure-ms", "10000", "-o", str(tmp_path / "scan"), "--json"]
     record = json.loads(command_line("simulate", str(tmp_path / "rows.npy"), *narrow(tmp_path), *flags).out)
     assert record["lines"] == 67
     assert {row["name"]: row["reason"] for row in record["effects"]}["smear"] == "absent"

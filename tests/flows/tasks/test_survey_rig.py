@@ -129,7 +129,7 @@ def test_a_rig_on_hardware_is_for_one_survey(tmp_path: Path) -> None:
         real = settings.but(visit="second", rig=replace(settings.rig, mirror_driver=""))
         with pytest.raises(RigError, match="in use by another survey"):
             run_survey(real, QUIET)
-        assert run_survey(replace(real, visit="first"), QUIET).receipt["products"]["mosaic"]
+        assert run_survey(real.but(visit="first"), QUIET).receipt["products"]["mosaic"]
 
 
 def test_field_without_a_picture_is_surveyed(tmp_path: Path, weights: Path) -> None:
@@ -144,7 +144,7 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, weights: Path) -> N
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
-    "axes": ({"rig.mirror_axes": "x,x"}, r"'rig.mirror_axes' must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
+    "axes": ({"rig.mirror_axes": "x,x"}, r"--rig.mirror-axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
     "memory": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* at most 8191 pairs"),
     "size": ({"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"}, r"give its size"),
     "no rig": ({"scene": "field", "source": "sim", "bands": None}, r"scene 'field' is what stands before a rig"),

@@ -174,7 +174,7 @@ def test_the_cheapest_good_scan_is_the_usual(survey_png: Survey, recorded: Path,
     assert taken["expected_miou"] >= 0.94 - 0.005
 
 
-@pytest.mark.parametrize(("name", "value"), [("policy", "gain"), ("scan_exposure_ms", "20")])
+@pytest.mark.parametrize(("name", "value"), [("policy", "sobel"), ("zoom", "always")])
 def test_flags_of_two_passes_select_two_passes(recorded: Path, name: str, value: str) -> None:
     """A flag without a use in a uniform scan is not ignored."""
     flags = {"scene": "farm", "weights": str(recorded)}

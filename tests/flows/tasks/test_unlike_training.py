@@ -81,7 +81,7 @@ def test_a_survey_within_the_training_range_has_no_note(weights: Path, day: int,
     [
         ({"day": 20, "hour": 12}, r"day 20 of the year \(January; training: April to October\); a sun"),
         ({"scan_step": 1, "scan_exposure_ms": 1}, r"exposures of 1 ms \(training: 3 ms and more, by --min-"),
-        ({"scan_exposure_ms": 2}, "exposures of 2 ms"),
+        ({"scan_exposure_ms": 2, "zoom": "always"}, "exposures of 2 ms"),
         ({"nm": (460.0, 470.0, 480.0)}, "the bands cover 2 of the weights' 3 spectral features"),
         ({"nm": (460.0, 900.0, 1500.0, 1600.0)}, "bands outside of 460-640 nm: 3 of 4"),
         ({"seen": replace(SEEN, ground_pixel_m=0.01)}, r"GSD of 12 cm \(training: 1 cm\)"),

@@ -202,8 +202,8 @@ def test_no_variant_makes_light_negative(effect: Effect, variant: str):
 @pytest.mark.parametrize("step", [1, 4])
 def test_extreme_rigs_give_finite_light(effect: Effect, step: int):
     """At the limits of mirror and air settings light is finite, also in a block without lines; no bound is negative."""
-    slow = MirrorMotion(0.1, 0.01, 0.0, 0.01, 1e3, 1e2, 1e2)
-    stiff = MirrorMotion(1e5, 10.0, 1e4, 1e4, 0.0, 0.0, 0.0)
+    slow = MirrorMotion(0.1, 1e3, 1e2, 1e2, damping=0.01, settled_s=0.0, positions_per_line=0.01)
+    stiff = MirrorMotion(1e5, 0.0, 0.0, 0.0, damping=10.0, settled_s=1e4, positions_per_line=1e4)
     far = Air(distance_m=np.inf, relief="plane", nearest_m=1e-3, wind_amplitude_m=100.0, wind_hz=50.0)
     sweep = replace(FINE, step=step, lines=3)
     for mirror in (slow, stiff):
