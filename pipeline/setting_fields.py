@@ -19,15 +19,27 @@ from pydantic.fields import FieldInfo
 Table = TypeVar("Table")
 
 
-def without_null(schema: dict[str, Any]) -> None:
-    """Write a setting that may be absent as its value alone: forms and help offer no null. Changes the schema."""
-    for name, about in schema.get("properties", {}).items():
-        kinds = [one for one in about.get("anyOf", ()) if one.get("type") != "null"]
-        if len(kinds) == 1:
-            schema["properties"][name] = {key: one for key, one in about.items() if key != "anyOf"} | kinds[0]
+def _as_form(schema: dict[str, Any]) -> None:
+    """Complete the schema of a table for forms and documents, without parameters of models. Changes the schema.
+
+    A form would send null and defaults over those of a settings file: the default is in the description, and ``usual``
+    of the schema. ``about`` is the help with unit and source.
+    """
+    schema["properties"] = {name: one for name, one in schema["properties"].items() if "description" in one}
+    for name, one in schema["properties"].items():
+        kinds = [kind for kind in one.pop("anyOf", ()) if kind.get("type") != "null"]
+        one |= {"anyOf": kinds} if len(kinds) > 1 else dict(*kinds)
+        one["title"] = name.replace("_", " ")
+        usual = {"usual": one.pop("default")} if "default" in one else {}
+        if "group" in one:
+            unit = f" [{one['unit']}]" if one["unit"] else ""
+            source = f"; {one['source']}" if one["source"] else ""
+            one |= usual | {"about": " ".join(one["description"].split()) + unit + source}
+            shown = None if one.get("usual") in (None, "") else one["example"] or one["usual"]
+            one["description"] = one["about"] + ("" if shown is None else f"; default: {shown}")
 
 
-CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra=without_null)
+CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra=_as_form)
 REQUIRED: Any = ...  # default of a setting that has none
 
 

@@ -22,17 +22,14 @@ HEAD = """\
 """
 
 
-def about(one: Schema, *, choices: bool = True) -> str:
-    """Return the help of a setting, with its unit, its choices, and the source of its default."""
-    unit = f" [{one['unit']}]" if one["unit"] else ""
-    words = f" ({listed(one)})" if "enum" in one and choices else ""
-    source = f"; {one['source']}" if one["source"] else ""
-    return f"{one['description']}{unit}{words}{source}"
+def about(one: Schema) -> str:
+    """Return the help of a setting, with its unit, the source of its default, and its choices."""
+    return str(one["about"]) + (f" ({listed(one)})" if "enum" in one else "")
 
 
 def toml_value(one: Schema) -> str:
     """Return the default of a setting, or an example value, as TOML."""
-    return as_toml(one.get("default") if one["example"] is None else one["example"])
+    return as_toml(one.get("usual") if one["example"] is None else one["example"])
 
 
 def as_toml(value: Any) -> str:
@@ -48,7 +45,7 @@ def example_toml() -> str:
     """Return the example file: each key with its default, commented out where it has none, and its help."""
     lines = [HEAD]
     for name, keys in declared(Settings).items():
-        off = name == "pose" or all(one.get("default") is None for one in keys.values())
+        off = name == "pose" or all(one.get("usual") is None for one in keys.values())
         if name:
             description = Settings.model_fields[name].description or ""
             lines += ["", *(f"# {line}" for line in textwrap.wrap(description, WIDTH - 2))]
@@ -58,7 +55,7 @@ def example_toml() -> str:
 
 
 def _example_lines(name: str, one: Schema, *, off: bool) -> Iterator[str]:
-    sign = "# " if off or one.get("default") in (None, "") else ""
+    sign = "# " if off or one.get("usual") in (None, "") else ""
     help_lines = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
     yield f"{sign}{name} = {toml_value(one)}".ljust(COLUMN - 1) + f" # {help_lines[0]}"
     yield from (" " * COLUMN + f"# {more}" for more in help_lines[1:])
@@ -69,9 +66,7 @@ def settings_table() -> str:
     parts = []
     for title, keys in declared(Settings).items():
         heading = f"## [{title}]\n\n{Settings.model_fields[title].description}\n\n" if title else ""
-        rows = [
-            f"| `{name}` | {_shown(one)} | {_values(one)} | {about(one, choices=False)} |" for name, one in keys.items()
-        ]
+        rows = [f"| `{name}` | {_shown(one)} | {_values(one)} | {one['about']} |" for name, one in keys.items()]
         parts.append(
             heading + "\n".join(["| key | default | allowed values | meaning |", "|---|---|---|---|", *rows]) + "\n"
         )
@@ -79,9 +74,9 @@ def settings_table() -> str:
 
 
 def _shown(one: Schema) -> str:
-    if "default" not in one:
+    if "usual" not in one:
         return "to be given"
-    return "" if one["default"] in (None, "") else f"`{toml_value(one)}`"
+    return "" if one["usual"] in (None, "") else f"`{toml_value(one)}`"
 
 
 def _values(one: Schema) -> str:

@@ -56,7 +56,7 @@ def _flags(keys: Iterable[str], *, all_shown: bool) -> Any:
     for full in keys:
         table, _, key = full.rpartition(".")
         one = declared(Settings)[table][key]
-        usual = "" if one.get("default") is None else f"; default: {toml_value(one).strip(chr(34))}"
+        usual = "" if one.get("usual") is None else f"; default: {toml_value(one).strip(chr(34))}"
         kind: Any = bool if one.get("type") == "boolean" else str
         page: Any = {"group": GROUPS[one["group"]]} if one["group"] else {"show": all_shown}
         flag = Parameter(name=f"--{full.replace('_', '-')}", help=about(one) + usual, **page)
@@ -93,8 +93,8 @@ def print_every_flag() -> int:
     for title, keys in declared(Settings).items():
         print(f"\n[{title}]  {Settings.model_fields[title].description}" if title else "")
         for key, one in keys.items():
-            flag = f"--{title}.{key}".replace("--.", "--no-" if one.get("default") is True else "--").replace("_", "-")
-            usual = "" if one.get("default") in (None, "") else f"; default: {toml_value(one)}"
+            flag = f"--{title}.{key}".replace("--.", "--no-" if one.get("usual") is True else "--").replace("_", "-")
+            usual = "" if one.get("usual") in (None, "") else f"; default: {toml_value(one)}"
             print(textwrap.fill(f"{flag:28} {about(one)}{usual}", 120, subsequent_indent=" " * 29))
     return 0
 

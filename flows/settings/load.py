@@ -29,9 +29,7 @@ def declared(model: type[BaseModel]) -> dict[str, dict[str, Schema]]:
     for name, about in whole["properties"].items():
         link = about.get("$ref")
         keys = {name: about} if link is None else whole["$defs"][link.rpartition("/")[2]]["properties"]
-        settings = {key: one for key, one in keys.items() if "group" in one}  # others are parameters of models
-        for one in settings.values():
-            one["description"] = " ".join(one["description"].split())
+        settings = {key: one for key, one in keys.items() if "group" in one}
         found.setdefault("" if link is None else name, {}).update(settings)
     return found
 
@@ -46,9 +44,7 @@ def allowed(about: Schema) -> str:
         return f"a whole number from {low} to {high}"
     if kind == "number":
         span = f"of at least {low:g}" if high is None else f"from {low:g} to {high:g}"
-        return (
-            f"a number {span}" + (f" {unit}" if unit else "") + (" or inf" if about.get("default") == math.inf else "")
-        )
+        return f"a number {span}" + (f" {unit}" if unit else "") + (" or inf" if about.get("usual") == math.inf else "")
     return {"boolean": "true or false", "string": "text that is not empty"}.get(str(kind), "")
 
 

@@ -89,10 +89,7 @@ class SignalChoice:
 
 
 class Settings(BaseModel):
-    """Settings of one survey. The source ``auto`` is resolved here, so that receipts name the actual source.
-
-    Raises pydantic.ValidationError, with one sentence on the first mistake (`SettingsError`, `BudgetError`).
-    """
+    """Settings of one survey; all have defaults."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True, **CONFIG)
 
@@ -237,7 +234,8 @@ class Settings(BaseModel):
     def _in_one_sentence(cls, table: Any, read: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
         """Complete a table of settings and read it; the first mistake is one sentence that names its flag or file.
 
-        The context is the origin of each key: ``flag`` or the name of a file.
+        The context is the origin of each key: ``flag`` or the name of a file. The source ``auto`` is resolved, so that
+        receipts name the actual source.
         """
         if not isinstance(table, Mapping):
             return read(table)

@@ -89,8 +89,8 @@ def test_documents_have_every_setting_with_its_default():
     assert ["| `samples`", "`640`", "a whole number from 16 to 65536", "Pixels of a line [px] |"] in rows
     of_others = {"mask", "max_age", "plots_name", "interest", "scan_exposure_ms", "pointing", "dark", "white", "sweeps"}
     for name, key, one in keys:
-        assert one["description"], key
-        value = one.get("default") if one["example"] is None else one["example"]
+        assert one["about"], key
+        value = one.get("usual") if one["example"] is None else one["example"]
         if not name and key not in of_others:
             assert parse_settings({"scene": "farm", key: value}) is not None
 
@@ -193,7 +193,7 @@ def test_numbers_are_finite_and_no_truth_values(key, about):
     """Infinity is allowed only where it is the default; NaN and true are never allowed."""
     pose = {f"pose.{name}": value for name, value in POSE.items()} if key.startswith("pose.") else {}
     for value in (True, math.nan, -math.inf, math.inf, "nan"):
-        if value is not True and value == about.get("default"):
+        if value is not True and value == about.get("usual"):
             assert load_settings(flags={key: value}) == Settings()
             continue
         with pytest.raises(SettingsError, match=rf"^--{key.replace('_', '-')} must be a (whole )?number"):
