@@ -27,10 +27,10 @@ def declared(model: type[BaseModel]) -> dict[str, dict[str, Schema]]:
     whole = model.model_json_schema()
     found: dict[str, dict[str, Schema]] = {"": {}}
     for name, about in whole["properties"].items():
-        link = about.get("$ref")
-        keys = {name: about} if link is None else whole["$defs"][link.rpartition("/")[2]]["properties"]
-        settings = {key: one for key, one in keys.items() if "group" in one}
-        found.setdefault("" if link is None else name, {}).update(settings)
+        if "$ref" in about:
+            found[name] = whole["$defs"][about["$ref"].rpartition("/")[2]]["properties"]
+        elif "group" in about:
+            found[""][name] = about
     return found
 
 

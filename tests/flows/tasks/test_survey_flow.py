@@ -137,9 +137,13 @@ def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> 
 def test_every_setting_is_a_described_field_of_the_form() -> None:
     """Prefect makes its form from the parameters of the flow."""
 
-    schema = prefect_flow.survey.parameters.definitions["Settings"]["properties"]
-    assert set(schema) == {*Settings.model_fields}
-    assert all(one.get("description") or "$ref" in json.dumps(one) for one in schema.values())
+    forms = prefect_flow.survey.parameters.definitions
+    assert set(forms["Settings"]["properties"]) == {*Settings.model_fields}
+    fields = [(name, one) for form in forms.values() for name, one in form.get("properties", {}).items()]
+    assert [name for name, one in fields if not one.get("description")] == []
+    assert [name for name, one in fields if "default" in one or "null" in json.dumps(one.get("type"))] == []
+    assert "stray_even" not in forms["Optics"]["properties"]  # a parameter of a model
+    assert forms["Settings"]["properties"]["seconds"]["description"].endswith("[s]")
 
 
 def test_prefect_makes_the_stores_of_plain(survey_png: Any, surveyed_png: Any, tmp_path: Path, server: str) -> None:
