@@ -79,32 +79,34 @@ def changed(settings: Settings, *names: str) -> list[str]:
     return found
 
 
-def contradictions(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+def mistakes(settings: Settings, origin: Mapping[str, str], *, stored: bool) -> Iterator[str]:
+    """Yield errors: settings that do not fit each other. A ``stored`` plan has its scan beside what it was chosen by."""
+    checks = (_camera_errors, _scene_errors, _air_errors, _recorded_errors, _extent_errors, _limit_errors)
+    for check in checks if stored else (_scan_errors, *checks):
+        yield from check(settings, lambda name: place_of(name, origin))
+
+
+def _scan_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings that choose different scans."""
-    zooms = settings.zoom == ALWAYS
-    uniform = [] if zooms else changed(settings, "seconds", "scan_step")  # which a first pass has too
+    if settings.is_map:
+        return
+    uniform = [] if settings.zoom == ALWAYS else changed(settings, "seconds", "scan_step")  # which a first pass has too
     passes = changed(settings, "budget", *(() if settings.macs else ("policy", "mask")))
-    if uniform and passes and not settings.is_map:
+    if uniform and passes:
         yield (
-            f"{place_of(uniform[0], origin)} asks for one uniform scan of the field, and {place_of(passes[0], origin)} "
-            "is for a survey that captures again; leave one of them out"
+            f"{at(uniform[0])} asks for one uniform scan of the field, and {at(passes[0])} is for a survey that "
+            "captures again; leave one of them out"
         )
-    exposure = place_of("scan_exposure_ms", origin)
-    if settings.scan_exposure_ms is not None and settings.source == RECORDED:
-        yield f"{exposure} is for a camera, and recorded lines have their own: leave it out"
     if len(uniform) > 1:
         yield (
-            f"{place_of(uniform[0], origin)} leaves the choice of the scan to the weights' record, "
-            f"{place_of(uniform[1], origin)} makes it: leave one out"
+            f"{at(uniform[0])} leaves the choice of the scan to the weights' record, {at(uniform[1])} makes it: leave "
+            "one out"
         )
+    exposure = at("scan_exposure_ms")
+    if settings.scan_exposure_ms is not None and settings.source == RECORDED:
+        yield f"{exposure} is for a camera, and recorded lines have their own: leave it out"
     if settings.scan_exposure_ms is not None and not settings.zooms and settings.scan_step is None:
         yield f"{exposure} is for lines that you choose: give --scan-step too (1 for every line), or --zoom always"
-
-
-def mistakes(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """Yield errors: settings that do not fit each other."""
-    for check in (_camera_errors, _scene_errors, _air_errors, _recorded_errors, _extent_errors, _limit_errors):
-        yield from check(settings, lambda name: place_of(name, origin))
 
 
 def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:

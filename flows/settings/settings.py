@@ -33,7 +33,7 @@ from spectralzoom.flows.settings.load import (
     read_file,
     sentence_of,
 )
-from spectralzoom.flows.settings.rules import completed, contradictions, mistakes, with_source
+from spectralzoom.flows.settings.rules import completed, mistakes, with_source
 from spectralzoom.flows.settings.values import (
     ALWAYS,
     AUTO,
@@ -247,9 +247,8 @@ class Settings(BaseModel):
             found = read(with_source(table) if origin is AS_STORED else completed(table))
         except ValidationError as error:
             raise sentence_of(error, cls, origin) from None
-        for check in (mistakes,) if origin is AS_STORED else (contradictions, mistakes):
-            for wrong in check(found, origin):
-                raise SettingsError(wrong)
+        for wrong in mistakes(found, origin, stored=origin is AS_STORED):
+            raise SettingsError(wrong)
         return found
 
     @model_serializer(mode="wrap")

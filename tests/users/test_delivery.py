@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 
 from spectralzoom.flows.cli.main import VERBS, build_app, main
+from spectralzoom.flows.settings.flags import KEYS
 from tests.conftest import WeightsMaker
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -177,11 +178,12 @@ def test_the_container_copies_every_package() -> None:
 
 
 def test_bash_completes_the_flags_of_a_verb(tmp_path: Path) -> None:
-    """The completion script contains every verb, and bash completes `survey --budg` to `--budget`."""
+    """The completion script contains every verb and setting, and bash completes `survey --budg` to `--budget`."""
     script = tmp_path / "script"
     with pytest.raises(SystemExit) as ended:
         main(["completion", "--shell", "bash", "--output", str(script)])
     assert not ended.value.code
     assert all(re.search(rf"\b{verb.split()[-1]}\b", script.read_text()) for verb in VERBS)
+    assert all(f"--{key.replace('_', '-')}" in script.read_text() for key in KEYS)
     typed = "COMP_WORDS=(spectralzoom survey --budg); COMP_CWORD=2; _spectralzoom; echo ${COMPREPLY[@]}"
     assert run(["bash", "-c", f"source {script}; {typed}"], tmp_path).split() == ["--budget"]
