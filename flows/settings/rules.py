@@ -80,7 +80,7 @@ def changed(settings: Settings, *names: str) -> list[str]:
 
 
 def mistakes(settings: Settings, origin: Mapping[str, str], *, stored: bool) -> Iterator[str]:
-    """Yield errors: settings that do not fit each other. A ``stored`` plan has its scan beside what it was chosen by."""
+    """Yield errors: settings that do not fit each other. A ``stored`` plan has its scan beside what chose it."""
     checks = (_camera_errors, _scene_errors, _air_errors, _recorded_errors, _extent_errors, _limit_errors)
     for check in checks if stored else (_scan_errors, *checks):
         yield from check(settings, lambda name: place_of(name, origin))
@@ -90,7 +90,8 @@ def _scan_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
     """Yield errors: settings that choose different scans."""
     if settings.is_map:
         return
-    uniform = [] if settings.zoom == ALWAYS else changed(settings, "seconds", "scan_step")  # which a first pass has too
+    # a first pass has them too
+    uniform = [] if settings.zoom == ALWAYS else changed(settings, "seconds", "scan_step")
     passes = changed(settings, "budget", *(() if settings.macs else ("policy", "mask")))
     if uniform and passes:
         yield (

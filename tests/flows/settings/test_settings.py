@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spectralzoom.flows.settings.documents import example_toml, settings_table
-from spectralzoom.flows.settings.load import declared
+from spectralzoom.flows.settings.flags import KEYS
+from spectralzoom.flows.settings.load import declared, nested
 from spectralzoom.flows.settings.settings import Settings, load_settings, parse_settings
 from spectralzoom.flows.settings.values import Tolerance
 from spectralzoom.pipeline.errors import BudgetError, SettingsError
@@ -305,3 +306,33 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
 def test_a_prior_map_and_seconds_select_a_partial_scan(more: dict[str, str], extent: str) -> None:
     """Without prior map, or with another choice of lines, the whole field is captured."""
     assert load_settings(None, {"scene": "farm", "seconds": "8", "prior": "latest", **more}).extent == extent
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=5)
+    | st.dates()
+    | st.datetimes()
+    | st.sampled_from(["auto", "farm", "field", "a.png", "50%", "1,2", "0:1-2", "inf", "1e400", "~nobody", "\0"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=4,
+)
+
+
+@given(
+    st.dictionaries(st.sampled_from([key for key in KEYS if key != "rig.password"]), VALUES, min_size=1, max_size=4),
+    st.booleans(),
+)
+def test_any_values_give_settings_or_one_sentence(values, stored):
+    """Values of any type are read back from the receipt as they are, or refused in one line that names a setting."""
+    try:
+        settings = parse_settings(nested(values)) if stored else load_settings(flags=values)
+    except (SettingsError, BudgetError) as error:
+        sentence = str(error)
+    else:
+        sentence = ""
+        assert parse_settings(settings.to_dict()) == settings
+    assert "\n" not in sentence
