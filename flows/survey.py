@@ -43,7 +43,12 @@ def survey_field(settings: SurveySettings) -> RunRef:
     Raises PipelineError: what is wrong, what is allowed, and what to do.
     """
     started = datetime.now(UTC)
-    return carry_out(plan_survey(open_field(settings_of_visit(settings))), started)
+    checked = settings_of_visit(settings)
+    if checked.source == RIG:
+        from spectralzoom.pipeline.rig.drivers import check_drivers  # imports pyserial
+
+        check_drivers(checked.rig)
+    return carry_out(plan_survey(open_field(checked)), started)
 
 
 def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:

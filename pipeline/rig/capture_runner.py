@@ -93,8 +93,7 @@ class CaptureJournal:
         for number, line in enumerate(lines, 1):
             check, _, text = line.partition(b" ")
             if check != _crc32(text):
-                if (line[-1] ^ ord("}")).bit_count() < 2:  # else the end of a write that a power cut broke off
-                    self.damage.append(f"record {number} of {JOURNAL} is ignored: it has changed since it was written")
+                self.damage.append(f"record {number} of {JOURNAL} is ignored: it is torn or has changed")
                 continue
             try:
                 self._follow(json.loads(text))

@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Protocol, cast
 
 from numpy.typing import ArrayLike
 
@@ -127,11 +127,6 @@ class RigDevices:
                 LOG.warning("while closing the rig: %s", error)
 
 
-Setting = Literal["mirror_driver", "camera_driver"]
-Factory = Callable[[SurveyRig, Clock], Any]
-_PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver": CameraDriver}
-
-
 def open_devices(rig: SurveyRig, vector_pairs: int, seen: SimulatedSource | None = None) -> RigDevices:
     """Connect to mirror and camera. Nothing moves. ``seen`` is the scene before a fake camera.
 
@@ -152,34 +147,37 @@ def open_devices(rig: SurveyRig, vector_pairs: int, seen: SimulatedSource | None
 
 def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK) -> MirrorDriver:
     """Connect to the mirror, as `open_devices`."""
-    if rig.mirror_driver == FAKE:
-        return FakeMirror(clock, vector_pairs)
-    factory = import_factory(rig, "mirror_driver")
-    if factory is None:
-        return open_mirror(rig, vector_pairs, clock)
-    return cast("MirrorDriver", _opened(factory, rig, "mirror_driver", clock))
+    match rig.mirror_driver:
+        case "":
+            return open_mirror(rig, vector_pairs, clock)
+        case "fake":
+            return FakeMirror(clock, vector_pairs)
+    return cast("MirrorDriver", _open_other(rig, "mirror_driver", MirrorDriver, clock))
 
 
 def open_camera_driver(
     rig: SurveyRig, clock: Clock = SYSTEM_CLOCK, seen: SimulatedSource | None = None
 ) -> CameraDriver:
     """Return the camera's driver; raises as `open_devices`. The shipped one connects at its first command."""
-    if rig.camera_driver == FAKE:
-        return FakeCamera(clock, seen)
-    factory = import_factory(rig, "camera_driver")
-    if factory is None:
-        return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
-    return cast("CameraDriver", _opened(factory, rig, "camera_driver", clock))
+    match rig.camera_driver:
+        case "":
+            return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
+        case "fake":
+            return FakeCamera(clock, seen)
+    return cast("CameraDriver", _open_other(rig, "camera_driver", CameraDriver, clock))
 
 
-def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
-    """Import the function that opens a driver of another make; None where the settings name a shipped one.
+def check_drivers(rig: SurveyRig) -> None:
+    """Import the drivers of another make that the settings name. Raises SettingsError: one cannot be imported."""
+    for setting in ("mirror_driver", "camera_driver"):
+        if getattr(rig, setting) not in ("", FAKE):
+            _imported(rig, setting)
 
-    Raises SettingsError: it cannot be imported.
-    """
+
+def _imported(rig: SurveyRig, setting: str) -> Callable[[SurveyRig, Clock], object]:
     name: str = getattr(rig, setting)
     try:
-        return cast("Factory", pkgutil.resolve_name(name)) if name not in ("", FAKE) else None
+        return cast("Callable[[SurveyRig, Clock], object]", pkgutil.resolve_name(name))
     except Exception as error:  # whatever the module of another make does as it is imported
         raise SettingsError(
             f"rig.{setting} = {name!r} cannot be imported ({type(error).__name__}: {error}). Expected module:function "
@@ -187,9 +185,9 @@ def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
         ) from error
 
 
-def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) -> object:
-    """Return what the function opens, where it has every method of its protocol."""
-    name = getattr(rig, setting)
+def _open_other(rig: SurveyRig, setting: str, protocol: type, clock: Clock) -> object:
+    """Open a driver of another make, and check that it has every method of its protocol."""
+    factory, name = _imported(rig, setting), getattr(rig, setting)
     try:
         device = factory(rig, clock)
     except TypeError as error:
@@ -197,7 +195,6 @@ def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) ->
             f"rig.{setting} = {name!r} does not open a driver ({error}). Expected a function of the table [rig] and a "
             "clock"
         ) from error
-    protocol = _PROTOCOLS[setting]
     missing = [one for one in vars(protocol) if not one.startswith("_") and not callable(getattr(device, one, None))]
     if missing:
         raise SettingsError(

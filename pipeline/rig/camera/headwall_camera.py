@@ -11,18 +11,10 @@ import logging
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 from spectralzoom.pipeline.errors import RigError
-from spectralzoom.pipeline.rig.camera.camera_cubes import (
-    CapturedLines,
-    MeanFrame,
-    Read,
-    mean_frame,
-    read_capture,
-    read_references,
-)
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, read_capture, read_references
 from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
 from spectralzoom.pipeline.rig.device_settings import FileServer
 from spectralzoom.pipeline.rig.transports import (
@@ -132,10 +124,11 @@ class HeadwallCamera:
 
     def capture(self, frames: int, *, prefix: str = "") -> Capture:
         """Begin a capture of ``frames`` lines in one file. The command is sent once; StateUnknown without a reply."""
-        self._open()
+        line = self._open()
         sent_s = self.clock.now()
+        command = to_request("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames})
         try:
-            folder = self._once("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}, as_folder)
+            folder = as_folder(self._once(line, command, "capture"))
         except DeviceRefused:
             raise
         except BaseException as error:
@@ -157,10 +150,6 @@ class HeadwallCamera:
         with suppress(DeviceRefused):  # where none runs
             self._ask("stopCapture", None, lambda _: None)
 
-    def list_files(self, folder: str) -> list[RemoteFile]:
-        """List one folder, in the order of names."""
-        return self._ask("listFiles", folder, as_listing)
-
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Fetch a finished capture's files, small ones first, and return its lines; a later call continues."""
         files = sorted(self._finished(folder), key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
@@ -171,25 +160,29 @@ class HeadwallCamera:
         """Return the mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``."""
         files = [file for file in self._finished(folder) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
-        cubes = read_references([file.name for file in files], _reader(kept))
-        return {kind: replace(mean_frame(cube.values), taken=cube.taken) for kind, cube in cubes.items()}
+        return read_references([file.name for file in files], _reader(kept))
 
     def close(self) -> None:
         """Send exit and close the connection. A capture continues; nothing is raised."""
         if self._line is not None:
             try:
-                self._line.write(to_request("exit"), self.clock.now() + DEADLINE_S)
+                self._line.write(to_request("exit"))
             except RigError as error:
                 LOG.info("the camera was gone before exit: %s", error)
         self._hang_up()
+
+    def _finished(self, folder: str) -> list[RemoteFile]:
+        """Return the files of a folder; RigError where a capture still runs."""
+        if self.is_capturing():
+            raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
+        return [file for file in self._ask("listFiles", folder, as_listing) if not file.folder]
 
     def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
         """Send a command that may be sent twice: again, on a new connection, after a lost, late or damaged reply."""
         left = RETRIES
         while True:
             try:
-                self._open()
-                return self._once(name, argument, check)
+                return check(self._once(self._open(), to_request(name, argument), name))
             except DeviceRefused:
                 raise
             except RigError as error:
@@ -200,37 +193,37 @@ class HeadwallCamera:
                 LOG.info("%s; asking again", error)
                 self.clock.sleep(PAUSE_S)
 
-    def _open(self) -> None:
-        """Open a connection at its prompt, without earlier input."""
+    def _open(self) -> Transport:
+        """Return a connection at its prompt, without earlier input."""
         if self._line is not None:
             try:
-                if stale := self._reader.held + self._line.drain():
-                    LOG.warning("%s: dropped %d stale bytes: %r", self._line.port, len(stale), stale[:64])
-                self._reader = ReplyReader()
-                return
+                stale = self._reader.held + self._line.read(1 << 16, self.clock.now())
             except RigError as error:
                 LOG.info("%s; connecting again", error)
                 self._hang_up()
-        self._line = self._connect()
-        self._reader = ReplyReader()
+        if self._line is not None:
+            if stale:
+                LOG.warning("%s: dropped %d stale bytes: %r", self._line.port, len(stale), stale[:64])
+            self._reader = ReplyReader()
+            return self._line
+        self._line, self._reader = self._connect(), ReplyReader()
         try:
             self._wait(self._line, "the greeting")
         except RigError:
             self._hang_up()
             raise
+        return self._line
 
-    def _once(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
-        """Send one command and wait for its reply."""
-        line = self._line
-        assert line is not None
-        line.write(to_request(name, argument), self.clock.now() + DEADLINE_S)
-        return check(response_of(self._wait(line, name), name, line.port))
+    def _once(self, line: Transport, command: bytes, name: str) -> Any:
+        """Send one command and return the response of its reply."""
+        line.write(command)
+        return response_of(self._wait(line, name), name, line.port)
 
     def _wait(self, line: Transport, name: str) -> str:
         """Wait for a text with a prompt behind it."""
         deadline = self.clock.now() + DEADLINE_S
         while self.clock.now() < deadline:
-            if texts := self._reader.feed(line.read(65536, deadline)):
+            if texts := self._reader.feed(line.read(1 << 16, deadline)):
                 return texts[0]
         came = self._reader.held
         found = f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
@@ -243,12 +236,6 @@ class HeadwallCamera:
         if self._line is not None:
             self._line.close()
         self._line = None
-
-    def _finished(self, folder: str) -> list[RemoteFile]:
-        """Return the files of a folder; RigError where a capture still runs."""
-        if self.is_capturing():
-            raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        return [file for file in self.list_files(folder) if not file.folder]
 
 
 def _reader(kept: Kept) -> Read:

@@ -9,7 +9,8 @@ import pytest
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
 from spectralzoom.pipeline.rig.camera import headwall_camera
-from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, as_listing, response_of
 from spectralzoom.pipeline.rig.device_settings import FileServer, check_times
 from spectralzoom.pipeline.rig.fakes import FakeClock
 from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
@@ -58,6 +59,7 @@ def test_every_command_is_sent_and_its_reply_read(echo: bool) -> None:
             answer(CAPTURE, b'{"folder": "/captured/f1_0"}'),
             answer(IS_CAPTURING, b"true"),
             answer(b"stopCapture\r", b"true"),
+            answer(b"isCapturing\r", b"false"),
             answer(b'listFiles("/captured/a")\r', listing),
             (b"exit\r", b""),
         ]
@@ -66,8 +68,7 @@ def test_every_command_is_sent_and_its_reply_read(echo: bool) -> None:
         assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
         assert control.is_capturing()
         control.stop()
-        files = [(file.name, file.size, file.folder) for file in control.list_files("/captured/a")]
-        assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
+        assert control.references("/captured/a", KeptInMemory()) == {}  # of a folder without dark and white
         control.close()
 
 
@@ -183,3 +184,15 @@ def test_bytes_without_a_prompt_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(headwall_camera, "LONGEST_REPLY", 100)
     with pytest.raises(RigError, match=r"bytes came without a prompt .* is this the camera's control port"):
         ReplyReader().feed(b"x" * 101)
+
+
+def test_a_listing_has_whole_names() -> None:
+    """Doubled slashes are one, a folder has no size, and other responses are refused."""
+    listing = [
+        {"name": "/captured//a/raw_0", "size": 12, "mtime": 1.5, "isDirectory": False},
+        {"name": "/captured/a/b", "isDirectory": True},
+    ]
+    files = [(file.name, file.size, file.folder) for file in as_listing(listing)]
+    assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
+    with pytest.raises(RigError, match="expected a list of files from the camera, got 7"):
+        as_listing(7)

@@ -228,7 +228,7 @@ def test_a_damaged_journal_costs_one_capture():
     source = rig.source(kept)
     assert_same(list(source.lines(FINE)))
     assert len(rig.captures) == 2
-    assert "is ignored: it has changed" in source.record["journal"][0]
+    assert "is ignored: it is torn or has changed" in source.record["journal"][0]
 
 
 def test_references_that_are_gone_are_taken_again():

@@ -66,7 +66,7 @@ class Memory:
         self._reply = b""
         self.passed = 0  # bytes, in both directions
 
-    def write(self, data: bytes, deadline: float) -> None:
+    def write(self, data: bytes) -> None:
         """Accept a frame and prepare the reply."""
         self.clock.sleep(len(data) * 10 / BAUD)
         self.passed += len(data)
@@ -91,10 +91,6 @@ class Memory:
         self.passed += len(reply)
         self.clock.sleep(len(reply) * 10 / BAUD if reply else deadline - self.clock.now())
         return reply
-
-    def drain(self) -> bytes:
-        """Return nothing."""
-        return b""
 
     def close(self) -> None:
         """Do nothing."""

@@ -149,12 +149,12 @@ def test_a_device_that_sends_endlessly_does_not_block():
 
 
 def test_a_motion_that_was_not_sent_is_no_motion():
-    """Without a device the port cannot even be drained, so nothing is sent."""
+    """Without a device the port cannot even be read, so nothing is sent."""
 
     class Gone(ScriptedTransport):
-        """Transport that cannot be drained."""
+        """Transport that cannot be read."""
 
-        def drain(self) -> bytes:
+        def read(self, at_most: int, deadline: float) -> bytes:
             raise DeviceGone("it went away")
 
     with pytest.raises(DeviceGone):
