@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import wire_positions
 from spectralzoom.pipeline.geometry.scan import Sweep, exposing, line_positions, memory_loads, sweep_positions
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
-from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
 
 Floats = NDArray[Any]  # float64
 Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]

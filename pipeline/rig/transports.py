@@ -195,12 +195,22 @@ Receiver = Callable[[bytes], Answer | None]
 class Wire:
     """Requests to one device, each of which begins with an empty line.
 
-    A read is sent again within its deadline. A write or a motion never is.
+    A read is sent again within its deadline. A write or a motion never is. ``advice`` ends the message of a request
+    that is not answered.
     """
 
-    def __init__(self, transport: Transport, clock: Clock) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        clock: Clock,
+        *,
+        deadline_s: float = DEADLINE_S,
+        advice: str = "is the controller on, its cable in, and the port's speed right?",
+    ) -> None:
         self.transport = transport
         self.clock = clock
+        self.deadline_s = deadline_s
+        self._advice = advice
         self._unanswered = 0  # requests whose answer may still come
 
     @property
@@ -215,8 +225,8 @@ class Wire:
         acknowledged. Raises DeadlinePassed: a read or a write was not answered in time. Raises DeviceRefused or
         DeviceGone.
         """
-        self._empty_line(f"before {name}", math.inf)
-        deadline = self.clock.now() + DEADLINE_S
+        self.empty_line(f"before {name}")
+        deadline = self.clock.now() + self.deadline_s
         left = 1 + (RETRIES if kind == "read" else 0)
         while True:
             silence_s = (deadline - self.clock.now()) / left
@@ -228,25 +238,30 @@ class Wire:
                 if kind == "motion":
                     raise StateUnknown(
                         f"{name} was sent to {self.port} and may have happened or not: {error}. It is not sent again. "
-                        "Look at the mirror, then run again, which connects anew"
+                        "Look at the device, stop what runs there, then run again, which connects anew"
                     ) from error
                 left -= 1
                 if left == 0 or isinstance(error, DeviceGone):
                     raise
                 LOG.info("%s; asking again", error)
-                self._empty_line("before asking again", deadline)
+                self.empty_line("before asking again", deadline)
                 if self.clock.now() >= deadline:
                     raise
+
+    def wait_for(self, name: str, receiver: Receiver[Answer]) -> Answer:
+        """Return what a device sends unasked, such as a greeting; raises as `exchange`."""
+        return self._once(b"", name, receiver, self.deadline_s, self.clock.now() + self.deadline_s)
 
     def _once(self, data: bytes, name: str, receiver: Receiver[Answer], silence_s: float, deadline: float) -> Answer:
         """Send once, and wait until the device has been silent for ``silence_s``, at most to the deadline."""
         began = self.clock.now()
-        self._unanswered += 1
-        self.transport.write(data)
+        if data:
+            self._unanswered += 1
+            self.transport.write(data)
         came = b""
         until = min(began + silence_s, deadline)
         while self.clock.now() < until:
-            part = self.transport.read(4096, until)
+            part = self.transport.read(1 << 16, until)
             if not part:
                 continue
             until = min(self.clock.now() + silence_s, deadline)
@@ -257,15 +272,14 @@ class Wire:
                 self._unanswered -= 1
                 raise
             if answer is not None:
-                self._unanswered -= 1
+                self._unanswered -= bool(data)
                 return answer
-        found = f"{len(came)} other bytes came: {came[:32].hex(' ')}" if came else "nothing came"
+        found = f"{len(came)} other bytes came: {came[:64]!r}" if came else "nothing came"
         raise DeadlinePassed(
-            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({found}); is the "
-            f"controller on, its cable in, and the port's speed right?"
+            f"no answer to {name} from {self.port} within {self.clock.now() - began:.3g} s ({found}); {self._advice}"
         )
 
-    def _empty_line(self, when: str, latest: float) -> None:
+    def empty_line(self, when: str, latest: float = math.inf) -> None:
         """Drop what is on the line. If an answer may still come, wait for silence: it would pass for the next one."""
         quiet_s = QUIET_S if self._unanswered else 0.0
         latest = min(latest, self.clock.now() + 5 * QUIET_S)  # some devices never stop
@@ -274,4 +288,4 @@ class Wire:
             stale += part
         self._unanswered = 0
         if stale:
-            LOG.info("%s: dropped %d stale bytes %s: %s", self.port, len(stale), when, stale[:64].hex(" "))
+            LOG.info("%s: dropped %d stale bytes %s: %r", self.port, len(stale), when, stale[:64])

@@ -19,13 +19,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
-from spectralzoom.pipeline.rig.camera.frame_indices import (
-    FRAME_INDEX,
-    FrameIndex,
-    LineTimes,
-    parse_frame_index,
-    times_of_lines,
-)
+from spectralzoom.pipeline.frame_indices import FRAME_INDEX, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, numbers_of_list
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from spectralzoom.pipeline.envi_headers import parse_envi_header
 from spectralzoom.pipeline.errors import RigError, SceneError, ShapeError
 from spectralzoom.pipeline.exposures import Taken, match_exposures, taken_with
-from spectralzoom.pipeline.rig.camera.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
+from spectralzoom.pipeline.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.pipeline.signal.calibrate import find_bad_elements
 from spectralzoom.pipeline.source import References
 

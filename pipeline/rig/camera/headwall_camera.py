@@ -21,16 +21,18 @@ from spectralzoom.pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
     Clock,
-    DeadlinePassed,
     DeviceRefused,
-    StateUnknown,
+    Kind,
+    Receiver,
     Transport,
+    Wire,
 )
 
 LOG = logging.getLogger(__name__)
 DEADLINE_S = 5.0  # from a command's first byte to the prompt
 RETRIES = 2  # of a read
 PAUSE_S = 0.5  # before connecting again
+ADVICE = "is it the camera's control port (8100), is the camera on, and not busy writing?"
 LONGEST_REPLY = 1 << 24  # bytes: a listing of a hundred thousand files
 _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _PROMPT = re.compile(rb"(?:\A|(?<=[\r\n}]))hpi> ")  # a reply may hold the word, but not there
@@ -115,30 +117,24 @@ class HeadwallCamera:
         self.server = server
         self.clock = clock
         self._connect = connect
-        self._line: Transport | None = None
-        self._reader = ReplyReader()
+        self._wire: Wire | None = None
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]"""
-        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: None)
+        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: True)
 
     def capture(self, frames: int, *, prefix: str = "") -> Capture:
         """Begin a capture of ``frames`` lines in one file. The command is sent once; StateUnknown without a reply."""
-        line = self._open()
+        wire = self._open()
         sent_s = self.clock.now()
-        command = to_request("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames})
+        what = {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}
         try:
-            folder = as_folder(self._once(line, command, "capture"))
+            folder = self._once(wire, "capture", what, as_folder, "motion")
         except DeviceRefused:
             raise
-        except BaseException as error:
+        except BaseException:  # also one that interrupts the wait
             self._hang_up()
-            if not isinstance(error, RigError):  # interrupted while it waited
-                raise
-            raise StateUnknown(
-                f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again. Look "
-                "at the camera, stop what runs there, then run again, which connects anew"
-            ) from error
+            raise
         return Capture(folder, sent_s, self.clock.now())
 
     def is_capturing(self) -> bool:
@@ -148,7 +144,7 @@ class HeadwallCamera:
     def stop(self) -> None:
         """End a capture, if one runs. A lost reply is asked for again, since stopping twice is safe."""
         with suppress(DeviceRefused):  # where none runs
-            self._ask("stopCapture", None, lambda _: None)
+            self._ask("stopCapture", None, lambda _: True)
 
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Fetch a finished capture's files, small ones first, and return its lines; a later call continues."""
@@ -164,9 +160,9 @@ class HeadwallCamera:
 
     def close(self) -> None:
         """Send exit and close the connection. A capture continues; nothing is raised."""
-        if self._line is not None:
+        if self._wire is not None:
             try:
-                self._line.write(to_request("exit"))
+                self._wire.transport.write(to_request("exit"))
             except RigError as error:
                 LOG.info("the camera was gone before exit: %s", error)
         self._hang_up()
@@ -182,7 +178,7 @@ class HeadwallCamera:
         left = RETRIES
         while True:
             try:
-                return check(self._once(self._open(), to_request(name, argument), name))
+                return self._once(self._open(), name, argument, check, "write")
             except DeviceRefused:
                 raise
             except RigError as error:
@@ -193,49 +189,37 @@ class HeadwallCamera:
                 LOG.info("%s; asking again", error)
                 self.clock.sleep(PAUSE_S)
 
-    def _open(self) -> Transport:
-        """Return a connection at its prompt, without earlier input."""
-        if self._line is not None:
+    def _once(self, wire: Wire, name: str, argument: Any, check: Callable[[Any], Answer], kind: Kind) -> Answer:
+        """Send one command and return its checked response."""
+
+        def receiver() -> Receiver[Answer]:
+            reader = ReplyReader()
+            return lambda data: next((check(response_of(text, name, wire.port)) for text in reader.feed(data)), None)
+
+        return wire.exchange(to_request(name, argument), name, kind, receiver)
+
+    def _open(self) -> Wire:
+        """Return a connection that has greeted; a new one where the camera ended the last."""
+        if self._wire is not None:
             try:
-                stale = self._reader.held + self._line.read(1 << 16, self.clock.now())
+                self._wire.empty_line("before a command")
             except RigError as error:
                 LOG.info("%s; connecting again", error)
                 self._hang_up()
-        if self._line is not None:
-            if stale:
-                LOG.warning("%s: dropped %d stale bytes: %r", self._line.port, len(stale), stale[:64])
-            self._reader = ReplyReader()
-            return self._line
-        self._line, self._reader = self._connect(), ReplyReader()
-        try:
-            self._wait(self._line, "the greeting")
-        except RigError:
-            self._hang_up()
-            raise
-        return self._line
-
-    def _once(self, line: Transport, command: bytes, name: str) -> Any:
-        """Send one command and return the response of its reply."""
-        line.write(command)
-        return response_of(self._wait(line, name), name, line.port)
-
-    def _wait(self, line: Transport, name: str) -> str:
-        """Wait for a text with a prompt behind it."""
-        deadline = self.clock.now() + DEADLINE_S
-        while self.clock.now() < deadline:
-            if texts := self._reader.feed(line.read(1 << 16, deadline)):
-                return texts[0]
-        came = self._reader.held
-        found = f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
-        raise DeadlinePassed(
-            f"no reply 'hpi> ' to {name} from {line.port} within {DEADLINE_S:g} s ({found}); is it the "
-            "camera's control port (8100), is the camera on, and not busy writing?"
-        )
+        if self._wire is None:
+            self._wire = Wire(self._connect(), self.clock, deadline_s=DEADLINE_S, advice=ADVICE)
+            reader = ReplyReader()
+            try:
+                self._wire.wait_for("the greeting", lambda data: next(iter(reader.feed(data)), None))
+            except RigError:
+                self._hang_up()
+                raise
+        return self._wire
 
     def _hang_up(self) -> None:
-        if self._line is not None:
-            self._line.close()
-        self._line = None
+        if self._wire is not None:
+            self._wire.transport.close()
+        self._wire = None
 
 
 def _reader(kept: Kept) -> Read:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -13,7 +14,7 @@ from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, as_listing, response_of
 from spectralzoom.pipeline.rig.device_settings import FileServer, check_times
 from spectralzoom.pipeline.rig.fakes import FakeClock
-from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
+from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
@@ -94,8 +95,8 @@ def test_a_late_reply_is_not_taken_for_the_next_one() -> None:
         (said(IS_CAPTURING, b"7"), HELLO, "expected true or false from the camera, got 7"),
         (b'{"response": true}\r\nhpi> ', HELLO, "expected JSON with success true or false"),
         (b"{]\r\nhpi> ", HELLO, "expected JSON"),
-        (b"isCapturing\r\n{", HELLO, r"within 5 s .*14 bytes came"),
-        (None, b"SSH-2.0\r\n", "no reply 'hpi> ' to the greeting .*; is it the camera's control port"),
+        (b"isCapturing\r\n{", HELLO, r"within 5 s .*14 other bytes came"),
+        (None, b"SSH-2.0\r\n", "no answer to the greeting .*SSH-2.0.*; is it the camera's control port"),
     ],
 )
 def test_invalid_replies_are_reported(
@@ -120,14 +121,23 @@ def test_a_refused_capture_did_not_begin() -> None:
 def test_a_capture_without_a_reply_is_sent_once() -> None:
     """Stopping still works afterwards."""
     with talk([(CAPTURE, b"")], [(b"stopCapture\r", said(b"stopCapture\r", b"true"))]) as control:
-        with pytest.raises(StateUnknown, match=r"capture \(prefix 'f1'\) was sent and its reply is lost: no reply"):
+        with pytest.raises(StateUnknown, match=r"capture was sent to scripted and may have happened or not: no answer"):
             control.capture(500, prefix="f1")
         control.stop()
 
 
+def test_a_connection_that_the_camera_ended_is_made_again() -> None:
+    """Nothing of the capture was sent on the old one, so that it begins on a new one."""
+    first = [(IS_CAPTURING, [said(IS_CAPTURING, b"false"), DeviceGone("closed by the other end")])]
+    with talk(first, [(CAPTURE, said(CAPTURE, b'{"folder": "/captured/f1_0"}'))]) as control:
+        assert not control.is_capturing()
+        assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
+
+
 def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
     """Bytes that arrive before a command are dropped and not taken for its reply."""
-    torn = said(IS_CAPTURING, b"false") + said(IS_CAPTURING, b"true")[:20]
+    caplog.set_level(logging.INFO)
+    torn = [said(IS_CAPTURING, b"false"), said(IS_CAPTURING, b"true")[:20]]
     with talk([(IS_CAPTURING, torn), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]) as control:
         assert not control.is_capturing()
         assert not control.is_capturing()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.rig import capture_paths
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
-from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 

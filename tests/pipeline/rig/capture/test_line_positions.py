@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
 from spectralzoom.pipeline.rig.capture_paths import (
     CaptureRecord,
     LinePositions,
