@@ -45,9 +45,9 @@ def survey_field(settings: SurveySettings) -> RunRef:
     started = datetime.now(UTC)
     checked = settings_of_visit(settings)
     if checked.source == RIG:
-        from spectralzoom.pipeline.rig.drivers import check_drivers  # imports pyserial
+        from spectralzoom.pipeline.rig.drivers import check_devices  # imports pyserial
 
-        check_drivers(checked.rig)
+        check_devices(checked.rig)
     return carry_out(plan_survey(open_field(checked)), started)
 
 

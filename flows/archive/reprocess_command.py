@@ -31,12 +31,12 @@ from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError
 from spectralzoom.pipeline.rig.device_settings import FAKE
+from spectralzoom.pipeline.rig.drivers import NO_PORT
 from spectralzoom.storage.parallel.pool import THREADS, WorkerPool
 from spectralzoom.storage.readers.recordings import stores_of_lines
 from spectralzoom.storage.runs import Catalogue, Run, read_run
 from spectralzoom.storage.store import Archive, text_of
 
-NO_PORT = "none"  # a rig's port that cannot be opened
 # settings of a rig on which its light depends; a receipt, which may be another person's, gives no others
 OF_THE_RIGS_LIGHT = (
     *("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y", "white_reference", "white_at_rest"),

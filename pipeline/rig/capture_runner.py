@@ -14,7 +14,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from spectralzoom.pipeline.errors import RigError
@@ -143,16 +143,16 @@ class CaptureRunner:
     camera: LineCamera
     rig: SurveyRig
     say: Say
-    _times_ms: tuple[float, float] | None = field(default=None, init=False)  # exposure and period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
 
         Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are
-        stopped.
+        stopped. A mirror that does not answer at the end may have restarted on the way: the lines do not count.
         """
         steering, clock = self.devices.steering, self.devices.clock
-        self._configure(exposing(self.camera, path.sweep))
+        exposed = exposing(self.camera, path.sweep)
+        self.devices.camera.configure(exposed.exposure_ms, exposed.frame_ms)
         self.say(f"path: {len(path.cells)} positions")
         steering.load_path(path.cells)
         steering.goto(*(float(place) for place in path.cells[0]))
@@ -165,7 +165,11 @@ class CaptureRunner:
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, *times_s)
             self.journal.record_capture(taken)
             self.wait(taken)
-        steering.halt()
+        try:
+            steering.halt()
+        except RigError as error:
+            self.journal.record_spent(taken, f"the mirror did not answer at its end: {error}")
+            raise
         return taken
 
     def wait(self, taken: CaptureRecord) -> None:
@@ -198,7 +202,8 @@ class CaptureRunner:
         ``exposure_ms`` is the camera's own where it is None.
         """
         at_rest = replace(AT_REST, exposure_ms=exposure_ms)
-        self._configure(exposing(self.camera, at_rest))
+        exposed = exposing(self.camera, at_rest)
+        self.devices.camera.configure(exposed.exposure_ms, exposed.frame_ms)
         if self.rig.white_at_rest:
             self.devices.steering.goto(0.0, 0.0)
             self.devices.steering.settle(SETTLE_S)
@@ -207,13 +212,6 @@ class CaptureRunner:
             at = (capture.sent_s, capture.acknowledged_s)
             self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, at, at))
         return capture.folder
-
-    def _configure(self, camera: LineCamera) -> None:
-        times_ms = camera.exposure_ms, camera.frame_ms
-        if times_ms != self._times_ms:
-            self._times_ms = None  # unknown if the camera does not answer
-            self.devices.camera.configure(*times_ms)
-        self._times_ms = times_ms
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

@@ -23,11 +23,12 @@ from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
 from spectralzoom.pipeline.rig.device_settings import CONTROL_PORT, FAKE, SurveyRig
 from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
 from spectralzoom.pipeline.rig.mirror_controller import open_mirror
-from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport, check_port
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 
 __all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
 LOG = logging.getLogger(__name__)
+NO_PORT = "none"  # cannot be opened
 
 
 class MirrorDriver(Protocol):
@@ -167,8 +168,14 @@ def open_camera_driver(
     return cast("CameraDriver", _open_other(rig, "camera_driver", CameraDriver, clock))
 
 
-def check_drivers(rig: SurveyRig) -> None:
-    """Import the drivers of another make that the settings name. Raises SettingsError: one cannot be imported."""
+def check_devices(rig: SurveyRig) -> None:
+    """Import the drivers of another make, and check the form of the port; nothing is opened.
+
+    `NO_PORT` is of a survey whose lines are stored. Raises SettingsError: a driver cannot be imported, or the text
+    names no port.
+    """
+    if not rig.mirror_driver and rig.port != NO_PORT:
+        check_port(rig.port)
     for setting in ("mirror_driver", "camera_driver"):
         if getattr(rig, setting) not in ("", FAKE):
             _imported(rig, setting)

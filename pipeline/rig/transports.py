@@ -65,8 +65,7 @@ class Clock(Protocol):
 class SystemClock:
     """The monotonic clock of the machine."""
 
-    def now(self) -> float:
-        return time.monotonic()
+    now = staticmethod(time.monotonic)
 
     def sleep(self, seconds: float) -> None:
         time.sleep(max(seconds, 0.0))

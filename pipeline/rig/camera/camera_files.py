@@ -25,11 +25,10 @@ Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """An entry of a listing."""
+    """A file in a listing."""
 
     name: str  # whole path
     size: int | None  # bytes; None where the camera does not say
-    folder: bool
 
     @property
     def base(self) -> str:

@@ -95,11 +95,12 @@ def as_truth(response: Any) -> bool:
 
 
 def as_listing(response: Any) -> list[RemoteFile]:
-    """Return the entries of a folder, by name; RigError where the response is no list of files."""
+    """Return the files of a folder, by name; RigError where the response is no list of files."""
     try:
         found = [
-            RemoteFile(re.sub("/{2,}", "/", entry["name"]), entry.get("size"), bool(entry.get("isDirectory")))
+            RemoteFile(re.sub("/{2,}", "/", entry["name"]), entry.get("size"))
             for entry in response
+            if not entry.get("isDirectory")
         ]
     except (LookupError, TypeError, AttributeError) as error:
         raise RigError(f"expected a list of files from the camera, got {response!r:.100}") from error
@@ -171,7 +172,7 @@ class HeadwallCamera:
         """Return the files of a folder; RigError where a capture still runs."""
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        return [file for file in self._ask("listFiles", folder, as_listing) if not file.folder]
+        return self._ask("listFiles", folder, as_listing)
 
     def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
         """Send a command that may be sent twice: again, on a new connection, after a lost, late or damaged reply."""

@@ -10,7 +10,7 @@ import pytest
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
 from spectralzoom.pipeline.rig.camera import headwall_camera
-from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, as_listing, response_of
 from spectralzoom.pipeline.rig.device_settings import FileServer, check_times
 from spectralzoom.pipeline.rig.fakes import FakeClock
@@ -197,12 +197,12 @@ def test_bytes_without_a_prompt_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_listing_has_whole_names() -> None:
-    """Doubled slashes are one, a folder has no size, and other responses are refused."""
+    """Doubled slashes are one, a folder in it is no file, and other responses are refused."""
     listing = [
         {"name": "/captured//a/raw_0", "size": 12, "mtime": 1.5, "isDirectory": False},
         {"name": "/captured/a/b", "isDirectory": True},
+        {"name": "/captured/a/imu"},
     ]
-    files = [(file.name, file.size, file.folder) for file in as_listing(listing)]
-    assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
+    assert as_listing(listing) == [RemoteFile("/captured/a/imu", None), RemoteFile("/captured/a/raw_0", 12)]
     with pytest.raises(RigError, match="expected a list of files from the camera, got 7"):
         as_listing(7)

@@ -11,7 +11,7 @@ import pytest
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.rig.camera.camera_files import NOT_LOGGED_IN, KeptInMemory
 from spectralzoom.pipeline.rig.capture_runner import JOURNAL
-from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
+from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from spectralzoom.pipeline.source import Line
 from tests.pipeline.rig.small_rig import FINE, SmallRig, assert_simulated
 
@@ -120,6 +120,20 @@ def test_files_that_cannot_be_fetched_cost_no_capture(error: RigError):
         list(rig.source(kept).lines(FINE))
     assert_same(list(rig.source(kept).lines(FINE)))
     assert len(rig.captures) == 1
+
+
+@pytest.mark.parametrize("error", [DeadlinePassed("no answer to halting the path"), DeviceGone("the port went away")])
+def test_lines_of_a_mirror_that_restarted_do_not_count(error: RigError):
+    """It may have stopped anywhere on the path: the next process captures these lines again, and no others."""
+    rig = SmallRig(vector_pairs=9)
+    kept = KeptInMemory()
+    halt = Mock(side_effect=[None, error, None, None])
+    rig.mirror.halt = halt  # type: ignore[method-assign]
+    with pytest.raises(type(error)):
+        list(rig.source(kept).lines(FINE))
+    source = rig.source(kept)
+    assert_same(list(source.lines(FINE)))
+    assert [(one["first"], "spent" in one) for one in source.record["captures"]] == [(0, False), (9, True), (9, False)]
 
 
 def test_a_full_camera_ends_the_sweep_at_once():

@@ -21,6 +21,7 @@ WRONG = pair(
     "7E 00 15 05 26 00 00 00 18 4D 59 7E",
     "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 3E 80 00 00 00 00 00 00 82 25 7E",
 )
+BOOT = b"\x00\xffMR-E-2 boot 1.2\r\nready\r\n"
 THERE, LOST = pair(w.GOTO, w.DONE), (bytes.fromhex(w.GOTO), b"")
 Call = Callable[[MirrorController], object]
 
@@ -77,6 +78,27 @@ REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]
         {},
         StateUnknown,
         "went away",
+    ),
+    "an acknowledgement of which a second reader took the rest": (
+        [w.WELL, (bytes.fromhex(w.GOTO), bytes.fromhex(w.DONE)[:4])],
+        lambda mirror: mirror.goto(0.5, -0.25),
+        {},
+        StateUnknown,
+        "4 other bytes came",
+    ),
+    "an acknowledgement with a wrong CRC": (
+        [w.WELL, pair(w.GOTO, w.DONE.replace("0C A0", "0C A1"))],
+        lambda mirror: mirror.goto(0.5, -0.25),
+        {},
+        StateUnknown,
+        "may have happened or not: no answer to going to 0.5; -0.25",
+    ),
+    "a controller that restarts while it plays": (
+        [w.HALT, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, pair(w.RUN, w.DONE), (w.HALT[0], BOOT)],
+        lambda mirror: [play(mirror), mirror.halt()],
+        {},
+        DeadlinePassed,
+        "no answer to halting the path .* other bytes came: .*MR-E-2 boot",
     ),
     "a run that is not acknowledged": (
         [w.HALT, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, (bytes.fromhex(w.RUN), b"")],
