@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from spectralzoom.pipeline.errors import RigError, SettingsError
 from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import wire_positions
-from spectralzoom.pipeline.geometry.scan import Sweep, exposing, line_positions, memory_loads, sweep_positions
+from spectralzoom.pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 
 Floats = NDArray[Any]  # float64
@@ -51,19 +51,11 @@ def announced(prefix: str) -> tuple[Sweep, int] | None:
     if found is None:
         return None
     name, kind, along, *numbers = found.groups()
-    swath, start = (float(text.replace("p", ".")) for text in numbers[:2])
-    lines, step, binning, held, first = map(int, numbers[2:])
+    places, (lines, step, binning, held, first) = numbers[:2], map(int, numbers[2:])
     if min(lines, step, binning) < 1 or first >= lines:
         return None
-    sweep = Sweep(
-        name,
-        "coarse" if kind == "coarse" else "fine",
-        "x" if along == "x" else "y",
-        swath,
-        start,
-        *(lines, step, binning),
-        held=held or None,
-    )
+    swath, start = (float(text.replace("p", ".")) for text in places)
+    sweep = Sweep(name, cast(Any, kind), cast(Axis, along), swath, start, lines, step, binning, held=held or None)
     return sweep, first
 
 

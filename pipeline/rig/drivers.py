@@ -22,8 +22,8 @@ from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progres
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
 from spectralzoom.pipeline.rig.device_settings import CONTROL_PORT, FAKE, SurveyRig
 from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from spectralzoom.pipeline.rig.mirror_controller import open_mirror
-from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport, check_port
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SerialTransport, SocketTransport, check_port
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 
 __all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
@@ -150,7 +150,13 @@ def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_
     """Connect to the mirror, as `open_devices`."""
     match rig.mirror_driver:
         case "":
-            return open_mirror(rig, vector_pairs, clock)
+            line = SerialTransport(rig.port, rig.baud, clock)
+            mirror = MirrorController(line, rig, clock, vector_pairs=vector_pairs)
+            with ExitStack() as opened:
+                opened.callback(mirror.close)
+                mirror.connect()
+                opened.pop_all()
+            return mirror
         case "fake":
             return FakeMirror(clock, vector_pairs)
     return cast("MirrorDriver", _open_other(rig, "mirror_driver", MirrorDriver, clock))

@@ -30,7 +30,6 @@ from spectralzoom.pipeline.rig.transports import (
     DeviceRefused,
     Kind,
     Receiver,
-    SerialTransport,
     Transport,
     Wire,
 )
@@ -120,7 +119,7 @@ _STOPPED: dict[int, pro.Value] = {pro.X.run: 0, pro.Y.run: 0}  # halts the vecto
 
 
 class MirrorController:
-    """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
+    """A mirror controller behind a transport, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
 
     Motions (goto, run) are sent once; one that is not acknowledged raises StateUnknown. Positions beyond the disk raise
     PoseError, before a byte is sent.
@@ -264,17 +263,3 @@ class MirrorController:
 
     def _ask(self, frame: pro.Frame, name: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
         return ask_frame(self.wire, frame, name, parse, kind, with_crc=self.rig.with_crc)
-
-
-def open_mirror(rig: SurveyRig, vector_pairs: int = 1500, clock: Clock = SYSTEM_CLOCK) -> MirrorController:
-    """Open the port of the settings and connect to the controller there. Nothing moves.
-
-    Raises as `MirrorController.connect`, and DeviceGone: there is no such port, it is in use, or not permitted.
-    """
-    mirror = MirrorController(SerialTransport(rig.port, rig.baud, clock), rig, clock, vector_pairs=vector_pairs)
-    try:
-        mirror.connect()
-    except BaseException:
-        mirror.close()
-        raise
-    return mirror

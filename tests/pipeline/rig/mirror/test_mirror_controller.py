@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError, ShapeError
-from spectralzoom.pipeline.rig import mirror_controller
+from spectralzoom.pipeline.rig import drivers
 from spectralzoom.pipeline.rig.device_settings import SurveyRig
-from spectralzoom.pipeline.rig.mirror_controller import MirrorController, open_mirror
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController
 from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceGone, StateUnknown
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
@@ -142,7 +142,7 @@ def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
         assert (port, baud, clock) == ("/dev/mirror", 256000, transport.clock)
         return transport
 
-    monkeypatch.setattr(mirror_controller, "SerialTransport", opened)
+    monkeypatch.setattr(drivers, "SerialTransport", opened)
 
 
 SETTINGS = SurveyRig(port="/dev/mirror", baud=256000, with_crc=True)
@@ -153,11 +153,12 @@ def test_opening_connects_or_releases_the_port(monkeypatch: pytest.MonkeyPatch):
     silent = (b"START\r\n", b"")
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
-        with closing(open_mirror(SETTINGS, 1500, transport.clock)) as mirror:
+        with closing(drivers.open_mirror_driver(SETTINGS, 1500, transport.clock)) as mirror:
+            assert isinstance(mirror, MirrorController)
             assert mirror.identity.startswith("MR-E-2,")
         assert transport.closed
     with scripted([*[silent] * 3, (w.LEAVE[0], b""), *[silent] * 3]) as transport:
         give(monkeypatch, transport)
         with pytest.raises(DeadlinePassed):
-            open_mirror(SETTINGS, 1500, transport.clock)
+            drivers.open_mirror_driver(SETTINGS, 1500, transport.clock)
         assert transport.closed
