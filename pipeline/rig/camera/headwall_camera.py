@@ -13,6 +13,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from pydantic import BaseModel, Field, StrictBool, TypeAdapter, ValidationError
+
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, read_capture, read_references
 from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
@@ -58,53 +60,47 @@ class ReplyReader:
         return [text.decode("utf-8", errors="replace").strip("\0 \t\r\n") for text in texts]
 
 
-def response_of(text: str, name: str, port: str) -> Any:
+class Reply(BaseModel):
+    """A reply to a command. The response of a capture has its folder, that of a listing its entries."""
+
+    success: StrictBool
+    response: Any = None
+    reason: Any = Field(None, alias="errorMessage")
+
+
+class Folder(BaseModel):
+    """The folder of a capture."""
+
+    folder: str = Field(min_length=1)
+
+
+class Entry(BaseModel):
+    """A file or folder in a listing, by its whole name."""
+
+    name: str
+    size: int | None = None  # bytes; None where the camera does not say
+    is_folder: bool = Field(False, alias="isDirectory")
+
+
+def response_of(text: str, name: str, port: str, kind: type[Answer]) -> Answer:
     """Return the response of a reply that reports success.
 
-    Raises DeviceRefused: it reports a failure. Raises RigError: it is no such reply.
+    Raises DeviceRefused: it reports a failure. Raises RigError: it is no reply, or has no response of this kind.
     """
+    # the command is repeated before a reply that does not begin as JSON
+    content = text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2]
     try:
-        # The command is repeated before a reply that does not begin as JSON.
-        content = json.loads(text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2])
-        success, response, reason = content["success"], content.get("response"), content.get("errorMessage")
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        reply = Reply.model_validate_json(content)
+        if reply.success:
+            return TypeAdapter(kind).validate_python(reply.response, strict=True)
+    except ValidationError as error:
         raise RigError(
-            f"{port} answered {name} with {text[:200]!r}, expected JSON with success true or false; is this the "
-            "camera's control port?"
+            f"{port} answered {name} with {text[:200]!r}: {error.errors()[0]['msg']}; is this the camera's control "
+            "port, and does its manual fit?"
         ) from error
-    if success is not True:
-        raise DeviceRefused(
-            f"the camera at {port} refused {name}: {str(reason or 'no reason given')[:300]!r}; see its manual"
-        )
-    return response
-
-
-def as_folder(response: Any) -> str:
-    """Return the folder of a capture; RigError where the response has none."""
-    folder = response.get("folder") if isinstance(response, dict) else None
-    if not isinstance(folder, str) or not folder:
-        raise RigError(f"expected the folder of the capture from the camera, got {response!r:.100}")
-    return folder
-
-
-def as_truth(response: Any) -> bool:
-    """Return whether a capture runs; RigError where the response does not say."""
-    if not isinstance(response, bool):
-        raise RigError(f"expected true or false from the camera, got {response!r:.100}; restart its server")
-    return response
-
-
-def as_listing(response: Any) -> list[RemoteFile]:
-    """Return the files of a folder, by name; RigError where the response is no list of files."""
-    try:
-        found = [
-            RemoteFile(re.sub("/{2,}", "/", entry["name"]), entry.get("size"))
-            for entry in response
-            if not entry.get("isDirectory")
-        ]
-    except (LookupError, TypeError, AttributeError) as error:
-        raise RigError(f"expected a list of files from the camera, got {response!r:.100}") from error
-    return sorted(found, key=lambda entry: entry.name)
+    raise DeviceRefused(
+        f"the camera at {port} refused {name}: {str(reply.reason or 'no reason given')[:300]!r}; see its manual"
+    )
 
 
 class HeadwallCamera:
@@ -122,7 +118,7 @@ class HeadwallCamera:
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]"""
-        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: True)
+        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, object)
 
     def capture(self, frames: int, *, prefix: str = "") -> Capture:
         """Begin a capture of ``frames`` lines in one file. The command is sent once; StateUnknown without a reply."""
@@ -130,7 +126,7 @@ class HeadwallCamera:
         sent_s = self.clock.now()
         what = {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}
         try:
-            folder = self._once(wire, "capture", what, as_folder, "motion")
+            folder = self._once(wire, "capture", what, Folder, "motion").folder
         except DeviceRefused:
             raise
         except BaseException:  # also one that interrupts the wait
@@ -140,12 +136,12 @@ class HeadwallCamera:
 
     def is_capturing(self) -> bool:
         """Return whether a capture runs."""
-        return self._ask("isCapturing", None, as_truth)
+        return self._ask("isCapturing", None, bool)
 
     def stop(self) -> None:
         """End a capture, if one runs. A lost reply is asked for again, since stopping twice is safe."""
         with suppress(DeviceRefused):  # where none runs
-            self._ask("stopCapture", None, lambda _: True)
+            self._ask("stopCapture", None, object)
 
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Fetch a finished capture's files, small ones first, and return its lines; a later call continues."""
@@ -172,14 +168,15 @@ class HeadwallCamera:
         """Return the files of a folder; RigError where a capture still runs."""
         if self.is_capturing():
             raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        return self._ask("listFiles", folder, as_listing)
+        entries = self._ask("listFiles", folder, list[Entry])
+        return [RemoteFile(re.sub("/{2,}", "/", one.name), one.size) for one in entries if not one.is_folder]
 
-    def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
+    def _ask(self, name: str, argument: Any, kind: type[Answer]) -> Answer:
         """Send a command that may be sent twice: again, on a new connection, after a lost, late or damaged reply."""
         left = RETRIES
         while True:
             try:
-                return self._once(self._open(), name, argument, check, "write")
+                return self._once(self._open(), name, argument, kind, "write")
             except DeviceRefused:
                 raise
             except RigError as error:
@@ -190,14 +187,14 @@ class HeadwallCamera:
                 LOG.info("%s; asking again", error)
                 self.clock.sleep(PAUSE_S)
 
-    def _once(self, wire: Wire, name: str, argument: Any, check: Callable[[Any], Answer], kind: Kind) -> Answer:
-        """Send one command and return its checked response."""
+    def _once(self, wire: Wire, name: str, argument: Any, kind: type[Answer], sent: Kind) -> Answer:
+        """Send one command and return its response."""
 
-        def receiver() -> Receiver[Answer]:
+        def receiver() -> Receiver[tuple[Answer]]:
             reader = ReplyReader()
-            return lambda data: next((check(response_of(text, name, wire.port)) for text in reader.feed(data)), None)
+            return lambda data: next(((response_of(one, name, wire.port, kind),) for one in reader.feed(data)), None)
 
-        return wire.exchange(to_request(name, argument), name, kind, receiver)
+        return wire.exchange(to_request(name, argument), name, sent, receiver)[0]
 
     def _open(self) -> Wire:
         """Return a connection that has greeted; a new one where the camera ended the last."""

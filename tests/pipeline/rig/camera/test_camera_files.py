@@ -36,13 +36,19 @@ def cube(frames: np.ndarray) -> tuple[bytes, bytes]:
 
 
 def test_a_capture_is_fetched_from_control_socket_and_files() -> None:
-    """Lines, frame times and means of references are those of the files; small files come first."""
+    """Lines, frame times and means of references are those of the files; small files come first.
+
+    The listing doubles slashes, as a camera does.
+    """
     rng = np.random.default_rng(1)
     lines, dark = rng.integers(0, 4096, (5, 6, 4)), rng.integers(60, 70, (20, 6, 4))
     index = "Frame#\tTimestamp\n" + "".join(f"{number}\t{10_000 * number}\n" for number in range(5))
     names = ("raw_0", "raw_0.hdr", "darkReference", "darkReference.hdr", "frameIndex_0.txt")
     contents = dict(zip((f"/c/{name}" for name in names), (*cube(lines), *cube(dark), index.encode()), strict=True))
-    entries = [f'{{"name": "{name}", "size": {len(data)}, "isDirectory": false}}' for name, data in contents.items()]
+    entries = [
+        f'{{"name": "{name.replace("/c/", "/c//")}", "size": {len(data)}, "isDirectory": false}}'
+        for name, data in contents.items()
+    ]
     pairs = [said("isCapturing", "false"), said('listFiles("/c")', f"[{', '.join(entries)}]")] * 2
     transport = ScriptedTransport(pairs, FakeClock(), b"hpi> ")
     with served(ScriptedFiles(contents)) as server:

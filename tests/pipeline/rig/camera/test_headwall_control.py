@@ -10,8 +10,8 @@ import pytest
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
 from spectralzoom.pipeline.rig.camera import headwall_camera
-from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile
-from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, as_listing, response_of
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.camera.headwall_camera import Entry, HeadwallCamera, ReplyReader, response_of
 from spectralzoom.pipeline.rig.device_settings import FileServer, check_times
 from spectralzoom.pipeline.rig.fakes import FakeClock
 from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
@@ -91,10 +91,10 @@ def test_a_late_reply_is_not_taken_for_the_next_one() -> None:
 @pytest.mark.parametrize(
     ("reply", "hello", "words"),
     [
-        (b"Segmentation fault\r\nhpi> ", HELLO, "expected JSON"),
-        (said(IS_CAPTURING, b"7"), HELLO, "expected true or false from the camera, got 7"),
-        (b'{"response": true}\r\nhpi> ', HELLO, "expected JSON with success true or false"),
-        (b"{]\r\nhpi> ", HELLO, "expected JSON"),
+        (b"Segmentation fault\r\nhpi> ", HELLO, "Segmentation fault.*: Invalid JSON"),
+        (said(IS_CAPTURING, b"7"), HELLO, "Input should be a valid boolean; is this the camera"),
+        (b'{"response": true}\r\nhpi> ', HELLO, "Field required"),
+        (b"{]\r\nhpi> ", HELLO, "Invalid JSON"),
         (b"isCapturing\r\n{", HELLO, r"within 5 s .*14 other bytes came"),
         (None, b"SSH-2.0\r\n", "no answer to the greeting .*SSH-2.0.*; is it the camera's control port"),
     ],
@@ -173,7 +173,7 @@ def test_implausible_exposure_times_are_refused(exposure: float, period: float, 
 def test_every_form_of_a_reply_is_parsed(data: bytes) -> None:
     """Replies come with or without the command, on one line or several, and with bytes of a telnet server."""
     (reply,) = ReplyReader().feed(data)
-    assert response_of(reply, "it", "here") == 1
+    assert response_of(reply, "it", "here", int) == 1
 
 
 def test_other_text_before_a_prompt_is_separated() -> None:
@@ -196,13 +196,20 @@ def test_bytes_without_a_prompt_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
         ReplyReader().feed(b"x" * 101)
 
 
-def test_a_listing_has_whole_names() -> None:
-    """Doubled slashes are one, a folder in it is no file, and other responses are refused."""
-    listing = [
-        {"name": "/captured//a/raw_0", "size": 12, "mtime": 1.5, "isDirectory": False},
-        {"name": "/captured/a/b", "isDirectory": True},
-        {"name": "/captured/a/imu"},
+def test_a_listing_has_files_and_folders() -> None:
+    """A folder has no size; other responses are refused."""
+    file, folder = (
+        '{"name": "/c/raw_0", "size": 12, "mtime": 1.5, "isDirectory": false}',
+        '{"name": "/c/b", "isDirectory": true}',
+    )
+
+    def listed(response: str) -> list[Entry]:
+        return response_of(f'{{"success": true, "response": {response}}}', "listFiles", "here", list[Entry])
+
+    assert [(one.name, one.size, one.is_folder) for one in listed(f"[{file}, {folder}]")] == [
+        ("/c/raw_0", 12, False),
+        ("/c/b", None, True),
     ]
-    assert as_listing(listing) == [RemoteFile("/captured/a/imu", None), RemoteFile("/captured/a/raw_0", 12)]
-    with pytest.raises(RigError, match="expected a list of files from the camera, got 7"):
-        as_listing(7)
+    for other in ("7", "[7]", '[{"name": 7}]', '[{"name": "/c/raw_0", "size": "12"}]', "null"):
+        with pytest.raises(RigError, match=r"here answered listFiles with .*is this the camera's control port"):
+            listed(other)
