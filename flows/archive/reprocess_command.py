@@ -263,5 +263,6 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     if isinstance(rig := known.get("rig"), Mapping):
         drivers = dict.fromkeys(("mirror_driver", "camera_driver"), FAKE)
         fakes = drivers if all(rig.get(name) == FAKE for name in drivers) else {}
-        known["rig"] = {name: rig[name] for name in OF_THE_RIGS_LIGHT if name in rig} | fakes | {"port": NO_PORT}
+        devices = {**fakes, "port": NO_PORT} if known.get("source") == RIG else {}
+        known["rig"] = {name: rig[name] for name in OF_THE_RIGS_LIGHT if name in rig} | devices
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
