@@ -108,6 +108,8 @@ class CaptureRecord:
     run_s: Span
     capture_s: Span
     spent: str = ""  # why it gives no further line; empty where it may
+    residual_px: float | None = None  # see `LinePositions`; None until its lines were read
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

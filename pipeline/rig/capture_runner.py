@@ -41,17 +41,34 @@ class CaptureJournal:
 
     def __init__(self, kept: Kept) -> None:
         self._kept = kept
-        self._taken: dict[str, CaptureRecord] = {}
+        self._taken: dict[str, CaptureRecord] = {}  # by folder; of a capture the latest record counts
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
-        self._positions: dict[str, dict[str, Any]] = {}
         self.references: dict[float | None, str] = {}  # folders of dark and white frames, by a sweep's own exposure
         self.damage: list[str] = []
-        self._read()
+        lines = filter(None, kept.read(JOURNAL, 0, kept.size(JOURNAL)).split(b"\n"))
+        for number, line in enumerate(lines, 1):
+            check, _, text = line.partition(b" ")
+            if check == _crc32(text):
+                self._follow(json.loads(text))
+            else:
+                self.damage.append(f"record {number} of {JOURNAL} is ignored: it is torn or has changed")
+        if self.damage:
+            LOG.warning("%s", "; ".join(self.damage))
 
     def holding(self, sweep: Sweep, line: int) -> CaptureRecord | None:
         """Return the latest capture that has a line of the sweep and is not spent."""
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
+
+    @property
+    def captures(self) -> list[dict[str, Any]]:
+        """Return every capture in order: sweep, lines, folder on the camera, error of positions, why it is spent."""
+        return [
+            {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
+            | ({} if one.residual_px is None else {"residual_px": one.residual_px, "notes": list(one.notes)})
+            | ({"spent": one.spent} if one.spent else {})
+            for one in self._taken.values()
+        ]
 
     def record_capture(self, taken: CaptureRecord) -> None:
         """Record a capture that the camera acknowledged."""
@@ -59,28 +76,17 @@ class CaptureJournal:
 
     def record_spent(self, taken: CaptureRecord, why: str) -> None:
         """Record that a capture gives no further line."""
-        self._write({"what": "spent", "folder": taken.folder, "why": why})
+        self.record_capture(replace(self._taken[taken.folder], spent=why))
 
     def record_positions(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Record once how a capture's lines got their positions."""
-        if taken.folder not in self._positions:
-            found = {"residual_px": how.residual_px, "notes": [*notes, *how.notes]}
-            self._write({"what": "positions", "folder": taken.folder, **found})
-
-    @property
-    def captures(self) -> list[dict[str, Any]]:
-        """Return every capture in order: sweep, lines, folder on the camera, error of positions, why it is spent."""
-        return [
-            {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
-            | self._positions.get(one.folder, {})
-            | ({"spent": one.spent} if one.spent else {})
-            for one in self._taken.values()
-        ]
+        known = self._taken[taken.folder]
+        if known.residual_px is None:
+            self.record_capture(replace(known, residual_px=how.residual_px, notes=(*notes, *how.notes)))
 
     def record_references(self, folder: str, exposure_ms: float | None = None) -> None:
         """Record the folder of the dark and white frames of an exposure; None is the camera's own."""
-        exposure = {} if exposure_ms is None else {"exposure_ms": exposure_ms}
-        self._write({"what": "references", "folder": folder, **exposure})
+        self._write({"what": "references", "folder": folder, "exposure_ms": exposure_ms})
 
     def origin_us(self, sweep: Sweep, stamp_us: int | None = None) -> int | None:
         """Return the stamp of the sweep's line 0; one that is given is recorded."""
@@ -88,44 +94,22 @@ class CaptureJournal:
             self._write({"what": "origin", "sweep": sweep.name, "stamp_us": stamp_us})
         return self._origins.get(sweep.name)
 
-    def _read(self) -> None:
-        lines = filter(None, self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL)).split(b"\n"))
-        for number, line in enumerate(lines, 1):
-            check, _, text = line.partition(b" ")
-            if check != _crc32(text):
-                self.damage.append(f"record {number} of {JOURNAL} is ignored: it is torn or has changed")
-                continue
-            try:
-                self._follow(json.loads(text))
-            except LookupError:
-                self.damage.append(f"record {number} of {JOURNAL} is ignored: the one that it refers to is missing")
-        if self.damage:
-            LOG.warning("%s", "; ".join(self.damage))
-
     def _write(self, record: dict[str, Any]) -> None:
         text = json.dumps(record).encode()
         self._kept.append(JOURNAL, b"\n%s %s\n" % (_crc32(text), text))
         self._follow(json.loads(text))
 
     def _follow(self, record: dict[str, Any]) -> None:
-        match record["what"]:
+        match record.pop("what"):
             case "capture":
-                self._taken.pop(record["folder"], None)  # an emptied camera uses the names of its folders again
-                self._positions.pop(record["folder"], None)
-                self._taken[record["folder"]] = CaptureRecord(
-                    Sweep(**record["sweep"]),
-                    record["first"],
-                    record["stop"],
-                    record["folder"],
-                    tuple(record["run_s"]),
-                    tuple(record["capture_s"]),
-                )
-            case "spent":
-                self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
-            case "positions":
-                self._positions[record["folder"]] = {name: record[name] for name in ("residual_px", "notes")}
+                spans = {name: tuple(record.get(name, ())) for name in ("run_s", "capture_s", "notes")}
+                taken = CaptureRecord(**record | spans | {"sweep": Sweep(**record["sweep"])})
+                known = self._taken.get(taken.folder)
+                if known is not None and known.capture_s != taken.capture_s:
+                    del self._taken[taken.folder]  # an emptied camera uses the names of its folders again
+                self._taken[taken.folder] = taken
             case "references":
-                self.references[record.get("exposure_ms")] = record["folder"]
+                self.references[record["exposure_ms"]] = record["folder"]
             case "origin":
                 self._origins[record["sweep"]] = record["stamp_us"]
 

@@ -150,7 +150,7 @@ def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_
     """Connect to the mirror, as `open_devices`."""
     match rig.mirror_driver:
         case "":
-            line = SerialTransport(rig.port, rig.baud, clock)
+            line = SerialTransport(rig.port, clock)
             mirror = MirrorController(line, rig, clock, vector_pairs=vector_pairs)
             with ExitStack() as opened:
                 opened.callback(mirror.close)

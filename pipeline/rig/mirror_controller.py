@@ -54,7 +54,7 @@ def read_done(line: bytes, request: str, port: str) -> bool:
 def read_text(line: bytes, request: str, port: str) -> str:
     """Read a reply that is a text of the device, such as its id; empty where it does not know the request."""
     if not re.fullmatch(rb"[ -~]+", line):
-        raise RigError(f"expected text to {request} from {port}, got {line!r}; is the port's speed right?")
+        raise RigError(f"expected text to {request} from {port}, got {line!r}; is this the mirror controller?")
     text = line.decode("ascii").strip()
     return "" if text.upper() in REFUSALS else text
 

@@ -17,8 +17,9 @@ from serial.tools import list_ports
 from spectralzoom.pipeline.errors import RigError, SettingsError
 
 LOG = logging.getLogger(__name__)
+BAUD = 115200  # of the public software; over USB any works
 SLICE_S = 0.02  # longest wait of one read of a serial port, by which a deadline may be exceeded
-WRITE_S = 0.25  # longest write; a frame takes 10 ms at 115200
+WRITE_S = 0.25  # longest write; a frame takes 10 ms
 CONNECT_S = 3.0
 DEADLINE_S = 1.0  # longest time of a request with its repetitions
 RETRIES = 2  # of a read within it
@@ -112,26 +113,24 @@ def check_port(port: str) -> None:
 class SerialTransport:
     """A :class:`Transport` over a port of pyserial, held exclusively.
 
-    Raises SettingsError: the text names no port, or the speed does not exist. Raises DeviceGone: there is no such
-    port, it is in use, or not permitted.
+    Raises SettingsError: the text names no port. Raises DeviceGone: there is no such port, it is in use, or not
+    permitted.
     """
 
-    def __init__(self, port: str, baud: int, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(self, port: str, clock: Clock = SYSTEM_CLOCK) -> None:
         check_port(port)
         self.port = port
         self._clock = clock
         try:
             self._serial = serial.serial_for_url(
-                port, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_S, exclusive=True
+                port, baudrate=BAUD, timeout=SLICE_S, write_timeout=WRITE_S, exclusive=True
             )
-        except serial.SerialException as error:
+        except (serial.SerialException, ValueError) as error:
             there = ", ".join(sorted(one.device for one in list_ports.comports())) or "none"
             raise DeviceGone(
                 f"{port} cannot be opened ({error}), ports of this machine: {there}; is it a serial port, the "
                 "controller on, no other program at it, and this user in its group (mostly dialout)?"
             ) from error
-        except (ValueError, OverflowError) as error:
-            raise SettingsError(f"{port} cannot be opened at a speed of {baud!r}: {error}; give another one") from error
 
     def write(self, data: bytes) -> None:
         with _errors(self.port, len(data)):
@@ -204,7 +203,7 @@ class Wire:
         clock: Clock,
         *,
         deadline_s: float = DEADLINE_S,
-        advice: str = "is the controller on, its cable in, and the port's speed right?",
+        advice: str = "is the controller on, its cable in, and this its port?",
     ) -> None:
         self.transport = transport
         self.clock = clock

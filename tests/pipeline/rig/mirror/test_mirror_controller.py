@@ -138,18 +138,18 @@ def test_a_path_that_was_not_stored_is_not_played():
 def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
     """Replace the port of the settings by the transport."""
 
-    def opened(port: str, baud: int, clock: object) -> ScriptedTransport:
-        assert (port, baud, clock) == ("/dev/mirror", 256000, transport.clock)
+    def opened(port: str, clock: object) -> ScriptedTransport:
+        assert (port, clock) == ("/dev/mirror", transport.clock)
         return transport
 
     monkeypatch.setattr(drivers, "SerialTransport", opened)
 
 
-SETTINGS = SurveyRig(port="/dev/mirror", baud=256000, with_crc=True)
+SETTINGS = SurveyRig(port="/dev/mirror", with_crc=True)
 
 
 def test_opening_connects_or_releases_the_port(monkeypatch: pytest.MonkeyPatch):
-    """Port and baud rate are those of the settings. Without a controller the port is closed."""
+    """The port is that of the settings. Without a controller the port is closed."""
     silent = (b"START\r\n", b"")
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)

@@ -128,7 +128,7 @@ def test_text_replies_are_printable():
     """A reply of NO gives an empty text, and unprintable bytes are refused."""
     assert read_text(b"MR-E-2 ", "GETID", "p") == "MR-E-2"
     assert read_text(b"NO", "GETID", "p") == ""
-    with pytest.raises(RigError, match="port's speed"):
+    with pytest.raises(RigError, match="is this the mirror controller"):
         read_text(b"\x00\x81", "GETID", "p")
 
 
