@@ -121,9 +121,10 @@ class SerialTransport:
         check_port(port)
         self.port = port
         self._clock = clock
+        write_s = None if port.startswith("rfc2217:") else WRITE_S  # pyserial limits no write by RFC 2217
         try:
             self._serial = serial.serial_for_url(
-                port, baudrate=BAUD, timeout=SLICE_S, write_timeout=WRITE_S, exclusive=True
+                port, baudrate=BAUD, timeout=SLICE_S, write_timeout=write_s, exclusive=True
             )
         except (serial.SerialException, ValueError) as error:
             there = ", ".join(sorted(one.device for one in list_ports.comports())) or "none"

@@ -12,6 +12,8 @@ from io import FileIO
 from unittest.mock import Mock
 
 import pytest
+import serial
+from serial.rfc2217 import PortManager
 
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, SerialTransport, check_port
@@ -127,23 +129,37 @@ def test_a_missing_port_lists_the_existing_ones(monkeypatch: pytest.MonkeyPatch)
         SerialTransport("/dev/no-such-port")
 
 
-def test_a_socket_serves_as_a_port():
-    """The same driver reaches a device or an emulator over the network."""
+def serve_echo(peer: socket.socket, options: bool) -> None:
+    """Return what is sent until the peer closes; with ``options`` as a server of RFC 2217, which answers options."""
+
+    class Back:
+        """The connection of the options' manager."""
+
+        def write(self, data: bytes) -> None:
+            peer.sendall(data)
+
+    with serial.serial_for_url("loop://", timeout=0) as device, peer:
+        manager = PortManager(device, Back()) if options else None
+        while data := peer.recv(100):
+            device.write(data if manager is None else b"".join(manager.filter(data)))
+            found = device.read(100)
+            if found:
+                peer.sendall(found if manager is None else b"".join(manager.escape(found)))
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # of pyserial 3.5
+@pytest.mark.parametrize("kind", ["socket", "rfc2217"])
+def test_a_port_behind_a_network_is_a_port(kind: str):
+    """The same driver reaches a device over a server of serial ports."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-
-        def echo() -> None:
-            with server.accept()[0] as peer:
-                peer.sendall(peer.recv(100))
-                peer.recv(1)
-
-        thread = threading.Thread(target=echo)
+        thread = threading.Thread(target=lambda: serve_echo(server.accept()[0], kind == "rfc2217"), daemon=True)
         thread.start()
-        line = SerialTransport(f"socket://127.0.0.1:{port}")
-        line.write(b"START\r\n")
+        line = SerialTransport(f"{kind}://127.0.0.1:{server.getsockname()[1]}")
+        sent = b"START\r\n\xff\x7e"
+        line.write(sent)
         got = b""
-        while len(got) < 7:
+        while len(got) < len(sent):
             got += line.read(100, soon())
-        assert got == b"START\r\n"
+        assert got == sent
         line.close()
         thread.join(5)
