@@ -148,30 +148,27 @@ def open_devices(rig: SurveyRig, vector_pairs: int, seen: SimulatedSource | None
 
 def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_CLOCK) -> MirrorDriver:
     """Connect to the mirror, as `open_devices`."""
-    match rig.mirror_driver:
-        case "":
-            line = SerialTransport(rig.port, clock)
-            mirror = MirrorController(line, rig, clock, vector_pairs=vector_pairs)
-            with ExitStack() as opened:
-                opened.callback(mirror.close)
-                mirror.connect()
-                opened.pop_all()
-            return mirror
-        case "fake":
-            return FakeMirror(clock, vector_pairs)
-    return cast("MirrorDriver", _open_other(rig, "mirror_driver", MirrorDriver, clock))
+    if rig.mirror_driver == FAKE:
+        return FakeMirror(clock, vector_pairs)
+    if rig.mirror_driver:
+        return cast("MirrorDriver", _open_other(rig, "mirror_driver", MirrorDriver, clock))
+    mirror = MirrorController(SerialTransport(rig.port, clock), rig, clock, vector_pairs=vector_pairs)
+    with ExitStack() as opened:
+        opened.callback(mirror.close)
+        mirror.connect()
+        opened.pop_all()
+    return mirror
 
 
 def open_camera_driver(
     rig: SurveyRig, clock: Clock = SYSTEM_CLOCK, seen: SimulatedSource | None = None
 ) -> CameraDriver:
     """Return the camera's driver; raises as `open_devices`. The shipped one connects at its first command."""
-    match rig.camera_driver:
-        case "":
-            return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
-        case "fake":
-            return FakeCamera(clock, seen)
-    return cast("CameraDriver", _open_other(rig, "camera_driver", CameraDriver, clock))
+    if rig.camera_driver == FAKE:
+        return FakeCamera(clock, seen)
+    if rig.camera_driver:
+        return cast("CameraDriver", _open_other(rig, "camera_driver", CameraDriver, clock))
+    return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
 
 
 def check_devices(rig: SurveyRig) -> None:
