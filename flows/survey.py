@@ -42,7 +42,12 @@ def survey_field(settings: Settings) -> RunRef:
     Raises PipelineError: what is wrong, what is allowed, and what to do.
     """
     started = datetime.now(UTC)
-    return carry_out(plan_survey(open_field(settings_of_visit(settings))), started)
+    checked = settings_of_visit(settings)
+    if checked.source == RIG:
+        from spectralzoom.pipeline.rig.drivers import check_devices  # imports pyserial
+
+        check_devices(checked.rig)
+    return carry_out(plan_survey(open_field(checked)), started)
 
 
 def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:

@@ -29,6 +29,8 @@ from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import PipelineError, SceneError, SettingsError
+from spectralzoom.pipeline.rig.device_settings import FAKE, OF_THE_LIGHT
+from spectralzoom.pipeline.rig.drivers import NO_PORT
 from spectralzoom.storage.parallel.pool import THREADS, WorkerPool
 from spectralzoom.storage.readers.recordings import stores_of_lines
 from spectralzoom.storage.runs import Catalogue, Run, read_run
@@ -213,11 +215,10 @@ def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settin
     )
     stores = [catalogue.stores.get(uri) for uri in raw]
     if not stores or any(one is None or one["problem"] is not None or one["cleared"] for one in stores):
+        lost = f"what {run.uri} showed is gone or shows something else by now"
         if settings.source == RIG:
-            return settings
-        raise SceneError(
-            f"what {run.uri} showed is gone or shows something else by now; restore its scene or recording"
-        )
+            raise SceneError(f"{lost}, and only `spectralzoom survey` opens a rig; survey this field again")
+        raise SceneError(f"{lost}; restore its scene or recording")
     asked = {"sweeps": f"{settings.out}/{run.uri}", "out": settings.out, "engine": settings.engine}
     kept = {name: getattr(settings, name) for name in OF_THE_SURVEY}
     return load_settings(None, {name: value for name, value in {**asked, **kept}.items() if value is not None})
@@ -247,10 +248,16 @@ def is_called(run: Run, pattern: str) -> bool:
 def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """Return the settings of a run for another survey into the archive ``out``, with other ``weights`` if given.
 
+    They name no device, so that nothing of a receipt is opened or imported: a rig has only the settings of its light.
     Raises SettingsError, BudgetError: the run's settings cannot be read, or are not of this version.
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
     known = {key: value for key, value in run.settings.items() if key in Settings.model_fields}
     known |= dict.fromkeys(OF_THE_MACHINE)
+    if isinstance(rig := known.get("rig"), Mapping):
+        drivers = dict.fromkeys(("mirror_driver", "camera_driver"), FAKE)
+        fakes = drivers if all(rig.get(name) == FAKE for name in drivers) else {}
+        devices = {**fakes, "port": NO_PORT} if known.get("source") == RIG else {}
+        known["rig"] = {name: rig[name] for name in OF_THE_LIGHT if name in rig} | devices
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})

@@ -24,6 +24,7 @@ from spectralzoom.pipeline.capture.recorded import RecordedSource
 from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
 from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
 from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.rig.device_settings import OF_THE_LIGHT
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.source import Source
 from spectralzoom.storage.readers.recordings import Recording, find_recorded_run, open_recording
@@ -54,6 +55,8 @@ def as_its_run(settings: Settings) -> Settings:
     another_plan = requested - {"macs"} if uniform else requested & {"seconds", "scan_step", "macs"}
     names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
     usual = {name: run.settings[name] for name in names if run.settings.get(name) is not None}
+    if isinstance(rig := usual.get("rig"), Mapping):
+        usual["rig"] = {name: one for name, one in rig.items() if name in OF_THE_LIGHT}
     usual |= {"name": str(run.receipt.get("survey") or run.folder.name), "visit": time_of_visit(run)}
     usual |= {} if shape is None else {"size": shape[::-1]}
     if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:

@@ -135,12 +135,7 @@ class SimulatedRigField(RigField):
 
 
 def rig_field(scene: RasterScene, settings: Settings, simulated: SimulatedSource) -> RigField:
-    """Return the rig, not connected. A fake camera sees what ``simulated`` does, and its white reference.
-
-    Raises SettingsError: a driver cannot be imported.
-    """
-    drivers.import_factory(settings.rig, "mirror_driver")
-    drivers.import_factory(settings.rig, "camera_driver")
+    """Return the rig, not connected and no driver imported. A fake camera sees the scene and its white reference."""
     fake = settings.rig.camera_driver == FAKE
     white = float(scene.white_reference.mean()) if fake else settings.rig.white_reference
     rig = RigSource(

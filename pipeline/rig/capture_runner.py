@@ -14,7 +14,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from spectralzoom.pipeline.errors import RigError
@@ -41,17 +41,34 @@ class CaptureJournal:
 
     def __init__(self, kept: Kept) -> None:
         self._kept = kept
-        self._taken: dict[str, CaptureRecord] = {}
+        self._taken: dict[str, CaptureRecord] = {}  # by folder; of a capture the latest record counts
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
-        self._positions: dict[str, dict[str, Any]] = {}
         self.references: dict[float | None, str] = {}  # folders of dark and white frames, by a sweep's own exposure
         self.damage: list[str] = []
-        self._read()
+        lines = filter(None, kept.read(JOURNAL, 0, kept.size(JOURNAL)).split(b"\n"))
+        for number, line in enumerate(lines, 1):
+            check, _, text = line.partition(b" ")
+            if check == _crc32(text):
+                self._follow(json.loads(text))
+            else:
+                self.damage.append(f"record {number} of {JOURNAL} is ignored: it is torn or has changed")
+        if self.damage:
+            LOG.warning("%s", "; ".join(self.damage))
 
     def holding(self, sweep: Sweep, line: int) -> CaptureRecord | None:
         """Return the latest capture that has a line of the sweep and is not spent."""
         fits = [one for one in self._taken.values() if one.sweep == sweep and one.first <= line < one.stop]
         return next((one for one in reversed(fits) if not one.spent), None)
+
+    @property
+    def captures(self) -> list[dict[str, Any]]:
+        """Return every capture in order: sweep, lines, folder on the camera, error of positions, why it is spent."""
+        return [
+            {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
+            | ({} if one.residual_px is None else {"residual_px": one.residual_px, "notes": list(one.notes)})
+            | ({"spent": one.spent} if one.spent else {})
+            for one in self._taken.values()
+        ]
 
     def record_capture(self, taken: CaptureRecord) -> None:
         """Record a capture that the camera acknowledged."""
@@ -59,28 +76,17 @@ class CaptureJournal:
 
     def record_spent(self, taken: CaptureRecord, why: str) -> None:
         """Record that a capture gives no further line."""
-        self._write({"what": "spent", "folder": taken.folder, "why": why})
+        self.record_capture(replace(self._taken[taken.folder], spent=why))
 
     def record_positions(self, taken: CaptureRecord, how: LinePositions, notes: Sequence[str]) -> None:
         """Record once how a capture's lines got their positions."""
-        if taken.folder not in self._positions:
-            found = {"residual_px": how.residual_px, "notes": [*notes, *how.notes]}
-            self._write({"what": "positions", "folder": taken.folder, **found})
-
-    @property
-    def captures(self) -> list[dict[str, Any]]:
-        """Return every capture in order: sweep, lines, folder on the camera, error of positions, why it is spent."""
-        return [
-            {"folder": one.folder, "sweep": one.sweep.name, "first": one.first, "stop": one.stop}
-            | self._positions.get(one.folder, {})
-            | ({"spent": one.spent} if one.spent else {})
-            for one in self._taken.values()
-        ]
+        known = self._taken[taken.folder]
+        if known.residual_px is None:
+            self.record_capture(replace(known, residual_px=how.residual_px, notes=(*notes, *how.notes)))
 
     def record_references(self, folder: str, exposure_ms: float | None = None) -> None:
         """Record the folder of the dark and white frames of an exposure; None is the camera's own."""
-        exposure = {} if exposure_ms is None else {"exposure_ms": exposure_ms}
-        self._write({"what": "references", "folder": folder, **exposure})
+        self._write({"what": "references", "folder": folder, "exposure_ms": exposure_ms})
 
     def origin_us(self, sweep: Sweep, stamp_us: int | None = None) -> int | None:
         """Return the stamp of the sweep's line 0; one that is given is recorded."""
@@ -88,45 +94,22 @@ class CaptureJournal:
             self._write({"what": "origin", "sweep": sweep.name, "stamp_us": stamp_us})
         return self._origins.get(sweep.name)
 
-    def _read(self) -> None:
-        lines = filter(None, self._kept.read(JOURNAL, 0, self._kept.size(JOURNAL)).split(b"\n"))
-        for number, line in enumerate(lines, 1):
-            check, _, text = line.partition(b" ")
-            if check != _crc32(text):
-                if (line[-1] ^ ord("}")).bit_count() < 2:  # else the end of a write that a power cut broke off
-                    self.damage.append(f"record {number} of {JOURNAL} is ignored: it has changed since it was written")
-                continue
-            try:
-                self._follow(json.loads(text))
-            except LookupError:
-                self.damage.append(f"record {number} of {JOURNAL} is ignored: the one that it refers to is missing")
-        if self.damage:
-            LOG.warning("%s", "; ".join(self.damage))
-
     def _write(self, record: dict[str, Any]) -> None:
         text = json.dumps(record).encode()
         self._kept.append(JOURNAL, b"\n%s %s\n" % (_crc32(text), text))
         self._follow(json.loads(text))
 
     def _follow(self, record: dict[str, Any]) -> None:
-        match record["what"]:
+        match record.pop("what"):
             case "capture":
-                self._taken.pop(record["folder"], None)  # an emptied camera uses the names of its folders again
-                self._positions.pop(record["folder"], None)
-                self._taken[record["folder"]] = CaptureRecord(
-                    Sweep(**record["sweep"]),
-                    record["first"],
-                    record["stop"],
-                    record["folder"],
-                    tuple(record["run_s"]),
-                    tuple(record["capture_s"]),
-                )
-            case "spent":
-                self._taken[record["folder"]] = replace(self._taken[record["folder"]], spent=record["why"])
-            case "positions":
-                self._positions[record["folder"]] = {name: record[name] for name in ("residual_px", "notes")}
+                spans = {name: tuple(record.get(name, ())) for name in ("run_s", "capture_s", "notes")}
+                taken = CaptureRecord(**record | spans | {"sweep": Sweep(**record["sweep"])})
+                known = self._taken.get(taken.folder)
+                if known is not None and known.capture_s != taken.capture_s:
+                    del self._taken[taken.folder]  # an emptied camera uses the names of its folders again
+                self._taken[taken.folder] = taken
             case "references":
-                self.references[record.get("exposure_ms")] = record["folder"]
+                self.references[record["exposure_ms"]] = record["folder"]
             case "origin":
                 self._origins[record["sweep"]] = record["stamp_us"]
 
@@ -144,16 +127,16 @@ class CaptureRunner:
     camera: LineCamera
     rig: SurveyRig
     say: Say
-    _times_ms: tuple[float, float] | None = field(default=None, init=False)  # exposure and period that the camera has
 
     def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
 
         Motions and the capture are sent once. If anything fails after the mirror or the camera has begun, both are
-        stopped.
+        stopped. A mirror that does not answer at the end may have restarted on the way: the lines do not count.
         """
         steering, clock = self.devices.steering, self.devices.clock
-        self._configure(exposing(self.camera, path.sweep))
+        exposed = exposing(self.camera, path.sweep)
+        self.devices.camera.configure(exposed.exposure_ms, exposed.frame_ms)
         self.say(f"path: {len(path.cells)} positions")
         steering.load_path(path.cells)
         steering.goto(*(float(place) for place in path.cells[0]))
@@ -166,7 +149,11 @@ class CaptureRunner:
             taken = CaptureRecord(path.sweep, path.first, path.stop, capture.folder, *times_s)
             self.journal.record_capture(taken)
             self.wait(taken)
-        steering.halt()
+        try:
+            steering.halt()
+        except RigError as error:
+            self.journal.record_spent(taken, f"the mirror did not answer at its end: {error}")
+            raise
         return taken
 
     def wait(self, taken: CaptureRecord) -> None:
@@ -199,7 +186,8 @@ class CaptureRunner:
         ``exposure_ms`` is the camera's own where it is None.
         """
         at_rest = replace(AT_REST, exposure_ms=exposure_ms)
-        self._configure(exposing(self.camera, at_rest))
+        exposed = exposing(self.camera, at_rest)
+        self.devices.camera.configure(exposed.exposure_ms, exposed.frame_ms)
         if self.rig.white_at_rest:
             self.devices.steering.goto(0.0, 0.0)
             self.devices.steering.settle(SETTLE_S)
@@ -208,13 +196,6 @@ class CaptureRunner:
             at = (capture.sent_s, capture.acknowledged_s)
             self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, at, at))
         return capture.folder
-
-    def _configure(self, camera: LineCamera) -> None:
-        times_ms = camera.exposure_ms, camera.frame_ms
-        if times_ms != self._times_ms:
-            self._times_ms = None  # unknown if the camera does not answer
-            self.devices.camera.configure(*times_ms)
-        self._times_ms = times_ms
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

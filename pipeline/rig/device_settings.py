@@ -10,6 +10,11 @@ from spectralzoom.pipeline.geometry.scan import Ends
 from spectralzoom.pipeline.setting_fields import Text, assumed, settings_table, stated
 
 FAKE = "fake"  # of a driver's name
+# settings on which the light depends; a receipt, which may be another person's, gives no others
+OF_THE_LIGHT = (
+    *("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y", "white_reference", "white_at_rest"),
+    *("ends", "provenance"),
+)
 CONTROL_PORT = 8100  # of the camera's commands; the maker's
 MOST_PAIRS = 8191  # a byte offset of 16 bits addresses the cells of the vector memory
 
@@ -55,10 +60,8 @@ class SurveyRig:
     ``provenance`` says which of the assumed values are confirmed.
     """
 
-    port: Text = stated("/dev/ttyACM0", "Port of the mirror controller; or socket://host:port")
-    # public software opens 115200
-    baud: int = assumed(
-        115200, "Bits per second; over USB any works; the manual of a later model says 256000", "", 1200, 4_000_000
+    port: Text = stated(
+        "/dev/ttyACM0", "Port of the mirror controller; or socket://HOST:PORT or rfc2217://HOST:PORT of a network"
     )
     with_crc: bool = assumed(False, "Requests carry a CRC, and replies whose CRC does not fit are refused")
     ends: Ends = assumed("exclusive", "Whether the mirror's index ranges include their end")  # erratum E14

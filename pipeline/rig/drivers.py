@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Protocol, cast
 
 from numpy.typing import ArrayLike
 
@@ -22,12 +22,13 @@ from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progres
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
 from spectralzoom.pipeline.rig.device_settings import CONTROL_PORT, FAKE, SurveyRig
 from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
-from spectralzoom.pipeline.rig.mirror_controller import open_mirror
-from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SocketTransport
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, SerialTransport, SocketTransport, check_port
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 
 __all__ = ["CameraDriver", "Capture", "MirrorDriver", "RigDevices", "open_devices"]
 LOG = logging.getLogger(__name__)
+NO_PORT = "none"  # cannot be opened
 
 
 class MirrorDriver(Protocol):
@@ -127,11 +128,6 @@ class RigDevices:
                 LOG.warning("while closing the rig: %s", error)
 
 
-Setting = Literal["mirror_driver", "camera_driver"]
-Factory = Callable[[SurveyRig, Clock], Any]
-_PROTOCOLS: dict[Setting, type] = {"mirror_driver": MirrorDriver, "camera_driver": CameraDriver}
-
-
 def open_devices(rig: SurveyRig, vector_pairs: int, seen: SimulatedSource | None = None) -> RigDevices:
     """Connect to mirror and camera. Nothing moves. ``seen`` is the scene before a fake camera.
 
@@ -154,10 +150,14 @@ def open_mirror_driver(rig: SurveyRig, vector_pairs: int, clock: Clock = SYSTEM_
     """Connect to the mirror, as `open_devices`."""
     if rig.mirror_driver == FAKE:
         return FakeMirror(clock, vector_pairs)
-    factory = import_factory(rig, "mirror_driver")
-    if factory is None:
-        return open_mirror(rig, vector_pairs, clock)
-    return cast("MirrorDriver", _opened(factory, rig, "mirror_driver", clock))
+    if rig.mirror_driver:
+        return cast("MirrorDriver", _open_other(rig, "mirror_driver", MirrorDriver, clock))
+    mirror = MirrorController(SerialTransport(rig.port, clock), rig, clock, vector_pairs=vector_pairs)
+    with ExitStack() as opened:
+        opened.callback(mirror.close)
+        mirror.connect()
+        opened.pop_all()
+    return mirror
 
 
 def open_camera_driver(
@@ -166,20 +166,28 @@ def open_camera_driver(
     """Return the camera's driver; raises as `open_devices`. The shipped one connects at its first command."""
     if rig.camera_driver == FAKE:
         return FakeCamera(clock, seen)
-    factory = import_factory(rig, "camera_driver")
-    if factory is None:
-        return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
-    return cast("CameraDriver", _opened(factory, rig, "camera_driver", clock))
+    if rig.camera_driver:
+        return cast("CameraDriver", _open_other(rig, "camera_driver", CameraDriver, clock))
+    return HeadwallCamera(lambda: SocketTransport(rig.host, CONTROL_PORT, clock), rig.files, clock=clock)
 
 
-def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
-    """Import the function that opens a driver of another make; None where the settings name a shipped one.
+def check_devices(rig: SurveyRig) -> None:
+    """Import the drivers of another make, and check the form of the port; nothing is opened.
 
-    Raises SettingsError: it cannot be imported.
+    `NO_PORT` is of a survey whose lines are stored. Raises SettingsError: a driver cannot be imported, or the text
+    names no port.
     """
+    if not rig.mirror_driver and rig.port != NO_PORT:
+        check_port(rig.port)
+    for setting in ("mirror_driver", "camera_driver"):
+        if getattr(rig, setting) not in ("", FAKE):
+            _imported(rig, setting)
+
+
+def _imported(rig: SurveyRig, setting: str) -> Callable[[SurveyRig, Clock], object]:
     name: str = getattr(rig, setting)
     try:
-        return cast("Factory", pkgutil.resolve_name(name)) if name not in ("", FAKE) else None
+        return cast("Callable[[SurveyRig, Clock], object]", pkgutil.resolve_name(name))
     except Exception as error:  # whatever the module of another make does as it is imported
         raise SettingsError(
             f"rig.{setting} = {name!r} cannot be imported ({type(error).__name__}: {error}). Expected module:function "
@@ -187,9 +195,9 @@ def import_factory(rig: SurveyRig, setting: Setting) -> Factory | None:
         ) from error
 
 
-def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) -> object:
-    """Return what the function opens, where it has every method of its protocol."""
-    name = getattr(rig, setting)
+def _open_other(rig: SurveyRig, setting: str, protocol: type, clock: Clock) -> object:
+    """Open a driver of another make, and check that it has every method of its protocol."""
+    factory, name = _imported(rig, setting), getattr(rig, setting)
     try:
         device = factory(rig, clock)
     except TypeError as error:
@@ -197,7 +205,6 @@ def _opened(factory: Factory, rig: SurveyRig, setting: Setting, clock: Clock) ->
             f"rig.{setting} = {name!r} does not open a driver ({error}). Expected a function of the table [rig] and a "
             "clock"
         ) from error
-    protocol = _PROTOCOLS[setting]
     missing = [one for one in vars(protocol) if not one.startswith("_") and not callable(getattr(device, one, None))]
     if missing:
         raise SettingsError(

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.mirror import wire_positions
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
 from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress
-from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
 from spectralzoom.pipeline.rig.capture_paths import announced
 from spectralzoom.pipeline.rig.device_settings import FAKE
 from spectralzoom.pipeline.rig.transports import Clock, DeviceRefused

@@ -13,9 +13,7 @@ import logging
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 
 from numpy.typing import ArrayLike
 
@@ -32,7 +30,6 @@ from spectralzoom.pipeline.rig.transports import (
     DeviceRefused,
     Kind,
     Receiver,
-    SerialTransport,
     Transport,
     Wire,
 )
@@ -40,13 +37,7 @@ from spectralzoom.pipeline.rig.transports import (
 LOG = logging.getLogger(__name__)
 SAMPLED_EVERY = 10  # frames
 KNOWN_MODEL = "MR"  # begins the ids of documented controllers
-_POLL_S = 0.01
-
-END = b"\r\n"
-START = "START"
-ID, VERSION, SERIAL = "GETID", "GETVERSION", "GETSN"
-GO_PRO, GO_PRO_CRC = "GOPRO", "GOPROCRC"
-OK = "OK"
+POLL_S = 0.01
 REFUSALS = ("NO", "OL", "OU", "ERROR")  # unknown or not now; below or above the range; an error on the device
 
 
@@ -55,16 +46,16 @@ def read_done(line: bytes, request: str, port: str) -> bool:
     text = line.decode("ascii", "backslashreplace").strip()
     if text.upper() in REFUSALS:
         raise DeviceRefused(f"the mirror controller on {port} answered {text.upper()} to {request}")
-    if text.upper() != OK:
+    if text.upper() != "OK":
         raise RigError(f"expected OK to {request} from {port}, got {text!r}; is this the mirror controller?")
     return True
 
 
 def read_text(line: bytes, request: str, port: str) -> str:
     """Read a reply that is a text of the device, such as its id; empty where it does not know the request."""
-    text = line.decode("ascii", "backslashreplace").strip()
-    if not re.fullmatch(r"[ -~]+", text) or "\\x" in text:
-        raise RigError(f"expected text to {request} from {port}, got {line!r}; is the port's speed right?")
+    if not re.fullmatch(rb"[ -~]+", line):
+        raise RigError(f"expected text to {request} from {port}, got {line!r}; is this the mirror controller?")
+    text = line.decode("ascii").strip()
     return "" if text.upper() in REFUSALS else text
 
 
@@ -72,100 +63,63 @@ def ask_line(wire: Wire, request: str, parse: Callable[[bytes, str, str], Answer
     """Send a line of simple mode and return the parsed line that answers it; raises as `Wire.exchange`."""
 
     def receiver() -> Receiver[Answer]:
-        """Return a receiver that collects a line."""
         held = b""
 
         def receive(data: bytes) -> Answer | None:
             nonlocal held
             *lines, held = (held + data).split(b"\n")
-            line = next((line for line in (line.rstrip(b"\r") for line in lines) if line), None)
-            return None if line is None else parse(line, request, wire.port)
+            whole = next((line for line in (line.rstrip(b"\r") for line in lines) if line), None)
+            return None if whole is None else parse(whole, request, wire.port)
 
         return receive
 
-    return wire.exchange(request.encode("ascii") + END, request, kind, receiver)
+    return wire.exchange(request.encode("ascii") + b"\r\n", request, kind, receiver)
 
 
-@dataclass(frozen=True)
-class ProLink:
-    """Frames of pro mode over a wire. ``with_crc`` sends CRCs, and refuses replies whose CRC does not fit.
+def ask_frame(
+    wire: Wire,
+    frame: pro.Frame,
+    name: str,
+    parse: Callable[[bytes], Answer],
+    kind: Kind = "read",
+    *,
+    with_crc: bool = False,
+) -> Answer:
+    """Send a frame and return the parsed payload of its answer; raises as `Wire.exchange`.
 
-    Requests raise DeviceRefused, DeadlinePassed or DeviceGone, and one that moves the mirror StateUnknown.
+    ``with_crc`` sends a CRC, and refuses an answer whose CRC does not fit.
     """
 
-    wire: Wire
-    with_crc: bool = False
-
-    def ask(self, frame: pro.Frame, name: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
-        """Send a request that only reads and return the parsed payload; it is sent again where no answer comes."""
-
-        def receiver() -> Receiver[Answer]:
-            reader = pro.FrameReader()
-
-            def receive(data: bytes) -> Answer | None:
-                answers = (self._answer(found, frame, name, parse) for found in reader.feed(data))
-                return next((answer for answer in answers if answer is not None), None)
-
-            return receive
-
-        return self.wire.exchange(pro.encode(frame, with_crc=self.with_crc), name, kind, receiver)
-
-    def set(self, frame: pro.Frame, name: str) -> None:
-        """Send a request once that writes and moves nothing."""
-        self.ask(frame, name, bytes, "write")
-
-    def _answer(self, found: pro.Frame, sent: pro.Frame, name: str, parse: Callable[[bytes], Answer]) -> Answer | None:
+    def answer(found: pro.Frame) -> Answer | None:
         """Return the answer in a frame; None, and a line in the log, where it does not answer the request."""
-        port = self.wire.port
-        if self.with_crc and not found.crc_good:
-            LOG.warning("%s: the CRC of an answer to %s does not fit; it is refused", port, name)
+        if with_crc and not found.crc_good:
+            LOG.warning("%s: the CRC of an answer to %s does not fit; it is refused", wire.port, name)
             return None
         try:
-            if found.command == sent.command | pro.ERROR_FLAG:
+            if found.command == frame.command | pro.ERROR_FLAG:
                 code = pro.cell_int(found.payload)
-                raise DeviceRefused(f"the mirror controller on {port} refused {name}: {pro.format_error(code)}", code)
-            if found.command == sent.command:
+                reason = pro.format_error(code)
+                raise DeviceRefused(f"the mirror controller on {wire.port} refused {name}: {reason}", code)
+            if found.command == frame.command:
                 return parse(found.payload)
         except ShapeError as error:
-            LOG.info("%s, while waiting for %s: an answer that does not fit: %s", port, name, error)
+            LOG.info("%s, while waiting for %s: an answer that does not fit: %s", wire.port, name, error)
             return None
-        LOG.info("%s, while waiting for %s: an answer to command %02X", port, name, found.command)
+        LOG.info("%s, while waiting for %s: an answer to command %02X", wire.port, name, found.command)
         return None
 
+    def receiver() -> Receiver[Answer]:
+        reader = pro.FrameReader()
+        return lambda data: next((one for found in reader.feed(data) if (one := answer(found)) is not None), None)
 
-def upload(link: ProLink, cells: bytes) -> None:
-    """Write cells, X of all positions and then Y of all, to the vector memory.
-
-    Every tenth frame and the ends of both channels are read back. Raises RigError: a cell holds another value.
-    """
-    size = pro.VECTOR_CELLS * pro.CELL
-    frames = [(at // pro.CELL, cells[at : at + size]) for at in range(0, len(cells), size)]
-    for start, sent in frames:
-        stop = start + len(sent) // pro.CELL
-        link.set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing cells {start} to {stop}")
-    for number in frames_to_check(len(frames)):
-        start, sent = frames[number]
-        place = f"cells {start} to {start + len(sent) // pro.CELL}"
-        asked = pro.get_vector(pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
-        if link.ask(asked, f"reading {place}", partial(pro.checked, size=len(sent))) != sent:
-            raise RigError(
-                f"{place} of the vector memory on {link.wire.port} hold other values than were sent; nothing was "
-                "moved: run again"
-            )
-
-
-def frames_to_check(frames: int) -> list[int]:
-    """Return the numbers of the frames that are read back."""
-    half = frames // 2  # X ends and Y begins here
-    ends = (0, half - 1, half, frames - 1)
-    return sorted({number for number in chain(range(0, frames, SAMPLED_EVERY), ends) if 0 <= number < frames})
+    return wire.exchange(pro.encode(frame, with_crc=with_crc), name, kind, receiver)
 
 
 _STOPPED: dict[int, pro.Value] = {pro.X.run: 0, pro.Y.run: 0}  # halts the vector units of both channels
 
 
 class MirrorController:
-    """A mirror controller on a port, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
+    """A mirror controller behind a transport, a `pipeline.rig.drivers.MirrorDriver`. Call :meth:`connect` first.
 
     Motions (goto, run) are sent once; one that is not acknowledged raises StateUnknown. Positions beyond the disk raise
     PoseError, before a byte is sent.
@@ -177,7 +131,6 @@ class MirrorController:
         self.rig = rig
         self.vector_pairs = vector_pairs
         self.wire = Wire(transport, clock)
-        self._link = ProLink(self.wire, rig.with_crc)
         self._pairs = 0  # positions in the vector memory
         self.identity = ""
 
@@ -192,10 +145,10 @@ class MirrorController:
             LOG.info("%s does not answer in simple mode; it may be in pro mode", self.wire.port)
             with suppress(DeadlinePassed):  # it may have changed; the greeting shows
                 # with a CRC: an earlier session may have had them checked
-                ProLink(self.wire, with_crc=True).set(pro.GO_SIMPLE, "changing to simple mode")
+                ask_frame(self.wire, pro.GO_SIMPLE, "changing to simple mode", bytes, "write", with_crc=True)
             self._greet()
         # empty where it does not know the request
-        device, version, number = (ask_line(self.wire, request, read_text) for request in (ID, VERSION, SERIAL))
+        device, version, number = (ask_line(self.wire, one, read_text) for one in ("GETID", "GETVERSION", "GETSN"))
         self.identity = f"{device or 'no id'}, version {version or 'unknown'}, serial {number or 'unknown'}"
         if not device.upper().startswith(KNOWN_MODEL):
             raise RigError(
@@ -204,7 +157,7 @@ class MirrorController:
             )
         try:
             with suppress(DeadlinePassed):  # it may have changed; the status shows
-                ask_line(self.wire, GO_PRO_CRC if self.rig.with_crc else GO_PRO, read_done, "write")
+                ask_line(self.wire, "GOPROCRC" if self.rig.with_crc else "GOPRO", read_done, "write")
             self.status()
         except (DeadlinePassed, DeviceRefused) as error:
             own, other = ("with", "without")[:: 1 if self.rig.with_crc else -1]
@@ -215,13 +168,13 @@ class MirrorController:
 
     def _greet(self) -> None:
         try:
-            ask_line(self.wire, START, read_done)
+            ask_line(self.wire, "START", read_done)
         except DeviceRefused:  # the greeting ended a line that was begun before
-            ask_line(self.wire, START, read_done)
+            ask_line(self.wire, "START", read_done)
 
     def status(self) -> pro.Status:
         """Return the present status bits."""
-        return pro.Status(self._link.ask(pro.ASK_STATUS, "the status", pro.cell_int))
+        return pro.Status(self._ask(pro.ASK_STATUS, "the status", pro.cell_int))
 
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position; return once that is acknowledged. RigError: the status forbids motion."""
@@ -236,24 +189,39 @@ class MirrorController:
         while pro.Status.NOT_STABLE in (status := self.status()):
             if self.wire.clock.now() >= until:
                 raise RigError(f"the mirror on {self.wire.port} is not at rest after {within_s:g} s; {status.sentence}")
-            self.wire.clock.sleep(_POLL_S)
+            self.wire.clock.sleep(POLL_S)
         if pro.Status.TRIMMED in status:
             raise RigError(f"the mirror on {self.wire.port} is not where it was sent; {status.sentence}")
 
     def load_path(self, positions: ArrayLike) -> None:
         """Put positions (position, 2) into the vector memory: X of all, then Y of all, from cell 0 on. Halts a path.
 
-        Raises SettingsError: there are too many. Raises RigError: a cell that was read back holds another value.
+        Every tenth frame and the ends of both channels are read back. Raises SettingsError: there are too many
+        positions. Raises RigError: a cell that was read back holds another value.
         """
-        cells = wire_positions(positions, self.rig.mounting)
-        if len(cells) > self.vector_pairs:
+        path = wire_positions(positions, self.rig.mounting)
+        if len(path) > self.vector_pairs:
             raise SettingsError(
-                f"the vector memory holds {self.vector_pairs} positions, got {len(cells)}; load in parts"
+                f"the vector memory holds {self.vector_pairs} positions, got {len(path)}; load in parts"
             )
         self.halt()
         self._pairs = 0
-        upload(self._link, cells.T.astype(">f4").tobytes())
-        self._pairs = len(cells)
+        cells, size = path.T.astype(">f4").tobytes(), pro.VECTOR_CELLS * pro.CELL
+        frames = [(at // pro.CELL, cells[at : at + size]) for at in range(0, len(cells), size)]
+        for start, sent in frames:
+            part = f"cells {start} to {start + len(sent) // pro.CELL}"
+            self._set(pro.set_vector(pro.VECTOR_MEMORY, start, sent), f"writing {part}")
+        half = len(frames) // 2  # X ends and Y begins here
+        for number in sorted({*range(0, len(frames), SAMPLED_EVERY), max(half - 1, 0), half, len(frames) - 1}):
+            start, sent = frames[number]
+            part = f"cells {start} to {start + len(sent) // pro.CELL}"
+            asked = pro.get_vector(pro.VECTOR_MEMORY, start, len(sent) // pro.CELL)
+            if self._ask(asked, f"reading {part}", partial(pro.checked, size=len(sent))) != sent:
+                raise RigError(
+                    f"{part} of the vector memory on {self.wire.port} hold other values than were sent; nothing was "
+                    "moved: run again"
+                )
+        self._pairs = len(path)
 
     def run(self, rate_hz: float) -> None:
         """Play the loaded positions once; X from cell 0 on, Y from behind the X of all positions.
@@ -273,13 +241,13 @@ class MirrorController:
                 channel.cycles: 1,
                 channel.trigger: pro.TRIGGER_OFF,
             }
-            self._link.set(pro.set_values(values), f"setting up the path's {name}")
+            self._set(pro.set_values(values), f"setting up the path's {name}")
         # one frame: both begin together
         self._move({**pro.X.play, **pro.Y.play, pro.X.run: 1, pro.Y.run: 1}, "running the path")
 
     def halt(self) -> None:
         """Stop playing; the mirror stays where it is."""
-        self._link.set(pro.set_values(_STOPPED), "halting the path")
+        self._set(pro.set_values(_STOPPED), "halting the path")
 
     def close(self) -> None:
         """Close the port; the mirror stays where it is."""
@@ -288,18 +256,10 @@ class MirrorController:
     def _move(self, values: dict[int, pro.Value], name: str) -> None:
         if (status := self.status()).stops_motion:
             raise RigError(f"{name} is refused on {self.wire.port}; {status.sentence}; mend that first")
-        self._link.ask(pro.set_values(values), name, bytes, "motion")
+        self._ask(pro.set_values(values), name, bytes, "motion")
 
+    def _set(self, frame: pro.Frame, name: str) -> None:
+        self._ask(frame, name, bytes, "write")
 
-def open_mirror(rig: SurveyRig, vector_pairs: int = 1500, clock: Clock = SYSTEM_CLOCK) -> MirrorController:
-    """Open the port of the settings and connect to the controller there. Nothing moves.
-
-    Raises as `MirrorController.connect`, and DeviceGone: there is no such port, it is in use, or not permitted.
-    """
-    mirror = MirrorController(SerialTransport(rig.port, rig.baud, clock), rig, clock, vector_pairs=vector_pairs)
-    try:
-        mirror.connect()
-    except BaseException:
-        mirror.close()
-        raise
-    return mirror
+    def _ask(self, frame: pro.Frame, name: str, parse: Callable[[bytes], Answer], kind: Kind = "read") -> Answer:
+        return ask_frame(self.wire, frame, name, parse, kind, with_crc=self.rig.with_crc)

@@ -17,7 +17,7 @@ import logging
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum, IntFlag
+from enum import IntFlag
 from functools import cache
 
 from spectralzoom.pipeline.errors import ShapeError
@@ -30,43 +30,21 @@ _TOO_LONG = 2 * (_HEAD + MOST_PAYLOAD + _CRC) + 1  # bytes between boundaries: a
 ERROR_FLAG = 0x80  # command of a reply that says no
 
 
-class Command(IntEnum):
-    """Commands of frames."""
-
-    STATUS = 0x02
-    SET_MODE = 0x06
-    SET_VALUES = 0x12
-    SET_VECTOR = 0x14
-    GET_VECTOR = 0x15
-
-
-class ErrorCode(IntEnum):
-    """Reasons of the device for refusing a request."""
-
-    FRAME_INVALID = 0x0001
-    COMMAND_UNKNOWN = 0x0002
-    LENGTH_MISMATCH = 0x0003
-    CRC_WRONG = 0x0004
-    NOT_IMPLEMENTED = 0x0005
-    NO_REGISTER = 0x0101
-    WRITE_FAILED = 0x0102
-    OUT_OF_RANGE = 0x0103
-    REGISTER_INVALID = 0x0104
-    READ_FAILED = 0x0105
-    READ_ONLY = 0x0106
-    VECTOR_INDEX = 0x0107
-    VECTOR_ALIGNMENT = 0x0108
-    LOCKED = 0x0109
-    NOT_READABLE = 0x010A
-    NO_SYSTEM = 0x0201
-    SYSTEM_NOT_SELECTABLE = 0x0202
-    CHAIN = 0x0203
+STATUS, SET_MODE, SET_VALUES, SET_VECTOR, GET_VECTOR = 0x02, 0x06, 0x12, 0x14, 0x15  # commands of frames
+_REASONS = {  # of a refusal, by the code of the first in a row
+    0x0001: ("frame invalid", "command unknown", "length mismatch", "CRC wrong", "not implemented"),
+    0x0101: (
+        *("no register", "write failed", "out of range", "register invalid", "read failed", "read only"),
+        *("vector index", "vector alignment", "locked", "not readable"),
+    ),
+    0x0201: ("no system", "system not selectable", "chain"),
+}
 
 
 def format_error(code: int) -> str:
-    """Return the name of an error code, with its number."""
-    name = next((error.name for error in ErrorCode if error == code), "UNKNOWN_ERROR")
-    return f"{name.lower().replace('_', ' ')} (code {code:04X})"
+    """Return the reason of a refusal by its code, with the code."""
+    reasons = {first + number: one for first, row in _REASONS.items() for number, one in enumerate(row)}
+    return f"{reasons.get(code, 'unknown error')} (code {code:04X})"
 
 
 @dataclass(frozen=True)
@@ -139,20 +117,10 @@ def _read_frame(data: bytes) -> Frame | None:
 
 CELL = 4  # bytes
 VECTOR_CELLS = 10  # in one frame, as the public software does; 11 would fit
-ASK_STATUS = Frame(Command.STATUS, b"\x00\x00")  # without an argument; the reply is one cell
-GO_SIMPLE = Frame(Command.SET_MODE, b"\x00\x00")  # simple mode is communication mode 0
+ASK_STATUS = Frame(STATUS, b"\x00\x00")  # without an argument; the reply is one cell
+GO_SIMPLE = Frame(SET_MODE, b"\x00\x00")  # simple mode is communication mode 0
 
 Value = float | int
-
-
-def float_cell(value: float) -> bytes:
-    """Return the cell of a float32."""
-    return struct.pack(">f", value)
-
-
-def int_cell(value: int) -> bytes:
-    """Return the cell of a signed or unsigned integer of 32 bits."""
-    return (value & 0xFFFFFFFF).to_bytes(CELL, "big")
 
 
 def cell_int(cell: bytes) -> int:
@@ -162,19 +130,18 @@ def cell_int(cell: bytes) -> int:
 
 def set_values(values: Mapping[int, Value]) -> Frame:
     """Return a request that sets 1 to 8 registers at once: integers as such, floats as float32."""
-    cells = (int_cell(value) if isinstance(value, int) else float_cell(value) for value in values.values())
-    head = (number.to_bytes(2, "big") for number in (len(values), *values))
-    return Frame(Command.SET_VALUES, b"".join([*head, *cells]))
+    cells = (struct.pack(">I" if isinstance(value, int) else ">f", value) for value in values.values())
+    return Frame(SET_VALUES, struct.pack(f">{1 + len(values)}H", len(values), *values) + b"".join(cells))
 
 
 def get_vector(register: int, start: int, count: int) -> Frame:
     """Return a request for the cells ``start`` to ``start + count`` of a vector; the reply is the cells."""
-    return Frame(Command.GET_VECTOR, struct.pack(">HHB", register, start * CELL, count * CELL))
+    return Frame(GET_VECTOR, struct.pack(">HHB", register, start * CELL, count * CELL))
 
 
 def set_vector(register: int, start: int, cells: bytes) -> Frame:
     """Return a request that sets the cells of a vector from ``start`` on."""
-    return Frame(Command.SET_VECTOR, struct.pack(">HHB", register, start * CELL, len(cells)) + cells)
+    return Frame(SET_VECTOR, struct.pack(">HHB", register, start * CELL, len(cells)) + cells)
 
 
 def checked(data: bytes, size: int) -> bytes:

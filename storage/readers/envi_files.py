@@ -8,7 +8,7 @@ layout, and on the references of a real MV.X.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,7 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
-from spectralzoom.pipeline.rig.camera.frame_indices import (
-    FRAME_INDEX,
-    LONGEST_LINE,
-    FrameIndex,
-    LineTimes,
-    parse_frame_index,
-    place_parts,
-    times_of_lines,
-)
+from spectralzoom.pipeline.frame_indices import FRAME_INDEX, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, numbers_of_list
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
@@ -37,6 +29,7 @@ from spectralzoom.storage.readers.places import place_of_envi
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
+LONGEST_LINE = 1000  # characters of a frame index; a frame's line has about 25
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 
 
@@ -192,7 +185,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     if len(frames) > 1:
         raise SceneError(f"the parts of {folder} have frames of {sorted(frames)} (sample, band); name them one by one")
     parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
-    starts = place_parts(parts, MOST_MISSING, notes)
+    starts = _first_lines(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
     if any("map info" in cube.header.fields for cube in opened.values()):
         notes.append("the map info of its parts is not read: lines of a folder are on no map; name one file")
@@ -208,12 +201,35 @@ def open_headwall_cube(folder: Path) -> CubeSource:
             continue
         index = load_frame_index(within(folder, indices[number]))
         own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
-        times.put(start, own)
+        there = slice(start, start + len(own.frame))
+        times.frame[there], times.stamp_us[there] = own.frame, own.stamp_us
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
     lines, known = source.lines, times.stamp_us >= 0
     if known.any() and np.ptp(times.stamp_us[known]):  # a camera without a clock repeats its stamp
         lines = replace(lines, time_s=np.where(known, (times.stamp_us - times.stamp_us[known][0]) * 1e-6, np.nan))
     return replace(source, files=(*source.files, *indices.values()), lines=lines, notes=tuple(notes))
+
+
+def _first_lines(parts: Sequence[tuple[str, int, int]], most: int, notes: list[str]) -> list[int]:
+    """Return the first line of each part of a cube, from the parts' names, first frames and numbers of lines.
+
+    Raises SceneError: more than ``most`` lines are in no part.
+    """
+    starts: list[int] = []
+    end = 0
+    missing = 0
+    for name, frame, lines in parts:
+        start = frame - parts[0][1]
+        missing += max(start - end, 0)
+        if missing > most:
+            raise SceneError(f"{missing} lines before {name} are in no file, more than {most}; is it of another cube?")
+        if start > end:
+            notes.append(f"{start - end} lines before {name} are in no file")
+        elif start < end:
+            notes.append(f"{name} begins {end - start} frames before the part before it ends")
+        starts.append(max(start, end))
+        end = starts[-1] + lines
+    return starts
 
 
 def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:

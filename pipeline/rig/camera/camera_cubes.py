@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spectralzoom.pipeline.envi_headers import EnviHeader, parse_envi_header
+from spectralzoom.pipeline.envi_headers import parse_envi_header
 from spectralzoom.pipeline.errors import RigError, SceneError, ShapeError
 from spectralzoom.pipeline.exposures import Taken, match_exposures, taken_with
-from spectralzoom.pipeline.rig.camera.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
+from spectralzoom.pipeline.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.pipeline.signal.calibrate import find_bad_elements
 from spectralzoom.pipeline.source import References
 
@@ -29,12 +29,12 @@ FRAMES_FOR_STUCK = 8  # fewer frames cannot tell an element that never changes f
 
 
 @dataclass(frozen=True)
-class CubeLines:
+class Cube:
     """Lines of one file. ``lost`` lines are in its header, but not whole in the file."""
 
     values: NDArray[np.uint16]  # (line, sample, band), a view of the bytes
     lost: int
-    taken: Taken = field(default_factory=Taken)
+    taken: Taken
 
 
 @dataclass(frozen=True)
@@ -47,27 +47,36 @@ class CapturedLines:
     notes: tuple[str, ...] = ()
 
 
-def parse_cube_header(text: str, where: str) -> EnviHeader:
-    """Read the header of a cube of the camera.
+@dataclass(frozen=True)
+class MeanFrame:
+    """The mean of a reference's frames."""
 
-    Raises RigError: it is no whole ENVI header, or the numbers are not 16-bit BIL.
+    mean: NDArray[np.float32]  # (sample, band) DN
+    stuck: NDArray[np.bool_]  # (sample, band) the same number in every frame while the others change
+    taken: Taken = field(default_factory=Taken)
+
+
+def parse_cube(header: str, data: bytes, where: str) -> Cube:
+    """Return the lines that are whole in ``data``; ``where`` is the header's name.
+
+    Raises RigError: it is no whole ENVI header, the numbers are not 16-bit BIL, or there are more bytes than it states.
     """
     try:
-        header = parse_envi_header(text, where)
+        found = parse_envi_header(header, where)
     except SceneError as error:
         raise RigError(f"{error}; fetch it again") from error
-    kind = header.dtype.str[1:]
-    if (header.interleave, kind) != ("bil", "u2"):
-        raise RigError(f"{where}: interleave {header.interleave!r} of {kind}; expected bil and u2, as cameras write")
-    return header
-
-
-def cube_lines(header: EnviHeader, data: bytes) -> CubeLines:
-    """Return the lines that are whole in ``data``, (line, sample, band)."""
-    held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines or 0)
-    shape = (held, header.bands, header.samples)
-    values: NDArray[Any] = np.ndarray(shape, header.dtype, data, header.offset if held else 0)
-    return CubeLines(values.transpose(0, 2, 1), (header.lines or 0) - held)
+    kind, lines = found.dtype.str[1:], found.lines or 0
+    if (found.interleave, kind) != ("bil", "u2"):
+        raise RigError(f"{where}: interleave {found.interleave!r} of {kind}; expected bil and u2, as cameras write")
+    if len(data) > found.offset + lines * found.line_bytes:
+        raise RigError(
+            f"{where} states {found.offset + lines * found.line_bytes} bytes of data, there are {len(data)}; is it "
+            "another file's?"
+        )
+    held = max(len(data) - found.offset, 0) // found.line_bytes
+    shape = (held, found.bands, found.samples)
+    values: NDArray[Any] = np.ndarray(shape, found.dtype, data, found.offset if held else 0)
+    return Cube(values.transpose(0, 2, 1), lines - held, taken_with(where, found.fields, found.settings))
 
 
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
@@ -82,72 +91,53 @@ def read_capture(names: Iterable[str], read: Read) -> CapturedLines:
         raise RigError(
             f"expected one cube with a whole line, got {', '.join(sorted(by_name)) or 'an empty folder'}; capture again"
         )
-    first = int(parts[0][1])
-    held = len(cube.values)
-    notes: list[str] = []
-    if cube.lost:
-        notes.append(f"raw_{first} is cut off: {held} of {held + cube.lost} lines are whole")
-    times = _times(by_name, first, cube, read, notes) or LineTimes.unknown(held)
+    first, held = int(parts[0][1]), len(cube.values)
+    notes = [f"raw_{first} is cut off: {held} of {held + cube.lost} lines are whole"] if cube.lost else []
+    times = LineTimes.unknown(held)
+    name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
+    if name is None:
+        notes.append(f"there is no frame index for raw_{first}")
+    else:
+        try:
+            index = parse_frame_index(read(by_name[name]).decode("utf-8-sig", errors="replace").splitlines(), name)
+        except SceneError as error:
+            notes.append(str(error))
+        else:
+            times = times_of_lines(index, first, held, cube.lost)
+            notes += [*index.notes, *(f"{name}: {note}" for note in times.notes)]
     return CapturedLines(cube.values.astype(np.uint16, copy=False), first, times, tuple(notes))
 
 
-def read_references(names: Iterable[str], read: Read) -> dict[str, CubeLines]:
-    """Return the reference cubes of a folder by ``dark`` and ``white``; empty without any.
+def read_references(names: Iterable[str], read: Read) -> dict[str, MeanFrame]:
+    """Read the references of a folder by ``dark`` and ``white``; empty without any.
 
     Raises RigError: one has no header, a wrong one, or another number of frames, or there are two of a kind.
     """
     by_name = {name.rsplit("/", 1)[-1]: name for name in names}
-    found: dict[str, CubeLines] = {}
+    found: dict[str, MeanFrame] = {}
     for name in sorted(by_name):
         match = _REFERENCE.fullmatch(name)
         if match is None:
             continue
-        if match[1].lower() in found:
-            raise RigError(f"two {match[1].lower()} references among {', '.join(sorted(by_name))}; keep one of them")
-        found[match[1].lower()] = cube = _read_cube(by_name, name, read)
-        if cube.lost:
+        kind = match[1].lower()
+        if kind in found:
+            raise RigError(f"two {kind} references among {', '.join(sorted(by_name))}; keep one of them")
+        cube = _read_cube(by_name, name, read)
+        if cube.lost or not len(cube.values):
             raise RigError(
                 f"{by_name[name]} holds {len(cube.values)} whole frames, its header says "
                 f"{len(cube.values) + cube.lost}; take both references again"
             )
+        found[kind] = replace(mean_frame(cube.values), taken=cube.taken)
     return found
 
 
-def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> CubeLines:
+def _read_cube(by_name: Mapping[str, str], name: str, read: Read) -> Cube:
     header = next((found for found in by_name if found.lower() == name.lower() + ".hdr"), None)
     if header is None:
         raise RigError(f"{by_name[name]} has no header {name}.hdr beside it; fetch the folder again")
-    found = parse_cube_header(read(by_name[header]).decode("utf-8", errors="replace"), by_name[header])
-    data = read(by_name[name])
-    stated = found.offset + (found.lines or 0) * found.line_bytes
-    if len(data) > stated:
-        raise RigError(f"{by_name[name]} has {len(data)} bytes, its header says {stated}; is it another file's?")
-    return replace(cube_lines(found, data), taken=taken_with(by_name[name], found.fields, found.settings))
-
-
-def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
-    """Return the times of a part's lines by its index; None where there is no readable one."""
-    name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
-    if name is None:
-        notes.append(f"there is no frame index for raw_{first}")
-        return None
-    try:
-        index = parse_frame_index(read(by_name[name]).decode("utf-8-sig", errors="replace").splitlines(), name)
-    except SceneError as error:
-        notes.append(str(error))
-        return None
-    own = times_of_lines(index, first, len(cube.values), cube.lost)
-    notes += [*index.notes, *(f"{name}: {note}" for note in own.notes)]
-    return own
-
-
-@dataclass(frozen=True)
-class MeanFrame:
-    """The mean of a reference's frames."""
-
-    mean: NDArray[np.float32]  # (sample, band) DN
-    stuck: NDArray[np.bool_]  # (sample, band) the same number in every frame while the others change
-    taken: Taken = field(default_factory=Taken)
+    text = read(by_name[header]).decode("utf-8", errors="replace")
+    return parse_cube(text, read(by_name[name]), by_name[header])
 
 
 def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:

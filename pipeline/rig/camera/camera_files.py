@@ -16,7 +16,7 @@ from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock, DeviceGone
 LOG = logging.getLogger(__name__)
 NOT_LOGGED_IN = 530  # of FTP: the user or the password is refused
 OVERLAP = 4096  # last bytes held that are fetched again, to see that it is the same file
-_BLOCK = 1 << 16  # bytes
+BLOCK = 1 << 16  # bytes
 STALL_S = 10.0  # longest silence before a transfer is continued anew
 TRIES = 3  # in a row that bring no byte
 PAUSE_S = 1.0  # between them
@@ -25,11 +25,10 @@ Progress = Callable[[str, int, int], None]  # file, bytes held, bytes in all
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """An entry of a listing."""
+    """A file in a listing."""
 
     name: str  # whole path
     size: int | None  # bytes; None where the camera does not say
-    folder: bool
 
     @property
     def base(self) -> str:
@@ -153,22 +152,24 @@ def _transfer(session: ftplib.FTP, file: RemoteFile, kept: Kept, progress: Progr
     another = RigError(f"the {held} bytes of {name} that are held are of another file; remove them and fetch again")
     if held > size:
         raise another
-    if size == 0:
+    at, total = max(held - OVERLAP, 0), size
+    if not total:
         kept.append(name, b"")
-        return
-    at = max(held - OVERLAP, 0)
-    with session.transfercmd(f"RETR {name}", at or None) as connection:
-        while data := connection.recv(_BLOCK):
-            same = min(len(data), max(held - at, 0))
-            if data[:same] != kept.read(name, at, at + same):
-                raise another
-            at += len(data)
-            if at > size:
-                raise RigError(f"{name} has more than its {size} bytes; fetch it when the capture has ended")
-            if same < len(data):
-                kept.append(name, data[same:])
-                if progress is not None:
-                    progress(name, at, size)
-    session.voidresp()
-    if at < size:
-        raise DeviceGone(f"the transfer of {name} ended at byte {at} of {size}; look at the file there")
+
+    def take(data: bytes) -> None:
+        nonlocal at
+        same = min(len(data), max(held - at, 0))
+        if data[:same] != kept.read(name, at, at + same):
+            raise another
+        at += len(data)
+        if at > total:
+            raise RigError(f"{name} has more than its {total} bytes; fetch it when the capture has ended")
+        if same < len(data):
+            kept.append(name, data[same:])
+            if progress is not None:
+                progress(name, at, total)
+
+    if total:
+        session.retrbinary(f"RETR {name}", take, BLOCK, rest=at or None)
+    if at < total:
+        raise DeviceGone(f"the transfer of {name} ended at byte {at} of {total}; look at the file there")

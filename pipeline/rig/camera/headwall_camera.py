@@ -11,34 +11,30 @@ import logging
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
+from pydantic import BaseModel, Field, StrictBool, TypeAdapter, ValidationError
+
 from spectralzoom.pipeline.errors import RigError
-from spectralzoom.pipeline.rig.camera.camera_cubes import (
-    CapturedLines,
-    MeanFrame,
-    Read,
-    mean_frame,
-    read_capture,
-    read_references,
-)
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame, Read, read_capture, read_references
 from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress, RemoteFile, fetch_files
 from spectralzoom.pipeline.rig.device_settings import FileServer
 from spectralzoom.pipeline.rig.transports import (
     SYSTEM_CLOCK,
     Answer,
     Clock,
-    DeadlinePassed,
     DeviceRefused,
-    StateUnknown,
+    Kind,
+    Receiver,
     Transport,
+    Wire,
 )
 
 LOG = logging.getLogger(__name__)
 DEADLINE_S = 5.0  # from a command's first byte to the prompt
 RETRIES = 2  # of a read
 PAUSE_S = 0.5  # before connecting again
+ADVICE = "is it the camera's control port (8100), is the camera on, and not busy writing?"
 LONGEST_REPLY = 1 << 24  # bytes: a listing of a hundred thousand files
 _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _PROMPT = re.compile(rb"(?:\A|(?<=[\r\n}]))hpi> ")  # a reply may hold the word, but not there
@@ -64,52 +60,47 @@ class ReplyReader:
         return [text.decode("utf-8", errors="replace").strip("\0 \t\r\n") for text in texts]
 
 
-def response_of(text: str, name: str, port: str) -> Any:
+class Reply(BaseModel):
+    """A reply to a command. The response of a capture has its folder, that of a listing its entries."""
+
+    success: StrictBool
+    response: Any = None
+    reason: Any = Field(None, alias="errorMessage")
+
+
+class Folder(BaseModel):
+    """The folder of a capture."""
+
+    folder: str = Field(min_length=1)
+
+
+class Entry(BaseModel):
+    """A file or folder in a listing, by its whole name."""
+
+    name: str
+    size: int | None = None  # bytes; None where the camera does not say
+    is_folder: bool = Field(False, alias="isDirectory")
+
+
+def response_of(text: str, name: str, port: str, kind: type[Answer]) -> Answer:
     """Return the response of a reply that reports success.
 
-    Raises DeviceRefused: it reports a failure. Raises RigError: it is no such reply.
+    Raises DeviceRefused: it reports a failure. Raises RigError: it is no reply, or has no response of this kind.
     """
+    # the command is repeated before a reply that does not begin as JSON
+    content = text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2]
     try:
-        # The command is repeated before a reply that does not begin as JSON.
-        content = json.loads(text if text.startswith("{") else text.replace("\n", "\r").partition("\r")[2])
-        success, response, reason = content["success"], content.get("response"), content.get("errorMessage")
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        reply = Reply.model_validate_json(content)
+        if reply.success:
+            return TypeAdapter(kind).validate_python(reply.response, strict=True)
+    except ValidationError as error:
         raise RigError(
-            f"{port} answered {name} with {text[:200]!r}, expected JSON with success true or false; is this the "
-            "camera's control port?"
+            f"{port} answered {name} with {text[:200]!r}: {error.errors()[0]['msg']}; is this the camera's control "
+            "port, and does its manual fit?"
         ) from error
-    if success is not True:
-        raise DeviceRefused(
-            f"the camera at {port} refused {name}: {str(reason or 'no reason given')[:300]!r}; see its manual"
-        )
-    return response
-
-
-def as_folder(response: Any) -> str:
-    """Return the folder of a capture; RigError where the response has none."""
-    folder = response.get("folder") if isinstance(response, dict) else None
-    if not isinstance(folder, str) or not folder:
-        raise RigError(f"expected the folder of the capture from the camera, got {response!r:.100}")
-    return folder
-
-
-def as_truth(response: Any) -> bool:
-    """Return whether a capture runs; RigError where the response does not say."""
-    if not isinstance(response, bool):
-        raise RigError(f"expected true or false from the camera, got {response!r:.100}; restart its server")
-    return response
-
-
-def as_listing(response: Any) -> list[RemoteFile]:
-    """Return the entries of a folder, by name; RigError where the response is no list of files."""
-    try:
-        found = [
-            RemoteFile(re.sub("/{2,}", "/", entry["name"]), entry.get("size"), bool(entry.get("isDirectory")))
-            for entry in response
-        ]
-    except (LookupError, TypeError, AttributeError) as error:
-        raise RigError(f"expected a list of files from the camera, got {response!r:.100}") from error
-    return sorted(found, key=lambda entry: entry.name)
+    raise DeviceRefused(
+        f"the camera at {port} refused {name}: {str(reply.reason or 'no reason given')[:300]!r}; see its manual"
+    )
 
 
 class HeadwallCamera:
@@ -123,43 +114,34 @@ class HeadwallCamera:
         self.server = server
         self.clock = clock
         self._connect = connect
-        self._line: Transport | None = None
-        self._reader = ReplyReader()
+        self._wire: Wire | None = None
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]"""
-        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, lambda _: None)
+        self._ask("configure", {"exposure": exposure_ms, "framePeriod": frame_period_ms}, object)
 
     def capture(self, frames: int, *, prefix: str = "") -> Capture:
         """Begin a capture of ``frames`` lines in one file. The command is sent once; StateUnknown without a reply."""
-        self._open()
+        wire = self._open()
         sent_s = self.clock.now()
+        what = {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}
         try:
-            folder = self._once("capture", {"prefix": prefix, "maxCubes": 1, "maxFramesPerCube": frames}, as_folder)
+            folder = self._once(wire, "capture", what, Folder, "motion").folder
         except DeviceRefused:
             raise
-        except BaseException as error:
+        except BaseException:  # also one that interrupts the wait
             self._hang_up()
-            if not isinstance(error, RigError):  # interrupted while it waited
-                raise
-            raise StateUnknown(
-                f"capture (prefix {prefix!r}) was sent and its reply is lost: {error}. It is not sent again. Look "
-                "at the camera, stop what runs there, then run again, which connects anew"
-            ) from error
+            raise
         return Capture(folder, sent_s, self.clock.now())
 
     def is_capturing(self) -> bool:
         """Return whether a capture runs."""
-        return self._ask("isCapturing", None, as_truth)
+        return self._ask("isCapturing", None, bool)
 
     def stop(self) -> None:
         """End a capture, if one runs. A lost reply is asked for again, since stopping twice is safe."""
         with suppress(DeviceRefused):  # where none runs
-            self._ask("stopCapture", None, lambda _: None)
-
-    def list_files(self, folder: str) -> list[RemoteFile]:
-        """List one folder, in the order of names."""
-        return self._ask("listFiles", folder, as_listing)
+            self._ask("stopCapture", None, object)
 
     def fetch(self, folder: str, kept: Kept, progress: Progress | None = None) -> CapturedLines:
         """Fetch a finished capture's files, small ones first, and return its lines; a later call continues."""
@@ -171,25 +153,30 @@ class HeadwallCamera:
         """Return the mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``."""
         files = [file for file in self._finished(folder) if file.base.lower().startswith(("dark", "white"))]
         fetch_files(self.server, files, kept, clock=self.clock)
-        cubes = read_references([file.name for file in files], _reader(kept))
-        return {kind: replace(mean_frame(cube.values), taken=cube.taken) for kind, cube in cubes.items()}
+        return read_references([file.name for file in files], _reader(kept))
 
     def close(self) -> None:
         """Send exit and close the connection. A capture continues; nothing is raised."""
-        if self._line is not None:
+        if self._wire is not None:
             try:
-                self._line.write(to_request("exit"), self.clock.now() + DEADLINE_S)
+                self._wire.transport.write(to_request("exit"))
             except RigError as error:
                 LOG.info("the camera was gone before exit: %s", error)
         self._hang_up()
 
-    def _ask(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
+    def _finished(self, folder: str) -> list[RemoteFile]:
+        """Return the files of a folder; RigError where a capture still runs."""
+        if self.is_capturing():
+            raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
+        entries = self._ask("listFiles", folder, list[Entry])
+        return [RemoteFile(re.sub("/{2,}", "/", one.name), one.size) for one in entries if not one.is_folder]
+
+    def _ask(self, name: str, argument: Any, kind: type[Answer]) -> Answer:
         """Send a command that may be sent twice: again, on a new connection, after a lost, late or damaged reply."""
         left = RETRIES
         while True:
             try:
-                self._open()
-                return self._once(name, argument, check)
+                return self._once(self._open(), name, argument, kind, "write")
             except DeviceRefused:
                 raise
             except RigError as error:
@@ -200,55 +187,37 @@ class HeadwallCamera:
                 LOG.info("%s; asking again", error)
                 self.clock.sleep(PAUSE_S)
 
-    def _open(self) -> None:
-        """Open a connection at its prompt, without earlier input."""
-        if self._line is not None:
+    def _once(self, wire: Wire, name: str, argument: Any, kind: type[Answer], sent: Kind) -> Answer:
+        """Send one command and return its response."""
+
+        def receiver() -> Receiver[tuple[Answer]]:
+            reader = ReplyReader()
+            return lambda data: next(((response_of(one, name, wire.port, kind),) for one in reader.feed(data)), None)
+
+        return wire.exchange(to_request(name, argument), name, sent, receiver)[0]
+
+    def _open(self) -> Wire:
+        """Return a connection that has greeted; a new one where the camera ended the last."""
+        if self._wire is not None:
             try:
-                if stale := self._reader.held + self._line.drain():
-                    LOG.warning("%s: dropped %d stale bytes: %r", self._line.port, len(stale), stale[:64])
-                self._reader = ReplyReader()
-                return
+                self._wire.empty_line("before a command")
             except RigError as error:
                 LOG.info("%s; connecting again", error)
                 self._hang_up()
-        self._line = self._connect()
-        self._reader = ReplyReader()
-        try:
-            self._wait(self._line, "the greeting")
-        except RigError:
-            self._hang_up()
-            raise
-
-    def _once(self, name: str, argument: Any, check: Callable[[Any], Answer]) -> Answer:
-        """Send one command and wait for its reply."""
-        line = self._line
-        assert line is not None
-        line.write(to_request(name, argument), self.clock.now() + DEADLINE_S)
-        return check(response_of(self._wait(line, name), name, line.port))
-
-    def _wait(self, line: Transport, name: str) -> str:
-        """Wait for a text with a prompt behind it."""
-        deadline = self.clock.now() + DEADLINE_S
-        while self.clock.now() < deadline:
-            if texts := self._reader.feed(line.read(65536, deadline)):
-                return texts[0]
-        came = self._reader.held
-        found = f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
-        raise DeadlinePassed(
-            f"no reply 'hpi> ' to {name} from {line.port} within {DEADLINE_S:g} s ({found}); is it the "
-            "camera's control port (8100), is the camera on, and not busy writing?"
-        )
+        if self._wire is None:
+            self._wire = Wire(self._connect(), self.clock, deadline_s=DEADLINE_S, advice=ADVICE)
+            reader = ReplyReader()
+            try:
+                self._wire.wait_for("the greeting", lambda data: next(iter(reader.feed(data)), None))
+            except RigError:
+                self._hang_up()
+                raise
+        return self._wire
 
     def _hang_up(self) -> None:
-        if self._line is not None:
-            self._line.close()
-        self._line = None
-
-    def _finished(self, folder: str) -> list[RemoteFile]:
-        """Return the files of a folder; RigError where a capture still runs."""
-        if self.is_capturing():
-            raise RigError(f"a capture still runs, so files of {folder} may grow; wait for its end, or stop it")
-        return [file for file in self.list_files(folder) if not file.folder]
+        if self._wire is not None:
+            self._wire.transport.close()
+        self._wire = None
 
 
 def _reader(kept: Kept) -> Read:

@@ -20,6 +20,7 @@ from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
+from spectralzoom.pipeline.rig.device_settings import SurveyRig
 from spectralzoom.storage.runs import Catalogue
 from spectralzoom.storage.store import Archive
 from tests.conftest import QUIET, Survey, WeightsMaker
@@ -77,6 +78,12 @@ class Reprocess:
 def reprocess(capsys: pytest.CaptureFixture[str]) -> Reprocess:
     """Return the command in this process."""
     return Reprocess(capsys)
+
+
+def test_settings_of_a_run_are_asked_again_without_devices(surveyed: Path) -> None:
+    """A run without a rig has the usual table [rig], so that a raster or simulation is not refused for it."""
+    for run in Catalogue.read(Archive.open(surveyed, write=False)).runs:
+        assert reprocess_command.asked_again(run, surveyed, None).rig == SurveyRig()
 
 
 def _captures(archive: Path) -> list[str]:

@@ -77,10 +77,10 @@ def test_rig_check_exits_with_3_if_one_of_two_devices_fails(command_line: Comman
     assert command_line("rig", "check", "--camera", NOWHERE).code == 1
 
 
-@pytest.mark.parametrize(
-    "words",
-    [("check", "no.toml"), ("check", "--port", "nonsense://x"), ("check", "--prot", "x"), ("nonsense",), ("emulate",)],
-)
+SPY = ("check", "--port", "spy:///dev/null?file=/tmp/x")
+
+
+@pytest.mark.parametrize("words", [("check", "no.toml"), SPY, ("check", "--prot", "x"), ("nonsense",), ("emulate",)])
 def test_usage_errors_exit_with_2(command_line: CommandLine, words: tuple[str, ...]) -> None:
     """One message is printed before anything is connected."""
     command_line("rig", *words).refused(2, "")

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.rig.camera.frame_indices import times_of_lines
+from spectralzoom.pipeline.frame_indices import times_of_lines
 from spectralzoom.storage.readers.envi_files import load_frame_index
 from spectralzoom.storage.readers.open_cubes import open_cube_source
 from tests.storage.readers.test_envi_cubes import write_envi

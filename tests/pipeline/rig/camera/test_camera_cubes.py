@@ -13,9 +13,8 @@ from spectralzoom.pipeline.errors import RigError, ShapeError
 from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.rig.camera.camera_cubes import (
     as_references,
-    cube_lines,
     mean_frame,
-    parse_cube_header,
+    parse_cube,
     read_capture,
     read_references,
 )
@@ -49,9 +48,8 @@ def header(lines: int) -> bytes:
 
 def test_header_of_a_cube_is_parsed() -> None:
     """Sizes, byte order and offset are read, and bands are interleaved by line."""
-    found = parse_cube_header(HEADER.format(lines=1).replace("\n", "\r\n"), "raw_0.hdr")
-    assert (found.samples, found.lines, found.bands, found.offset, found.line_bytes) == (5, 1, 3, 0, 30)
-    values = cube_lines(found, bytes(range(30))).values
+    values = parse_cube(HEADER.format(lines=1).replace("\n", "\r\n"), bytes(range(30)), "raw_0.hdr").values
+    assert values.shape == (1, 5, 3)
     assert values[0, 1, 0] == 0x0302
     assert values[0, 0, 1] == 0x0B0A
 
@@ -60,7 +58,7 @@ def test_big_endian_cubes_with_an_offset_are_read() -> None:
     """The reader applies the header's byte order and offset."""
     text = HEADER.format(lines=2).replace("byte order = 0", "byte order = 1").replace("offset = 0", "offset = 7")
     data = b"7 bytes" + numbers(2).transpose(0, 2, 1).astype(">u2").tobytes()
-    np.testing.assert_array_equal(cube_lines(parse_cube_header(text, "h"), data).values, numbers(2))
+    np.testing.assert_array_equal(parse_cube(text, data, "h").values, numbers(2))
 
 
 @pytest.mark.parametrize(
@@ -76,7 +74,7 @@ def test_big_endian_cubes_with_an_offset_are_read() -> None:
 def test_headers_of_other_formats_are_refused(old: str, new: str, words: str) -> None:
     """Any format other than 16-bit BIL is refused with the offending text."""
     with pytest.raises(RigError, match=words):
-        parse_cube_header(HEADER.format(lines=1).replace(old, new), "raw_0.hdr")
+        parse_cube(HEADER.format(lines=1).replace(old, new), b"", "raw_0.hdr")
 
 
 def test_times_come_from_the_frame_index() -> None:
@@ -111,7 +109,7 @@ def test_a_truncated_cube_gives_its_whole_lines() -> None:
         ({"raw_0": b"", "raw_0__hdr": header(0)}, "one cube with a whole line, got raw_0, raw_0.hdr"),
         ({"raw_0": b"", "raw_5": b""}, "one cube with a whole line, got raw_0, raw_5"),
         ({"raw_0": bil(numbers(1))}, "has no header raw_0.hdr"),
-        ({"raw_0": bil(numbers(2)), "raw_0__hdr": header(1)}, "60 bytes, its header says 30"),
+        ({"raw_0": bil(numbers(2)), "raw_0__hdr": header(1)}, "states 30 bytes of data, there are 60"),
     ],
 )
 def test_incomplete_captures_are_refused(files: dict[str, bytes], words: str) -> None:
@@ -124,7 +122,10 @@ def test_references_are_found_in_a_folder() -> None:
     """Dark and white cubes are recognised by the beginning of their names. Two of a kind are refused."""
     names, read = folder(darkReference=bil(numbers(2)), darkReference__hdr=header(2))
     assert list(read_references(names, read)) == ["dark"]
-    np.testing.assert_array_equal(read_references(names, read)["dark"].values, numbers(2))
+    np.testing.assert_array_equal(read_references(names, read)["dark"].mean, numbers(2).mean(axis=0))
+    names, read = folder(dark=b"", dark__hdr=header(0))
+    with pytest.raises(RigError, match="holds 0 whole frames, its header says 0; take both references again"):
+        read_references(names, read)
     names, read = folder(dark=bil(numbers(1)), dark__hdr=header(1), darkRef=bil(numbers(1)), darkRef__hdr=header(1))
     with pytest.raises(RigError, match="two dark references"):
         read_references(names, read)

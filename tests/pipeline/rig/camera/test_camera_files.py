@@ -19,7 +19,7 @@ from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 RAW = bytes(range(256)) * 20
 NAME = "/captured/a/raw_0"
-FILE = RemoteFile(NAME, len(RAW), False)
+FILE = RemoteFile(NAME, len(RAW))
 
 
 def said(command: str, response: str) -> Pair:
@@ -36,13 +36,19 @@ def cube(frames: np.ndarray) -> tuple[bytes, bytes]:
 
 
 def test_a_capture_is_fetched_from_control_socket_and_files() -> None:
-    """Lines, frame times and means of references are those of the files; small files come first."""
+    """Lines, frame times and means of references are those of the files; small files come first.
+
+    The listing doubles slashes, as a camera does.
+    """
     rng = np.random.default_rng(1)
     lines, dark = rng.integers(0, 4096, (5, 6, 4)), rng.integers(60, 70, (20, 6, 4))
     index = "Frame#\tTimestamp\n" + "".join(f"{number}\t{10_000 * number}\n" for number in range(5))
     names = ("raw_0", "raw_0.hdr", "darkReference", "darkReference.hdr", "frameIndex_0.txt")
     contents = dict(zip((f"/c/{name}" for name in names), (*cube(lines), *cube(dark), index.encode()), strict=True))
-    entries = [f'{{"name": "{name}", "size": {len(data)}, "isDirectory": false}}' for name, data in contents.items()]
+    entries = [
+        f'{{"name": "{name.replace("/c/", "/c//")}", "size": {len(data)}, "isDirectory": false}}'
+        for name, data in contents.items()
+    ]
     pairs = [said("isCapturing", "false"), said('listFiles("/c")', f"[{', '.join(entries)}]")] * 2
     transport = ScriptedTransport(pairs, FakeClock(), b"hpi> ")
     with served(ScriptedFiles(contents)) as server:
@@ -95,7 +101,7 @@ def test_a_different_file_of_the_same_name_is_refused() -> None:
                 fetch_files(server, [FILE], kept)
             assert bytes(kept.files[NAME]) == held
         with pytest.raises(RigError, match=r"481 when it was listed; fetch it when the capture has ended"):
-            fetch_files(server, [RemoteFile(NAME, 481, False)], KeptInMemory())
+            fetch_files(server, [RemoteFile(NAME, 481)], KeptInMemory())
 
 
 @pytest.mark.parametrize(
@@ -109,7 +115,7 @@ def test_transfer_of_other_length(size: int, kind: type[RigError], words: str) -
     """A file that is longer or shorter than the server's size is not accepted as complete."""
     files = ScriptedFiles({NAME: RAW}, stated={NAME: size})
     with served(files) as server, pytest.raises(RigError, match=words) as caught:
-        fetch_files(server, [RemoteFile(NAME, None, False)], KeptInMemory())
+        fetch_files(server, [RemoteFile(NAME, None)], KeptInMemory())
     assert type(caught.value) is kind
 
 
@@ -120,7 +126,7 @@ def test_refused_files_are_reported() -> None:
         with pytest.raises(DeviceRefused, match="user and password"):
             log_in(FileServer(server.host, server.port, password="x"))
         with pytest.raises(DeviceRefused, match="whether the file is there"):
-            fetch_files(server, [RemoteFile("/captured/none", 3, False)], KeptInMemory())
+            fetch_files(server, [RemoteFile("/captured/none", 3)], KeptInMemory())
     with pytest.raises(DeviceGone, match="is not there, fell silent"):
         fetch_files(FileServer("127.0.0.1", server.port), [FILE], KeptInMemory(), clock=FakeClock())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -9,10 +10,11 @@ import pytest
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
 from spectralzoom.pipeline.rig.camera import headwall_camera
-from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera, ReplyReader, response_of
+from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
+from spectralzoom.pipeline.rig.camera.headwall_camera import Entry, HeadwallCamera, ReplyReader, response_of
 from spectralzoom.pipeline.rig.device_settings import FileServer, check_times
 from spectralzoom.pipeline.rig.fakes import FakeClock
-from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
+from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
@@ -58,6 +60,7 @@ def test_every_command_is_sent_and_its_reply_read(echo: bool) -> None:
             answer(CAPTURE, b'{"folder": "/captured/f1_0"}'),
             answer(IS_CAPTURING, b"true"),
             answer(b"stopCapture\r", b"true"),
+            answer(b"isCapturing\r", b"false"),
             answer(b'listFiles("/captured/a")\r', listing),
             (b"exit\r", b""),
         ]
@@ -66,8 +69,7 @@ def test_every_command_is_sent_and_its_reply_read(echo: bool) -> None:
         assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
         assert control.is_capturing()
         control.stop()
-        files = [(file.name, file.size, file.folder) for file in control.list_files("/captured/a")]
-        assert files == [("/captured/a/b", None, True), ("/captured/a/raw_0", 12, False)]
+        assert control.references("/captured/a", KeptInMemory()) == {}  # of a folder without dark and white
         control.close()
 
 
@@ -89,12 +91,12 @@ def test_a_late_reply_is_not_taken_for_the_next_one() -> None:
 @pytest.mark.parametrize(
     ("reply", "hello", "words"),
     [
-        (b"Segmentation fault\r\nhpi> ", HELLO, "expected JSON"),
-        (said(IS_CAPTURING, b"7"), HELLO, "expected true or false from the camera, got 7"),
-        (b'{"response": true}\r\nhpi> ', HELLO, "expected JSON with success true or false"),
-        (b"{]\r\nhpi> ", HELLO, "expected JSON"),
-        (b"isCapturing\r\n{", HELLO, r"within 5 s .*14 bytes came"),
-        (None, b"SSH-2.0\r\n", "no reply 'hpi> ' to the greeting .*; is it the camera's control port"),
+        (b"Segmentation fault\r\nhpi> ", HELLO, "Segmentation fault.*: Invalid JSON"),
+        (said(IS_CAPTURING, b"7"), HELLO, "Input should be a valid boolean; is this the camera"),
+        (b'{"response": true}\r\nhpi> ', HELLO, "Field required"),
+        (b"{]\r\nhpi> ", HELLO, "Invalid JSON"),
+        (b"isCapturing\r\n{", HELLO, r"within 5 s .*14 other bytes came"),
+        (None, b"SSH-2.0\r\n", "no answer to the greeting .*SSH-2.0.*; is it the camera's control port"),
     ],
 )
 def test_invalid_replies_are_reported(
@@ -119,14 +121,23 @@ def test_a_refused_capture_did_not_begin() -> None:
 def test_a_capture_without_a_reply_is_sent_once() -> None:
     """Stopping still works afterwards."""
     with talk([(CAPTURE, b"")], [(b"stopCapture\r", said(b"stopCapture\r", b"true"))]) as control:
-        with pytest.raises(StateUnknown, match=r"capture \(prefix 'f1'\) was sent and its reply is lost: no reply"):
+        with pytest.raises(StateUnknown, match=r"capture was sent to scripted and may have happened or not: no answer"):
             control.capture(500, prefix="f1")
         control.stop()
 
 
+def test_a_connection_that_the_camera_ended_is_made_again() -> None:
+    """Nothing of the capture was sent on the old one, so that it begins on a new one."""
+    first = [(IS_CAPTURING, [said(IS_CAPTURING, b"false"), DeviceGone("closed by the other end")])]
+    with talk(first, [(CAPTURE, said(CAPTURE, b'{"folder": "/captured/f1_0"}'))]) as control:
+        assert not control.is_capturing()
+        assert control.capture(500, prefix="f1").folder == "/captured/f1_0"
+
+
 def test_stale_bytes_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
     """Bytes that arrive before a command are dropped and not taken for its reply."""
-    torn = said(IS_CAPTURING, b"false") + said(IS_CAPTURING, b"true")[:20]
+    caplog.set_level(logging.INFO)
+    torn = [said(IS_CAPTURING, b"false"), said(IS_CAPTURING, b"true")[:20]]
     with talk([(IS_CAPTURING, torn), (IS_CAPTURING, said(IS_CAPTURING, b"false"))]) as control:
         assert not control.is_capturing()
         assert not control.is_capturing()
@@ -162,7 +173,7 @@ def test_implausible_exposure_times_are_refused(exposure: float, period: float, 
 def test_every_form_of_a_reply_is_parsed(data: bytes) -> None:
     """Replies come with or without the command, on one line or several, and with bytes of a telnet server."""
     (reply,) = ReplyReader().feed(data)
-    assert response_of(reply, "it", "here") == 1
+    assert response_of(reply, "it", "here", int) == 1
 
 
 def test_other_text_before_a_prompt_is_separated() -> None:
@@ -183,3 +194,22 @@ def test_bytes_without_a_prompt_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(headwall_camera, "LONGEST_REPLY", 100)
     with pytest.raises(RigError, match=r"bytes came without a prompt .* is this the camera's control port"):
         ReplyReader().feed(b"x" * 101)
+
+
+def test_a_listing_has_files_and_folders() -> None:
+    """A folder has no size; other responses are refused."""
+    file, folder = (
+        '{"name": "/c/raw_0", "size": 12, "mtime": 1.5, "isDirectory": false}',
+        '{"name": "/c/b", "isDirectory": true}',
+    )
+
+    def listed(response: str) -> list[Entry]:
+        return response_of(f'{{"success": true, "response": {response}}}', "listFiles", "here", list[Entry])
+
+    assert [(one.name, one.size, one.is_folder) for one in listed(f"[{file}, {folder}]")] == [
+        ("/c/raw_0", 12, False),
+        ("/c/b", None, True),
+    ]
+    for other in ("7", "[7]", '[{"name": 7}]', '[{"name": "/c/raw_0", "size": "12"}]', "null"):
+        with pytest.raises(RigError, match=r"here answered listFiles with .*is this the camera's control port"):
+            listed(other)

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.rig import capture_paths
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
-from spectralzoom.pipeline.rig.camera.frame_indices import LineTimes
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
 def test_the_prefix_of_a_sweep_is_readable() -> None:
     """Short numbers appear unchanged, with p for the decimal point."""
     sweep = Sweep("coarse-0", "coarse", "y", -31.5, 0.5, 96, 16, 16)
-    assert capture_paths.capture_prefix(sweep) == "coarse-0_cy-31p5_0p5_96x16x16_0"
+    assert capture_paths.capture_prefix(sweep) == "coarse-0_coarse_y_-31p5_0p5_96_16_16_0_0"
 
 
 def test_a_sweep_is_recovered_from_its_prefix() -> None:
@@ -37,7 +37,8 @@ def test_a_sweep_is_recovered_from_its_prefix() -> None:
 
 @pytest.mark.parametrize(
     "prefix",
-    ["", "field", capture_paths.REFERENCES, "a_cx0_0_0x1x1_0", "a_cx0_0_5x1x1_5", "a_cz0_0_5x1x1_0", "a_cx0_0_5x1_0"],
+    ["", "field", capture_paths.REFERENCES]
+    + [f"a_coarse_{rest}" for rest in ("x_0_0_0_1_1_0_0", "x_0_0_5_1_1_0_5", "z_0_0_5_1_1_0_0", "x_0_0_5_1_0_0")],
 )
 def test_other_prefixes_announce_nothing(prefix: str) -> None:
     """Prefixes that others chose, and those of impossible sweeps, give no sweep."""

@@ -9,9 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spectralzoom.pipeline.errors import RigError
+from spectralzoom.pipeline.frame_indices import LineTimes
+from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
-from spectralzoom.pipeline.rig.capture_paths import FrameTimes, LinePositions, positions_by_time
+from spectralzoom.pipeline.rig.capture_paths import (
+    CaptureRecord,
+    LinePositions,
+    UnusableCaptureError,
+    positions_by_time,
+)
 
 LINES = 400
 PERIOD_MS = 10.0
@@ -21,17 +27,25 @@ MIDDLE = np.stack([0.1 * np.sin(np.arange(LINES) / 300), 0.4 * np.arange(LINES) 
 AT_ONCE = (10.0, 10.0)
 
 
-def frames(count: int = LINES, drift: float = 0.0) -> FrameTimes:
+def frames(count: int = LINES, drift: float = 0.0) -> LineTimes:
     """Return frames, stamped by a camera clock that is slow by ``drift``."""
     stamp = 1_700_000_000_000_000 + np.rint(np.arange(count) * PERIOD_MS / (1 + drift) * 1e3).astype(np.int64)
-    return FrameTimes(np.arange(count), stamp, PERIOD_MS)
+    return LineTimes(np.arange(count), stamp)
 
 
 def located(
-    told: FrameTimes, run_s: tuple[float, float] = AT_ONCE, capture_s: tuple[float, float] = AT_ONCE
+    told: LineTimes,
+    run_s: tuple[float, float] = AT_ONCE,
+    capture_s: tuple[float, float] = AT_ONCE,
+    *,
+    exposure_ms: float = PERIOD_MS,
+    period_ms: float = PERIOD_MS,
+    step: int = 2,
 ) -> LinePositions:
     """Return the positions of frames on the path."""
-    return positions_by_time(told, MIDDLE, run_s, capture_s, SWEEP, PERIOD_MS)
+    exposed = LineCamera(exposure_ms=exposure_ms, readout_ms=period_ms - exposure_ms)
+    sweep = replace(SWEEP, step=step)
+    return positions_by_time(told, MIDDLE, CaptureRecord(sweep, 0, LINES, "/c", run_s, capture_s), exposed)
 
 
 def at(place: np.ndarray) -> np.ndarray:
@@ -42,8 +56,8 @@ def at(place: np.ndarray) -> np.ndarray:
 def test_lines_of_a_path_in_step_have_its_positions():
     """Stamps in whole microseconds change no bit, as the frames follow their period."""
     for period_ms in (10.0, 9.8765):
-        told = FrameTimes(np.arange(LINES), np.rint(np.arange(LINES) * period_ms * 1e3).astype(np.int64), period_ms)
-        found = positions_by_time(told, MIDDLE, AT_ONCE, AT_ONCE, SWEEP, period_ms)
+        told = LineTimes(np.arange(LINES), np.rint(np.arange(LINES) * period_ms * 1e3).astype(np.int64))
+        found = located(told, exposure_ms=period_ms, period_ms=period_ms)
         np.testing.assert_array_equal(found.position, MIDDLE)
         assert (found.residual_px, found.valid.all()) == (0.0, True)
 
@@ -69,11 +83,11 @@ def test_dropped_frames_do_not_move_other_lines():
     """Other lines keep their positions, whether frame numbers show the gap or only time stamps do."""
     whole = frames(drift=DRIFT)
     kept = np.concatenate([np.arange(50), np.arange(53, LINES)])
-    numbered = replace(whole, number=whole.number[kept], stamp_us=whole.stamp_us[kept])
+    numbered = replace(whole, frame=whole.frame[kept], stamp_us=whole.stamp_us[kept])
     found = located(numbered)
     np.testing.assert_allclose(found.position, MIDDLE[kept], atol=1e-4)
     assert "3 frames are missing between the lines" in found.notes
-    found = located(replace(numbered, number=np.arange(len(kept))))
+    found = located(replace(numbered, frame=np.arange(len(kept))))
     np.testing.assert_allclose(found.position, MIDDLE[kept], atol=1e-4)
 
 
@@ -90,7 +104,7 @@ def test_lines_beyond_the_path_are_invalid():
 
 def test_frames_without_time_stamps_follow_their_period():
     """A note says that no line has a time stamp."""
-    found = located(FrameTimes(np.arange(LINES), np.full(LINES, -1), PERIOD_MS))
+    found = located(LineTimes(np.arange(LINES), np.full(LINES, -1)))
     np.testing.assert_array_equal(found.position, MIDDLE)
     assert "no line has a time stamp: frames are taken to follow their period" in found.notes
 
@@ -98,25 +112,24 @@ def test_frames_without_time_stamps_follow_their_period():
 def test_missing_time_stamps_make_lines_invalid():
     """Lines without a stamp or number are invalid, the others stay right. Stamps that go back are refused."""
     whole = frames()
-    stamp, number = whole.stamp_us.copy(), whole.number.copy()
+    stamp, number = whole.stamp_us.copy(), whole.frame.copy()
     stamp[200:210], number[:5] = -1, -1
-    found = located(replace(whole, stamp_us=stamp, number=number))
+    found = located(replace(whole, stamp_us=stamp, frame=number))
     np.testing.assert_array_equal(found.position[found.valid], MIDDLE[found.valid])
     assert np.flatnonzero(~found.valid).tolist() == [*range(5), *range(200, 210)]
     stamp[300:] -= 1_000_000
-    with pytest.raises(RigError, match="the time stamps of its frames go back"):
+    with pytest.raises(UnusableCaptureError, match="the time stamps of its frames go back"):
         located(replace(whole, stamp_us=stamp))
 
 
 def test_dropped_first_frames_do_not_move_the_lines():
     """Lines that begin with frame 50 lie half a second after the capture's start."""
     whole = frames()
-    found = located(replace(whole, number=whole.number[50:], stamp_us=whole.stamp_us[50:]))
+    found = located(replace(whole, frame=whole.frame[50:], stamp_us=whole.stamp_us[50:]))
     np.testing.assert_array_equal(found.position, MIDDLE[50:])
 
 
 def test_a_short_exposure_sees_the_first_held_positions():
     """Held positions fill the frame period; the stated error has what an exposure of half of it misses."""
-    sweep = replace(SWEEP, step=4)
-    found = positions_by_time(frames(), MIDDLE, AT_ONCE, AT_ONCE, sweep, PERIOD_MS / 2)
+    found = located(frames(), exposure_ms=PERIOD_MS / 2, step=4)
     assert found.residual_px == 0.75

@@ -11,7 +11,7 @@ import pytest
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.rig.camera.camera_files import NOT_LOGGED_IN, KeptInMemory
 from spectralzoom.pipeline.rig.capture_runner import JOURNAL
-from spectralzoom.pipeline.rig.transports import DeviceGone, DeviceRefused, StateUnknown
+from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from spectralzoom.pipeline.source import Line
 from tests.pipeline.rig.small_rig import FINE, SmallRig, assert_simulated
 
@@ -68,7 +68,7 @@ def test_truncated_cubes_are_captured_again_from_the_first_missing_line(cuts: li
     assert [one["first"] for one in source.record["captures"]] == begun
 
 
-@pytest.mark.parametrize("mark", [b'"what": "positions"', b"origin"])
+@pytest.mark.parametrize("mark", [b'"residual_px": 0', b"origin"])
 def test_a_capture_is_used_after_the_process_is_killed(mark: bytes):
     """The process is killed before the positions are recorded, or a line is returned."""
     rig = SmallRig()
@@ -120,6 +120,20 @@ def test_files_that_cannot_be_fetched_cost_no_capture(error: RigError):
         list(rig.source(kept).lines(FINE))
     assert_same(list(rig.source(kept).lines(FINE)))
     assert len(rig.captures) == 1
+
+
+@pytest.mark.parametrize("error", [DeadlinePassed("no answer to halting the path"), DeviceGone("the port went away")])
+def test_lines_of_a_mirror_that_restarted_do_not_count(error: RigError):
+    """It may have stopped anywhere on the path: the next process captures these lines again, and no others."""
+    rig = SmallRig(vector_pairs=9)
+    kept = KeptInMemory()
+    halt = Mock(side_effect=[None, error, None, None])
+    rig.mirror.halt = halt  # type: ignore[method-assign]
+    with pytest.raises(type(error)):
+        list(rig.source(kept).lines(FINE))
+    source = rig.source(kept)
+    assert_same(list(source.lines(FINE)))
+    assert [(one["first"], "spent" in one) for one in source.record["captures"]] == [(0, False), (9, True), (9, False)]
 
 
 def test_a_full_camera_ends_the_sweep_at_once():
@@ -219,16 +233,18 @@ def test_a_late_run_command_moves_the_lines():
 
 
 def test_a_damaged_journal_costs_one_capture():
-    """A capture whose record changed is captured again, and the damage is in the record of the rig."""
+    """A capture of which every record changed is captured again, and the damage is in the record of the rig."""
     rig = SmallRig()
     kept = KeptInMemory()
     list(rig.source(kept).lines(FINE))
-    at = bytes(kept.files[JOURNAL]).index(b'"what": "capture"')
-    kept.files[JOURNAL][at + 3] ^= 1
-    source = rig.source(kept)
-    assert_same(list(source.lines(FINE)))
-    assert len(rig.captures) == 2
-    assert "is ignored: it has changed" in source.record["journal"][0]
+    content = bytes(kept.files[JOURNAL])
+    records = [at for at in range(len(content)) if content.startswith(b'"what": "capture"', at)]
+    for count, at in enumerate(records, 1):  # of the capture, and of the positions of its lines
+        kept.files[JOURNAL][at + 3] ^= 1
+        source = rig.source(kept)
+        assert_same(list(source.lines(FINE)))
+        assert len(rig.captures) == 1 + (count == len(records))
+    assert "is ignored: it is torn or has changed" in source.record["journal"][0]
 
 
 def test_references_that_are_gone_are_taken_again():

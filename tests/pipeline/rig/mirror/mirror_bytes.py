@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 from spectralzoom.pipeline.rig.device_settings import SurveyRig
 from spectralzoom.pipeline.rig.mirror_controller import MirrorController
-from spectralzoom.pipeline.rig.pro_mode import Frame, float_cell
+from spectralzoom.pipeline.rig.pro_mode import Frame
 from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 
@@ -17,7 +18,7 @@ def pair(sent: str, received: str) -> Pair:
 
 def set_value(register: int, value: float) -> Frame:
     """Return a frame that sets one register, which the driver never sends."""
-    return Frame(0x10, register.to_bytes(2, "big") + float_cell(value))
+    return Frame(0x10, register.to_bytes(2, "big") + struct.pack(">f", value))
 
 
 def get_value(register: int) -> Frame:

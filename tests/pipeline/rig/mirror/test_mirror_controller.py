@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from spectralzoom.pipeline.errors import PoseError, RigError, SettingsError, ShapeError
-from spectralzoom.pipeline.rig import mirror_controller
+from spectralzoom.pipeline.rig import drivers
 from spectralzoom.pipeline.rig.device_settings import SurveyRig
-from spectralzoom.pipeline.rig.mirror_controller import MirrorController, open_mirror
+from spectralzoom.pipeline.rig.mirror_controller import MirrorController
 from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceGone, StateUnknown
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
@@ -21,6 +21,7 @@ WRONG = pair(
     "7E 00 15 05 26 00 00 00 18 4D 59 7E",
     "7E 00 15 18 3F 00 00 00 00 00 00 00 3F 80 00 00 BE 80 00 00 3E 80 00 00 00 00 00 00 82 25 7E",
 )
+BOOT = b"\x00\xffMR-E-2 boot 1.2\r\nready\r\n"
 THERE, LOST = pair(w.GOTO, w.DONE), (bytes.fromhex(w.GOTO), b"")
 Call = Callable[[MirrorController], object]
 
@@ -78,6 +79,27 @@ REFUSED: dict[str, tuple[list[Pair], Call, dict[str, Any], type[Exception], str]
         StateUnknown,
         "went away",
     ),
+    "an acknowledgement of which a second reader took the rest": (
+        [w.WELL, (bytes.fromhex(w.GOTO), bytes.fromhex(w.DONE)[:4])],
+        lambda mirror: mirror.goto(0.5, -0.25),
+        {},
+        StateUnknown,
+        "4 other bytes came",
+    ),
+    "an acknowledgement with a wrong CRC": (
+        [w.WELL, pair(w.GOTO, w.DONE.replace("0C A0", "0C A1"))],
+        lambda mirror: mirror.goto(0.5, -0.25),
+        {},
+        StateUnknown,
+        "may have happened or not: no answer to going to 0.5; -0.25",
+    ),
+    "a controller that restarts while it plays": (
+        [w.HALT, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, pair(w.RUN, w.DONE), (w.HALT[0], BOOT)],
+        lambda mirror: [play(mirror), mirror.halt()],
+        {},
+        DeadlinePassed,
+        "no answer to halting the path .* other bytes came: .*MR-E-2 boot",
+    ),
     "a run that is not acknowledged": (
         [w.HALT, w.LOAD, w.READ_BACK, w.HALT, w.SET_X, w.SET_Y, w.WELL, (bytes.fromhex(w.RUN), b"")],
         play,
@@ -116,26 +138,27 @@ def test_a_path_that_was_not_stored_is_not_played():
 def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
     """Replace the port of the settings by the transport."""
 
-    def opened(port: str, baud: int, clock: object) -> ScriptedTransport:
-        assert (port, baud, clock) == ("/dev/mirror", 256000, transport.clock)
+    def opened(port: str, clock: object) -> ScriptedTransport:
+        assert (port, clock) == ("/dev/mirror", transport.clock)
         return transport
 
-    monkeypatch.setattr(mirror_controller, "SerialTransport", opened)
+    monkeypatch.setattr(drivers, "SerialTransport", opened)
 
 
-SETTINGS = SurveyRig(port="/dev/mirror", baud=256000, with_crc=True)
+SETTINGS = SurveyRig(port="/dev/mirror", with_crc=True)
 
 
 def test_opening_connects_or_releases_the_port(monkeypatch: pytest.MonkeyPatch):
-    """Port and baud rate are those of the settings. Without a controller the port is closed."""
+    """The port is that of the settings. Without a controller the port is closed."""
     silent = (b"START\r\n", b"")
     with scripted(w.CONNECT) as transport:
         give(monkeypatch, transport)
-        with closing(open_mirror(SETTINGS, 1500, transport.clock)) as mirror:
+        with closing(drivers.open_mirror_driver(SETTINGS, 1500, transport.clock)) as mirror:
+            assert isinstance(mirror, MirrorController)
             assert mirror.identity.startswith("MR-E-2,")
         assert transport.closed
     with scripted([*[silent] * 3, (w.LEAVE[0], b""), *[silent] * 3]) as transport:
         give(monkeypatch, transport)
         with pytest.raises(DeadlinePassed):
-            open_mirror(SETTINGS, 1500, transport.clock)
+            drivers.open_mirror_driver(SETTINGS, 1500, transport.clock)
         assert transport.closed

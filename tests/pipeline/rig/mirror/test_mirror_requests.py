@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
+from typing import Any
 
 import pytest
 
 from spectralzoom.pipeline.errors import RigError, SettingsError
-from spectralzoom.pipeline.rig.mirror_controller import ProLink, ask_line, read_done, read_text
+from spectralzoom.pipeline.rig.mirror_controller import ask_frame, ask_line, read_done, read_text
 from spectralzoom.pipeline.rig.pro_mode import cell_int
 from spectralzoom.pipeline.rig.transports import DeadlinePassed, DeviceRefused, Wire
 from tests.pipeline.rig.mirror.mirror_bytes import (
@@ -38,18 +41,21 @@ def wire(transport: ScriptedTransport) -> Wire:
     return Wire(transport, transport.clock)
 
 
-def pro(transport: ScriptedTransport, **settings: bool) -> ProLink:
-    """Return pro mode over the transport; CRCs in the script have to fit."""
-    return ProLink(wire(transport), **{"with_crc": True, **settings})
+Ask = Callable[..., Any]
+
+
+def pro(transport: ScriptedTransport, *, with_crc: bool = True) -> Ask:
+    """Return requests in frames over the transport; CRCs in the script have to fit."""
+    return partial(ask_frame, wire(transport), with_crc=with_crc)
 
 
 def test_pro_mode_sends_every_kind_of_request():
     """A read, a write and a motion have these bytes, and the reply gives this value."""
     with scripted([(ASK, REPLY), (SET, DONE), (SET, DONE)]) as transport:
-        link = pro(transport)
-        assert link.ask(get_value(0x680A), "it", cell_int) == 300
-        link.set(set_value(0x5002, 0.5), "it")
-        link.ask(set_value(0x5002, 0.5), "it", bytes, "motion")
+        ask = pro(transport)
+        assert ask(get_value(0x680A), "it", cell_int) == 300
+        ask(set_value(0x5002, 0.5), "it", bytes, "write")
+        ask(set_value(0x5002, 0.5), "it", bytes, "motion")
 
 
 @pytest.mark.parametrize(
@@ -63,25 +69,25 @@ def test_error_replies_are_reported_in_words(received: str, words: str):
     """The message has the error code in words, the port and the request. The request is not retried."""
     refused = pytest.raises(DeviceRefused, match=f"on scripted refused the place: {words}")
     with scripted([(ASK, bytes.fromhex(received))]) as transport, refused:
-        pro(transport).ask(get_value(0x680A), "the place", cell_int)
+        pro(transport)(get_value(0x680A), "the place", cell_int)
 
 
 def test_a_refused_motion_blocks_nothing():
     """A motion that the device refused did not happen."""
     with scripted([(SET, bytes.fromhex("7E 00 90 04 00 00 01 03 AD 01 7E"))]) as transport:
-        link = pro(transport)
+        ask = pro(transport)
         with pytest.raises(DeviceRefused, match="out of range"):
-            link.ask(set_value(0x5002, 0.5), "it", bytes, "motion")
+            ask(set_value(0x5002, 0.5), "it", bytes, "motion")
 
 
 def test_a_wrong_crc_is_refused(caplog: pytest.LogCaptureFixture):
     """The request is sent again. Without CRC none is sent, and those of replies are not looked at."""
     with scripted([(ASK, WRONG_CRC), (ASK, REPLY)]) as transport:
-        assert pro(transport).ask(get_value(0x680A), "the place", cell_int) == 300
+        assert pro(transport)(get_value(0x680A), "the place", cell_int) == 300
     assert "CRC of an answer to the place does not fit; it is refused" in caplog.text
     caplog.clear()
     with scripted([pair("7E 00 11 02 68 0A 00 00 7E", "7E 00 11 04 00 00 01 2C 00 00 7E")]) as transport:
-        assert pro(transport, with_crc=False).ask(get_value(0x680A), "it", cell_int) == 300
+        assert pro(transport, with_crc=False)(get_value(0x680A), "it", cell_int) == 300
     assert caplog.text == ""
 
 
@@ -91,7 +97,7 @@ def test_data_other_than_the_reply_are_skipped(noise: bytes):
     pieces: list[Reply] = [bytes((byte,)) for byte in noise + REPLY]
     with scripted([(ASK, [noise + REPLY]), (ASK, pieces)]) as transport:
         for _ in range(2):
-            assert pro(transport).ask(get_value(0x680A), "the place", cell_int) == 300
+            assert pro(transport)(get_value(0x680A), "the place", cell_int) == 300
 
 
 def test_simple_mode_reads_replies_to_lines():
@@ -122,7 +128,7 @@ def test_text_replies_are_printable():
     """A reply of NO gives an empty text, and unprintable bytes are refused."""
     assert read_text(b"MR-E-2 ", "GETID", "p") == "MR-E-2"
     assert read_text(b"NO", "GETID", "p") == ""
-    with pytest.raises(RigError, match="port's speed"):
+    with pytest.raises(RigError, match="is this the mirror controller"):
         read_text(b"\x00\x81", "GETID", "p")
 
 

@@ -90,7 +90,8 @@ def test_damaged_frames_are_dropped_and_logged(data: str, caplog: pytest.LogCapt
 
 def test_error_codes_have_words():
     """Known codes have a name and a number, others a number only."""
-    assert pro.format_error(pro.ErrorCode.OUT_OF_RANGE) == "out of range (code 0103)"
+    assert pro.format_error(0x0103) == "out of range (code 0103)"
+    assert pro.format_error(0x0203) == "chain (code 0203)"
     assert pro.format_error(0x7777) == "unknown error (code 7777)"
 
 
@@ -100,9 +101,14 @@ def test_a_wrong_crc_is_reported_with_its_frame():
     assert not found.crc_good
 
 
-def refusal(command: int, code: pro.ErrorCode) -> pro.Frame:
+def cell(value: int) -> bytes:
+    """Return the cell of an integer."""
+    return value.to_bytes(4, "big")
+
+
+def refusal(command: int, code: int) -> pro.Frame:
     """Return the device's reply that refuses a command."""
-    return pro.Frame(command | pro.ERROR_FLAG, pro.int_cell(code))
+    return pro.Frame(command | pro.ERROR_FLAG, cell(code))
 
 
 HALF, MINUS_QUARTER = b"\x3f\x00\x00\x00", b"\xbe\x80\x00\x00"
@@ -117,21 +123,21 @@ REQUESTS = [
 ]
 REPLIES = [
     (pro.Frame(0x01, b"MRE2"), "7E 00 01 04 4D 52 45 32 F5 E9 7E"),
-    (pro.Frame(0x02, pro.int_cell(0x11)), "7E 00 02 04 00 00 00 11 30 2E 7E"),
+    (pro.Frame(0x02, cell(0x11)), "7E 00 02 04 00 00 00 11 30 2E 7E"),
     (pro.Frame(0x06), "7E 00 06 00 03 A0 7E"),
     (pro.Frame(0x10), "7E 00 10 00 0D C0 7E"),
-    (pro.Frame(0x11, pro.int_cell(300)), "7E 00 11 04 00 00 01 2C F2 CC 7E"),
+    (pro.Frame(0x11, cell(300)), "7E 00 11 04 00 00 01 2C F2 CC 7E"),
     (pro.Frame(0x12), "7E 00 12 00 0C A0 7E"),
     (pro.Frame(0x14), "7E 00 14 00 0F 00 7E"),
     (pro.Frame(0x15, HALF + MINUS_QUARTER), "7E 00 15 08 3F 00 00 00 BE 80 00 00 10 D1 7E"),
-    (refusal(0x11, pro.ErrorCode.FRAME_INVALID), "7E 00 91 04 00 00 00 01 2C 81 7E"),
-    (refusal(0x11, pro.ErrorCode.LENGTH_MISMATCH), "7E 00 91 04 00 00 00 03 AD 40 7E"),
-    (refusal(0x11, pro.ErrorCode.CRC_WRONG), "7E 00 91 04 00 00 00 04 EC 82 7E"),
-    (refusal(0x11, pro.ErrorCode.NO_REGISTER), "7E 00 91 04 00 00 01 01 2D 11 7E"),
-    (refusal(0x10, pro.ErrorCode.OUT_OF_RANGE), "7E 00 90 04 00 00 01 03 AD 01 7E"),
-    (refusal(0x10, pro.ErrorCode.READ_ONLY), "7E 00 90 04 00 00 01 06 6D 02 7E"),
-    (refusal(0x14, pro.ErrorCode.VECTOR_INDEX), "7E 00 94 04 00 00 01 07 AD 46 7E"),
-    (refusal(0x12, pro.ErrorCode.CHAIN), "7E 00 92 04 00 00 02 03 AC 13 7E"),
+    (refusal(0x11, 0x0001), "7E 00 91 04 00 00 00 01 2C 81 7E"),
+    (refusal(0x11, 0x0003), "7E 00 91 04 00 00 00 03 AD 40 7E"),
+    (refusal(0x11, 0x0004), "7E 00 91 04 00 00 00 04 EC 82 7E"),
+    (refusal(0x11, 0x0101), "7E 00 91 04 00 00 01 01 2D 11 7E"),
+    (refusal(0x10, 0x0103), "7E 00 90 04 00 00 01 03 AD 01 7E"),
+    (refusal(0x10, 0x0106), "7E 00 90 04 00 00 01 06 6D 02 7E"),
+    (refusal(0x14, 0x0107), "7E 00 94 04 00 00 01 07 AD 46 7E"),
+    (refusal(0x12, 0x0203), "7E 00 92 04 00 00 02 03 AC 13 7E"),
 ]
 
 

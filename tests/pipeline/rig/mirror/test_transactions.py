@@ -89,7 +89,7 @@ def test_a_late_acknowledgement_does_not_answer_the_next_read(caplog: pytest.Log
     pairs: list[Pair] = [(b"m\n", [Late(1.05, b"late\n")]), (b"q\n", b"a\n")]
     with scripted(pairs) as transport, caplog.at_level(logging.INFO):
         wire = make(transport)
-        with pytest.raises(StateUnknown, match="Look at the mirror, then run again, which connects anew"):
+        with pytest.raises(StateUnknown, match=r"Look at the device, .* run again, which connects anew"):
             ask(wire, b"m\n", "motion")
         assert ask(wire) == b"a\n"
     assert "dropped 5 stale bytes" in caplog.text
@@ -124,7 +124,7 @@ def test_stale_bytes_are_dropped_and_logged(caplog: pytest.LogCaptureFixture):
     """Bytes that an earlier session left on the line are no reply."""
     with scripted([(b"q\n", b"a\n")], stale=b"old\n", drained=b"old\n") as transport, caplog.at_level(logging.INFO):
         assert ask(make(transport)) == b"a\n"
-    assert "scripted: dropped 4 stale bytes before asking q: 6f 6c 64 0a" in caplog.text
+    assert "scripted: dropped 4 stale bytes before asking q: b'old\\n'" in caplog.text
 
 
 def test_a_device_that_sends_endlessly_does_not_block():
@@ -141,7 +141,7 @@ def test_a_device_that_sends_endlessly_does_not_block():
 
     transport = Babbling([(b"q\n", b""), (b"r\n", b"")], FakeClock())
     wire = make(transport)
-    with pytest.raises(DeadlinePassed, match=r"other bytes came: 78"):
+    with pytest.raises(DeadlinePassed, match=r"other bytes came: b'xx"):
         ask(wire)
     with pytest.raises(DeadlinePassed, match="r from"):
         ask(wire, b"r\n", "write")
@@ -149,12 +149,12 @@ def test_a_device_that_sends_endlessly_does_not_block():
 
 
 def test_a_motion_that_was_not_sent_is_no_motion():
-    """Without a device the port cannot even be drained, so nothing is sent."""
+    """Without a device the port cannot even be read, so nothing is sent."""
 
     class Gone(ScriptedTransport):
-        """Transport that cannot be drained."""
+        """Transport that cannot be read."""
 
-        def drain(self) -> bytes:
+        def read(self, at_most: int, deadline: float) -> bytes:
             raise DeviceGone("it went away")
 
     with pytest.raises(DeviceGone):

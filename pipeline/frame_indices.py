@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from spectralzoom.pipeline.errors import SceneError
 
 FRAME_INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)  # names of its files
-LONGEST_LINE = 1000  # characters; a frame's line has about 25
 _LARGEST = 2**62
 _WHOLE = re.compile(r"-?\d{1,19}")
 
@@ -44,33 +43,6 @@ class LineTimes:
     def unknown(cls, lines: int) -> LineTimes:
         """Return lines without any time."""
         return cls(np.full(lines, -1), np.full(lines, -1))
-
-    def put(self, start: int, own: LineTimes) -> None:
-        """Fill in the times of one file, whose first line is line ``start``."""
-        stop = start + len(own.frame)
-        self.frame[start:stop], self.stamp_us[start:stop] = own.frame, own.stamp_us
-
-
-def place_parts(parts: Sequence[tuple[str, int, int]], most: int, notes: list[str]) -> list[int]:
-    """Return the first line of each part of a cube, from the parts' names, first frames and numbers of lines.
-
-    Raises SceneError: more than ``most`` lines are in no part.
-    """
-    starts: list[int] = []
-    end = 0
-    missing = 0
-    for name, frame, lines in parts:
-        start = frame - parts[0][1]
-        missing += max(start - end, 0)
-        if missing > most:
-            raise SceneError(f"{missing} lines before {name} are in no file, more than {most}; is it of another cube?")
-        if start > end:
-            notes.append(f"{start - end} lines before {name} are in no file")
-        elif start < end:
-            notes.append(f"{name} begins {end - start} frames before the part before it ends")
-        starts.append(max(start, end))
-        end = starts[-1] + lines
-    return starts
 
 
 def parse_frame_index(lines: Iterable[str], name: str = "the frame index", where: str = "") -> FrameIndex:
