@@ -105,11 +105,8 @@ def _field_shape(
     if stated is not None:
         return stated, ()
     tangents = [np.where(one.valid_line[:, None], one.tangents, np.nan) for one in recording.sweeps]
-    covered = covered_field([one.sweep for one in recording.sweeps], tangents, recording.camera)
-    height, width = (
-        int(size - 2 * abs(off) + EDGE_PX) for size, off in zip(covered.shape, covered.centre_px, strict=True)
-    )
-    y, x = covered.centre_px
+    covered, (y, x) = covered_field([one.sweep for one in recording.sweeps], tangents, recording.camera)
+    height, width = (int(size - 2 * abs(off) + EDGE_PX) for size, off in zip(covered, (y, x), strict=True))
     if min(height, width) < 1:
         raise SceneError(
             f"the field of {where} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction at rest, "
