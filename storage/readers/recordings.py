@@ -64,10 +64,15 @@ def open_recording(
     ArchiveError, IncompleteStoreError, PoseError: the archive or a raw cube cannot be used.
     """
     camera = camera or LineCamera()
-    stores = find_raw_cubes(address)
+    path = Path(address)
+    if (of_archive := _run_with_cubes(address)) is not None:
+        stores = of_archive[2]
+    else:
+        beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
+        stores = [one for one in beside if _is_raw_cube(one)]
     flags = {"pointing": pointing, "dark": dark, "white": white, "wavelengths": wavelengths}
-    if stores is None:
-        paths = find_cubes(Path(address))
+    if not stores:
+        paths = find_cubes(path)
         opened = [open_file_cube(one, wavelengths, {"dark": dark, "white": white}) for one in paths]
         cubes = [_point(one, pointing, mounting, len(paths) == 1) for one in opened]
         return _recording_of(dict(zip(paths, cubes, strict=True)), camera, white_reference)
@@ -288,18 +293,6 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera) -
     return filled, notes
 
 
-def find_raw_cubes(address: str | Path) -> list[Path] | None:
-    """Return the raw cubes of an address, sorted by name; None if it has none.
-
-    Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
-    """
-    path = Path(address)
-    if (of_archive := _run_with_cubes(address)) is not None:
-        return of_archive[2]
-    beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
-    return [one for one in beside if _is_raw_cube(one)] or None
-
-
 def _is_raw_cube(path: Path) -> bool:
     """Return whether a folder is a store of a survey's lines."""
     with suppress(IncompleteStoreError):
@@ -310,7 +303,7 @@ def _is_raw_cube(path: Path) -> bool:
 def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None, GeoBox | None] | None:
     """Return the run of an address, and size (y, x) and place of its field, if known; None if it is no archive's.
 
-    Raises SceneError, ArchiveError: as `find_raw_cubes`.
+    Raises SceneError: there is no such file; ArchiveError: the archive has no such run, or none with raw cubes.
     """
     if (found := _run_with_cubes(address)) is None:
         return None
