@@ -106,7 +106,7 @@ def rig_source(settings: Settings, name: str, simulated: SimulatedSource, hold: 
         FetchedFiles,
         rig=replace(rig, white_reference=round(float(scene.white_reference.mean()), 6)) if fake else rig,
         vector_pairs=settings.cost.vector_pairs,
-        field=name,
+        field_name=name,
         seen=simulated if fake else None,
         say=current_observer().say,
     )

@@ -13,8 +13,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +47,7 @@ LOG = logging.getLogger(__name__)
 BARREN = 2  # captures in a row without a line, after which a sweep fails
 
 
+@dataclass(eq=False)
 class RigSource:
     """A :class:`pipeline.source.Source` over a rig, the devices of which are connected when they are first needed.
 
@@ -56,31 +56,19 @@ class RigSource:
     continues its captures. ``say`` gets the present step while no line comes: upload, capture or transfer.
     """
 
+    camera: LineCamera
+    wavelength_nm: NDArray[np.float64]
+    open_devices: Callable[[SimulatedSource | None], RigDevices]
+    keep: Callable[[Path], Kept] = lambda folder: KeptInMemory()
+    rig: SurveyRig = field(default_factory=SurveyRig)
+    vector_pairs: int = 1500
+    field_name: str = ""
+    seen: SimulatedSource | None = None
+    say: Say = lambda step: None
+    unknown: list[str] = field(default_factory=list)  # why the rig's state is unknown; shared by copies of this source
     name = "rig"
 
-    def __init__(
-        self,
-        camera: LineCamera,
-        wavelength_nm: NDArray[np.float64],
-        open_devices: Callable[[SimulatedSource | None], RigDevices],
-        keep: Callable[[Path], Kept] = lambda folder: KeptInMemory(),
-        *,
-        rig: SurveyRig | None = None,
-        vector_pairs: int = 1500,
-        field: str = "",  # name of the field
-        seen: SimulatedSource | None = None,
-        say: Say = lambda step: None,
-    ) -> None:
-        self.camera = camera
-        self.wavelength_nm = wavelength_nm
-        self.rig = SurveyRig() if rig is None else rig
-        self.vector_pairs = vector_pairs
-        self.field = field
-        self.seen = seen
-        self._open = open_devices
-        self._keep = keep
-        self._say = say
-        self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
+    def __post_init__(self) -> None:
         self._use(KeptInMemory())
 
     def _use(self, kept: Kept) -> None:
@@ -95,7 +83,7 @@ class RigSource:
         """Return field, white reference and mounting; of a fake camera also what its scene depends on."""
         white = {"white_reference": self.rig.white_reference, "white_at_rest": self.rig.white_at_rest}
         seen = {} if self.seen is None else self.seen.key
-        return {"field": self.field, **white, "mounting": self.rig.mounting, **seen}
+        return {"field": self.field_name, **white, "mounting": self.rig.mounting, **seen}
 
     @property
     def effects(self) -> Sequence[Effect]:
@@ -113,13 +101,11 @@ class RigSource:
 
     def with_effects(self, chosen: Chosen, clock: Mapping[str, float]) -> RigSource:
         """Return the same rig, before the fake camera of which the scene has these effects."""
-        other = copy(self)
-        other.seen = None if self.seen is None else self.seen.with_effects(chosen, clock)
-        return other
+        return replace(self, seen=None if self.seen is None else self.seen.with_effects(chosen, clock))
 
     def keeping(self, kept: Kept) -> RigSource:
         """Return the same rig with its files elsewhere."""
-        other = copy(self)
+        other = replace(self)
         other._use(kept)
         return other
 
@@ -129,7 +115,7 @@ class RigSource:
 
         Raises as `session`.
         """
-        source = self.keeping(self._keep(kept))
+        source = self.keeping(self.keep(kept))
         with source.session():
             yield source
         (kept / RECORD).write_text(json.dumps(source.record, indent=1) + "\n")
@@ -141,16 +127,16 @@ class RigSource:
         Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one answers. Raises
         StateUnknown where a motion or capture of an earlier session was not acknowledged.
         """
-        if self._unknown:
-            raise StateUnknown(f"the rig gets no further command: {self._unknown[0]}; look at it, then run again")
-        devices = self._open(self.seen) if self._runner is None else None
+        if self.unknown:
+            raise StateUnknown(f"the rig gets no further command: {self.unknown[0]}; look at it, then run again")
+        devices = self.open_devices(self.seen) if self._runner is None else None
         try:
             if devices is not None:
-                self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self._say)
+                self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self.say)
             assert self._runner is not None
             yield self._runner
         except StateUnknown as error:
-            self._unknown.append(str(error))
+            self.unknown.append(str(error))
             raise
         finally:
             if devices is not None:
@@ -236,7 +222,7 @@ class RigSource:
         whole, notes = as_references(dark, white, white_reference=self.rig.white_reference, exposure_ms=exposure_ms)
         self._check_size(whole.dark.shape, folder)
         for note in (*notes, *full_scale_notes(whole.white, self.camera.full_scale_dn)):
-            self._say(note)
+            self.say(note)
         return whole
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
@@ -245,7 +231,7 @@ class RigSource:
             captured = runner.devices.camera.fetch(
                 taken.folder,
                 self._kept,
-                lambda _, held, size: self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
+                lambda _, held, size: self.say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
             )
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a full disk: the capture is in order
