@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from spectralzoom.flows.frame import FieldFrame, FieldLabels, FieldView
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
+from spectralzoom.flows.tasks.observer import current_observer
 from spectralzoom.flows.tasks.patch_budget import SHARD
 from spectralzoom.flows.tasks.prior_maps import AUTO, NONE, Prior, find_prior
-from spectralzoom.flows.tasks.recorded_field import OpenedRecording, open_recorded
+from spectralzoom.flows.tasks.recorded_field import open_recorded, recorded_scene
+from spectralzoom.flows.tasks.rig_field import RigHold, rig_source
 from spectralzoom.flows.tasks.scene import (
-    FieldSource,
-    SimulatedField,
     check_labels,
     check_scene_there,
     farm_refusal,
@@ -35,7 +35,7 @@ from spectralzoom.models.network.machine import choose_device
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.reading.regions import Region, plan_regions
 from spectralzoom.models.weights.files import Description, ReaderPart, Weights
-from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.capture.recorded import Recording
 from spectralzoom.pipeline.errors import SceneError, SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -46,6 +46,7 @@ from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import Source
 from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.readers.open_cubes import load_labels_array
 from spectralzoom.storage.readers.scene_files import RasterPixels, SceneFile
@@ -59,13 +60,13 @@ class Field:
 
     settings: Settings
     scene: RasterScene
-    source: FieldSource
+    source: Source | None  # None of a raster, which needs no capture
     simulated: SimulatedSource  # without effects; for a rig, a model of its sizes, paths and memory
     model: SurveyModel
     grid: SceneGrid
     zones: SurveyZones
     labels: FieldLabels
-    recorded: RecordedPasses | None  # of recorded sweeps
+    hold: RigHold  # keeps other surveys from the rig
     raster: RasterPixels | None  # of a scene that needs no capture
     prior: Prior | None  # prior map
     notes: tuple[str, ...]
@@ -86,6 +87,16 @@ class Field:
     def camera(self) -> LineCamera:
         """Return the camera of the settings, or of the recording."""
         return self.settings.camera
+
+    @property
+    def recorded(self) -> Recording | None:
+        """Return the source of lines where it is a recording."""
+        return self.source if isinstance(self.source, Recording) else None
+
+    @property
+    def simulates(self) -> bool:
+        """Return whether a scene is simulated, so that effects are chosen for it."""
+        return self.source is not None and bool(self.source.effects)
 
     @property
     def described(self) -> Description:
@@ -109,8 +120,9 @@ class Field:
 
     @property
     def view(self) -> FieldView:
-        """Return what the camera sees."""
-        return view_of(self.settings, self.scene, self.source, self.name)
+        """Return what the camera sees. A raster has no camera."""
+        assert self.source is not None
+        return view_of(self.settings, self.scene, self.source)
 
     @property
     def frame(self) -> FieldFrame:
@@ -148,8 +160,9 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     """
     settings = scene_of_visit(for_rig(settings), datetime.now().astimezone())
     check_scene_there(settings.scene)
-    recorded = open_recorded(settings) if settings.source == RECORDED else None
-    settings = settings if recorded is None else recorded.settings
+    recording = None
+    if settings.source == RECORDED:
+        settings, recording = open_recorded(settings)
     settings = settings.but(device=choose_device(settings.device))
     model = (
         SurveyModel.unread()
@@ -159,7 +172,7 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    pixels, scene, notes = _scene_for(model, settings, recorded, planning=planning)
+    pixels, scene, notes = _scene_for(model, settings, recording, planning=planning)
     grid = SceneGrid(*scene.shape, model.described.config.patch)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
@@ -177,19 +190,20 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     if settings.prior != AUTO:  # a receipt names the run
         settings = settings.but(prior=NONE if prior is None else prior.run)
     simulated = make_source(scene, settings)
+    hold = RigHold(settings.rig.port if settings.on_hardware else None, current_observer().note)
     return Field(
         settings=settings,
         scene=scene,
-        source=_source(settings, scene, simulated, recorded),
+        source=open_source(settings, name, simulated, recording, hold),
         simulated=simulated,
         model=model,
         grid=grid,
         zones=zones,
         labels=FieldLabels(
             Once(lambda: judged_labels(scene, model.described)),
-            scene.key if settings.scene in BUILT_IN_SCENES and recorded is None else None,
+            scene.key if settings.scene in BUILT_IN_SCENES and recording is None else None,
         ),
-        recorded=None if recorded is None else RecordedPasses(recorded.field.source),
+        hold=hold,
         raster=raster,
         prior=prior,
         notes=(*notes, *zones.notes, *prior_notes, *training_note(outside, model.path), *label_notes),
@@ -199,16 +213,15 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
 
 
 def _scene_for(
-    model: SurveyModel, settings: Settings, recorded: OpenedRecording | None, *, planning: bool
+    model: SurveyModel, settings: Settings, recording: Recording | None, *, planning: bool
 ) -> tuple[SceneFile | None, RasterScene, tuple[str, ...]]:
     """Open a scene that the weights can read; drawn unless for ``planning``.
 
     Returns the file of a raster or None, the scene, and notes on it.
     """
     pixels = None
-    if recorded is not None:
-        scene, notes = recorded.scene()
-        scene = scene.in_light(settings.sky.fraction_of_clear)
+    if recording is not None:
+        scene, notes = recorded_scene(settings, recording)
     elif settings.is_map:
         pixels, scene, notes = open_map(settings)
     else:
@@ -230,31 +243,20 @@ def _scene_for(
     return pixels, scene, notes
 
 
-def _source(
-    settings: Settings, scene: RasterScene, simulated: SimulatedSource, recorded: OpenedRecording | None
-) -> FieldSource:
-    """Return the source of lines; that of a raster has none."""
-    if recorded is not None:
-        return recorded.field
+def open_source(
+    settings: Settings, name: str, simulated: SimulatedSource, recording: Recording | None, hold: RigHold
+) -> Source | None:
+    """Return the source of the lines of the field ``name``, which is not opened; None of a raster."""
     if settings.is_map:
-        return FieldSource()
+        return None
     if settings.source == RIG:
-        from spectralzoom.flows.tasks.rig_field import rig_field  # imports pyserial
-
-        return rig_field(scene, settings, simulated)
-    return SimulatedField(simulated)
+        return rig_source(settings, name, simulated, hold)
+    return simulated if recording is None else recording
 
 
-def view_of(settings: Settings, scene: RasterScene, source: FieldSource, name: str) -> FieldView:
-    """Return what the camera sees of a field ``name``."""
-    light = {
-        "source": source.name,
-        "scene": scene.key,
-        "seed": noise_seed(settings),
-        "pointing_px": settings.pointing_px,
-        "visit": settings.visit,
-        **source.key(name),
-    }
+def view_of(settings: Settings, scene: RasterScene, source: Source) -> FieldView:
+    """Return what the camera sees of a scene, or of the field before the source."""
+    light = {"source": source.name, "scene": scene.key, "visit": settings.visit, **source.key}
     return FieldView(settings.camera, scene.wavelength_nm, scene.fwhm_nm, light)
 
 
@@ -270,4 +272,4 @@ def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
     seed = noise_seed(settings)
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, seed=seed)
-    return SimulatedSource(scene, settings.simulated_rig, seed, {}, name=settings.source, pointing=pointing)
+    return SimulatedSource(scene, settings.simulated_rig, seed, {}, pointing=pointing)

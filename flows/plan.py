@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.field import Field
 from spectralzoom.flows.settings.settings import Settings
-from spectralzoom.flows.settings.values import NEVER, PART, WHOLE
+from spectralzoom.flows.settings.values import NEVER, PART, RIG, WHOLE
 from spectralzoom.flows.stages.rectify import tile_budget
 from spectralzoom.flows.stages.score import PatchGains, all_seen
 from spectralzoom.flows.tasks.capture_plan import (
@@ -24,12 +25,14 @@ from spectralzoom.flows.tasks.capture_plan import (
 from spectralzoom.flows.tasks.extent_choice import ExtentChoice, choose_extent
 from spectralzoom.flows.tasks.field_work import FieldWork, WeightsFile
 from spectralzoom.flows.tasks.patch_budget import PatchBudget, ReadingCosts
+from spectralzoom.flows.tasks.rig_field import check_rig
 from spectralzoom.models.network.sizes import MultiplyAdds
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.policies.policies import GLANCING_POLICIES
 from spectralzoom.models.reading.prior_map import EVERY_PX
 from spectralzoom.models.weights.files import CASCADE
+from spectralzoom.pipeline.capture.recorded_passes import recorded_fine_ms, recorded_fine_pass
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
@@ -93,7 +96,7 @@ class SurveyPlan:
         """
         scan = self.scans.best_in_time(self.passes.coarse_s + self.passes.fine_s)
         settings = self.settings
-        judged = settings.controls and settings.accuracy and self.field.source.simulates and self.field.scene.labelled
+        judged = settings.controls and settings.accuracy and self.field.simulates and self.field.scene.labelled
         if not judged or scan is None or (scan == self.scans.chosen and self.field.prior is None):
             return None
         settings = settings.but(
@@ -158,8 +161,12 @@ class SurveyPlan:
             return None
         field = (self.field.grid, self.field.camera, self.settings.cost)
         recorded = self.field.recorded
-        of_recording = () if recorded is None else (recorded.fine_pass, recorded.exposures_ms, recorded.fine_ms)
-        return SecondPass(*field, passes.coarse, passes.full, passes.fine_s, passes.margin_px, *of_recording)
+        planned = SecondPass(*field, passes.coarse, passes.full, passes.fine_s, passes.margin_px)
+        if recorded is None:
+            return planned
+        cut = partial(recorded_fine_pass, recorded)
+        usual_ms = recorded_fine_ms(recorded)
+        return replace(planned, recorded=cut, recorded_ms=recorded.exposures_ms, usual_ms=usual_ms)
 
     @property
     def scan_record(self) -> ScanPerformance | None:
@@ -257,7 +264,8 @@ def plan_survey(opened: Field) -> SurveyPlan:
     layout, extent, settings, notes = _extent(opened)
     scans = choose_uniform_scan(layout, described, opened.model.path, len(opened.scene.wavelength_nm), settings)
     passes, scans, settings, plan_notes = lay_out_passes(layout, scans, described, settings)
-    opened.source.check((*passes.coarse, *passes.full))
+    if settings.source == RIG:
+        check_rig(settings, (*passes.coarse, *passes.full))
     check_memory(opened.simulated, opened.grid, passes, settings.memory, pool_of(settings))
     return SurveyPlan(
         field=opened,

@@ -3,7 +3,7 @@
     @stage("mosaic", version=8)
     def rectify(out: Output, signal: Ref, *, frame: FieldFrame, kernel: Kernel, pool: Unkeyed[WorkerPool]) -> None: ...
 
-    mosaic = rectify(stores, signal, frame=field.frame, kernel="catmull-rom", pool=settings.pool)  # -> Ref
+    mosaic = rectify(stores, signal, frame=field.frame, kernel="catmull-rom", pool=plan.pool)  # -> Ref
 
 In a flow each call is a Prefect task of the stage's name; elsewhere it is a plain call. Arguments that change no byte
 are annotated `Unkeyed`. The stores of a dry run make nothing: they answer with the addresses that stores would have.

@@ -53,14 +53,12 @@ def survey_field(settings: Settings) -> RunRef:
 def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
     """Run the stages of a planned survey and publish its run; returns and raises as `survey_field`."""
     observer = current_observer()
-    field = replace(plan.field, source=plan.field.source.saying(observer.say))
-    plan = replace(plan, field=field)
     archive = Archive.open(plan.settings.out)
     archive.reclaim()  # remove incomplete stores of killed runs
     for note in plan.notes:
         observer.note(note)
-    stores = Stores(archive, name=field.name, watch=observer.watch, log=observer.log, finish=tidy_up)
-    with archive.in_use(), plan.pool.open(), field.source.to_oneself(observer.note):
+    stores = Stores(archive, name=plan.field.name, watch=observer.watch, log=observer.log, finish=tidy_up)
+    with archive.in_use(), plan.pool.open(), plan.field.hold:
         try:
             products = run_stages(stores, plan)
         except SurveyStopped as stopped:
@@ -80,7 +78,7 @@ def run_stages(stores: Stores, plan: SurveyPlan) -> Products:
     """
     field = plan.field
     is_judged = field.scene.labelled and plan.settings.accuracy
-    effects = _effects(stores, plan) if field.source.simulates else None
+    effects = _effects(stores, plan) if field.simulates else None
     first = None
     if field.raster is not None:
         mosaic = _raster_mosaic(stores, plan, field.raster)
@@ -185,6 +183,7 @@ def _accuracy(stores: Stores, plan: SurveyPlan, class_map: Ref, first: Pass | No
 def _first_pass(stores: Stores, plan: SurveyPlan, effects: Ref | None) -> Pass:
     """Capture the first pass, or the uniform scan, and rectify it."""
     field, settings = plan.field, plan.settings
+    assert field.source is not None
     raw = capture_coarse(
         stores,
         effects,
@@ -226,6 +225,7 @@ def _second_pass(
     """Capture the requested lines, and rectify both passes."""
     field, settings = plan.field, plan.settings
     sweeps = [] if request is None else request.sweeps
+    assert field.source is not None
     raw = capture_fine(
         stores,
         attention if request is not None else replace(attention, key=""),  # which leaves the lines open

@@ -1,17 +1,22 @@
-"""Define the interface of sources of raw lines: the rig, the simulator and an archive."""
+"""Define the interface of sources of raw lines: a rig, a recording and a simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
 
+if TYPE_CHECKING:
+    from spectralzoom.pipeline.simulator.effects.effect import Chosen, Effect
+
+RECORD = "rig.json"  # file of a source with facts of its captures
 AT_REST = Sweep("references", "fine", "x", 0.0, 0.0, 1)  # a line for references: mirror at (0, 0), no binning
 
 
@@ -51,23 +56,26 @@ class References:
 
 
 class Source(Protocol):
-    """A source that captures a field line by line."""
+    """Lines of a field, one by one: a rig, a recording or a simulator."""
 
     @property
     def name(self) -> str:
-        """Return its name in the receipt: ``sim``, ``rig``, or an archive's address."""
+        """Return its name in receipts and stores."""
 
     @property
-    def camera(self) -> LineCamera:
-        """Return the camera that takes the lines."""
+    def key(self) -> Mapping[str, Any]:
+        """Return what its light depends on besides scene, visit, camera, bands and sweeps; part of a capture's key."""
 
     @property
-    def wavelength_nm(self) -> NDArray[np.float64]:
-        """Return (band,) centre wavelengths [nm]."""
+    def effects(self) -> Sequence[Effect]:
+        """Return the simulated effects to choose from; empty of a rig and of a recording."""
 
-    @property
-    def field_shape(self) -> tuple[int, int]:
-        """Return the (y, x) size of the field [px]."""
+    def opened(self, kept: Path) -> AbstractContextManager[Source]:
+        """Return the source with its devices connected for the block.
+
+        It may write files into the folder ``kept``, which outlives a killed process; the next one gets it again. Its
+        file `RECORD`, facts of the captures, is stored with their lines.
+        """
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the sweep's lines one by one, from line ``first`` on."""
@@ -75,9 +83,12 @@ class Source(Protocol):
     def references(self, sweep: Sweep) -> References:
         """Return dark and white frames with the sweep's binning."""
 
-    @property
-    def record(self) -> Mapping[str, Any] | None:
-        """Return facts of its captures for their store; None if the effects describe them."""
+
+class SimulatedLight(Source, Protocol):
+    """A source with effects to choose from: a simulator, or a rig whose camera is a fake."""
+
+    def with_effects(self, chosen: Chosen, clock: Mapping[str, float]) -> Source:
+        """Return the source with the chosen effects, and the start of each sweep by its name [s]."""
 
 
 class SweepLines(Protocol):

@@ -21,7 +21,7 @@ from spectralzoom.flows.settings.settings import OF_THE_MACHINE, Settings, load_
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RECORDED, RIG
 from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.recorded_field import open_recorded
+from spectralzoom.flows.tasks.recorded_field import open_recorded, recorded_scene
 from spectralzoom.flows.tasks.scene import open_map, open_scene
 from spectralzoom.flows.tasks.scores import score_of
 from spectralzoom.flows.terminal.figures import counted, format_points, format_seconds
@@ -230,7 +230,7 @@ def _is_there(run: Run, settings: Settings) -> bool:
         return True
     try:
         if settings.source == RECORDED:
-            scene = open_recorded(settings).scene()[0].in_light(settings.sky.fraction_of_clear)
+            scene, _ = recorded_scene(*open_recorded(settings))
         else:
             scene = open_map(settings)[1] if settings.is_map else open_scene(settings)[0]
     except PipelineError:

@@ -20,7 +20,7 @@ from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse
 from spectralzoom.flows.stages.effects import choose_effects, load_manifest
 from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.flows.tasks.observer import tidy_up
-from spectralzoom.flows.tasks.scene import SimulatedField, farm_refusal, open_scene
+from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
 from spectralzoom.flows.terminal.figures import counted, format_bytes, format_seconds
 from spectralzoom.flows.terminal.progress import StageProgress, print_json, stderr
 from spectralzoom.models.network.machine import keep_freed_memory
@@ -100,7 +100,7 @@ def open_simulation(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
 
 def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequence[Sweep]) -> tuple[Ref, Ref]:
     """Choose the effects for these sweeps alone, and capture them; return both stores."""
-    source = SimulatedField(make_source(scene, settings))
+    source = make_source(scene, settings)
     effects = choose_effects(
         stores,
         scene=scene,
@@ -114,7 +114,7 @@ def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequenc
         stores,
         effects,
         request=SweepRequest.of(sweeps, settings.camera, settings.cost),
-        view=view_of(settings, scene, source, settings.name or Path(scene.name).stem),
+        view=view_of(settings, scene, source),
         source=source,
         pool=pool_of(settings),
     )

@@ -22,6 +22,7 @@ from spectralzoom.flows.tasks.scores import MOST_ERROR
 from spectralzoom.flows.terminal.figures import format_points
 from spectralzoom.models.evaluation.expected_scores import expected_counts
 from spectralzoom.models.evaluation.unlike_scenes import UNLIKE
+from spectralzoom.pipeline.capture.recorded_passes import lines_served
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts, patch_pixels
 from spectralzoom.pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
 from spectralzoom.pipeline.ground.georeference import crs_name, pixel_side_m
@@ -114,8 +115,8 @@ def _recording(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any] | None:
         return None
     return {
         "sweeps": str(plan.settings.sweeps),
-        "lines_read": recorded.lines_served([*plan.passes.coarse, *fine.sweeps]),
-        "lines_recorded": sum(int(one.valid_line.sum()) for one in recorded.source.sweeps),
+        "lines_read": lines_served(recorded, [*plan.passes.coarse, *fine.sweeps]),
+        "lines_recorded": sum(int(one.valid_line.sum()) for one in recorded.sweeps),
         "passes_s": plan.passes.coarse_s + fine.seconds,
         "full_scan_s": plan.settings.cost.seconds(plan.passes.full, plan.field.camera),
     }

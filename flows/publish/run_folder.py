@@ -24,7 +24,7 @@ from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, 
 from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
-from spectralzoom.flows.settings.values import KEEP_SIGNAL
+from spectralzoom.flows.settings.values import KEEP_SIGNAL, RASTER
 from spectralzoom.flows.stage import Row, Stores
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
@@ -101,7 +101,7 @@ def make_receipt(
     }  # where there is a table
     return build_receipt(
         survey=field.name,
-        source=field.source.name,
+        source=RASTER if field.source is None else field.source.name,
         scene=field.scene.key,
         seed=plan.settings.seed,
         started=in_seconds(started),

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from itertools import islice
+from typing import cast
 
 import numpy as np
 
 from spectralzoom.flows.frame import FieldView
 from spectralzoom.flows.stage import Output, Unkeyed, stage
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
-from spectralzoom.flows.tasks.scene import FieldSource
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
 from spectralzoom.pipeline.signal.condense import LineStatistics
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
-from spectralzoom.pipeline.source import Line, Source
+from spectralzoom.pipeline.source import RECORD, Line, SimulatedLight, Source
 from spectralzoom.storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHeader
 from spectralzoom.storage.arrays.spool import Spool
 from spectralzoom.storage.parallel.pool import WorkerPool
-from spectralzoom.storage.store import Ref, write_table
+from spectralzoom.storage.store import Ref
 
 RAW, RAW_VERSION = "capture", 15
+KEPT = "source"  # folder of a source's own files within a capture's spool
 MADE_BY = ("pipeline/simulator", "pipeline/rig", "pipeline/capture", "storage/arrays/cubes.py")
-RIG_RECORD = "rig.json"  # record of a rig's captures, beside the cubes
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def capture_coarse(
     *,
     request: SweepRequest,
     view: FieldView,
-    source: Unkeyed[FieldSource],
+    source: Unkeyed[Source],
     pool: Unkeyed[WorkerPool],
 ) -> None:
     """Capture the first pass, or the uniform scan; ``view`` identifies what the source shows."""
@@ -65,7 +66,7 @@ def capture_fine(
     *,
     request: SweepRequest,
     view: FieldView,
-    source: Unkeyed[FieldSource],
+    source: Unkeyed[Source],
     pool: Unkeyed[WorkerPool],
 ) -> None:
     """Capture the second pass, which ``attention`` requests."""
@@ -81,15 +82,17 @@ class SweepRecorder:
     view: FieldView
     pool: WorkerPool
 
-    def take(self, source: FieldSource, request: SweepRequest) -> None:
-        """Capture the sweeps one after the other, and write the record of the source beside their cubes."""
+    def take(self, source: Source, request: SweepRequest) -> None:
+        """Capture the sweeps one after the other, and store the record of the source beside their cubes."""
         lines = sum(one.lines for one in request.sweeps)
         found = SignalStatistics(len(self.view.wavelength_nm), lines * self.view.camera.samples)
         before = 0
         self.out.report(0.0)  # before the first line, which takes a rig some time
-        self.out.spool.mkdir(parents=True, exist_ok=True)
-        lit = source if self.effects is None else source.lit(chosen_effects(self.effects), request.starts_s)
-        with lit.opened(self.out.spool) as opened:
+        kept = self.out.spool / KEPT
+        kept.mkdir(parents=True, exist_ok=True)
+        if self.effects is not None:
+            source = cast(SimulatedLight, source).with_effects(chosen_effects(self.effects), request.starts_s)
+        with source.opened(kept) as opened:
             for sweep in request.sweeps:
 
                 def taken(count: int, before: int = before) -> None:
@@ -97,9 +100,9 @@ class SweepRecorder:
 
                 self._sweep(opened, sweep, found, taken)
                 before += sweep.lines
-            np.savez(self.out.path / STATISTICS, allow_pickle=False, **found.arrays())
-            if opened.record is not None:
-                write_table(self.out.path / RIG_RECORD, opened.record)
+        np.savez(self.out.path / STATISTICS, allow_pickle=False, **found.arrays())
+        if (kept / RECORD).exists():
+            shutil.copyfile(kept / RECORD, self.out.path / RECORD)
 
     def _sweep(self, source: Source, sweep: Sweep, found: SignalStatistics, taken: Callable[[int], None]) -> None:
         """Write the lines of a sweep into spool and cube, one by one."""

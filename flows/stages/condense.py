@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from spectralzoom.flows.frame import FieldFrame
 from spectralzoom.flows.settings.settings import SignalChoice
 from spectralzoom.flows.stage import Output, Report, Unkeyed, stage
-from spectralzoom.flows.stages.capture import RIG_RECORD
 from spectralzoom.pipeline.errors import IncompleteStoreError, SceneError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.readings import MOST_VALUE, readings_alone
@@ -38,6 +37,7 @@ from spectralzoom.pipeline.signal.subspace import (
     with_shared,
 )
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
+from spectralzoom.pipeline.source import RECORD
 from spectralzoom.storage.arrays.cubes import RawCube, SweepHeader, open_raw_cubes, read_statistics
 from spectralzoom.storage.arrays.layout import SHARD_ROWS
 from spectralzoom.storage.arrays.mosaics import MosaicWriter
@@ -106,9 +106,9 @@ def condense(out: Output, passes: Sequence[Ref], camera: LineCamera, signal: Sig
         "saturated": sum(one.saturated for one in done) / max(every, 1),
     }
     write_table(out.path / SIGNAL_RECORD, record)
-    rig_record = passes[0].path / RIG_RECORD
+    rig_record = passes[0].path / RECORD
     if rig_record.is_file():  # the raw lines may be deleted
-        shutil.copyfile(rig_record, out.path / RIG_RECORD)
+        shutil.copyfile(rig_record, out.path / RECORD)
 
 
 def with_shared_directions(

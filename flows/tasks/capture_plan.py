@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import ALWAYS, AUTO, NEVER, RECORDED, WHOLE, parse_extent_runs
 from spectralzoom.models.weights.files import Description
-from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.capture.recorded import Recording
+from spectralzoom.pipeline.capture.recorded_passes import (
+    recorded_fine_ms,
+    recorded_first_pass,
+    recorded_full_scan,
+    sweeps_as_taken,
+)
 from spectralzoom.pipeline.errors import BudgetError, NotRecordedError, PoseError, SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -69,7 +75,7 @@ class PassLayout:
     first_step: int = FIRST_STEP  # line spacing of the first of two passes
     as_taken: bool = False  # use all lines of a recording
     shown: NDArray[np.bool_] | None = None  # (patch,) to capture; None: all, also of a scan that is used as taken
-    recorded: RecordedPasses | None = None  # recording that has the lines
+    recorded: Recording | None = None  # recording that has the lines
 
     @classmethod
     def of(
@@ -77,10 +83,10 @@ class PassLayout:
         settings: Settings,
         grid: SceneGrid,
         shown: NDArray[np.bool_] | None = None,
-        recorded: RecordedPasses | None = None,
+        recorded: Recording | None = None,
     ) -> PassLayout:
         """Return the layout that the settings request."""
-        as_taken = None if recorded is None or not settings.as_taken else recorded.uniform_scan()
+        as_taken = None if recorded is None or not settings.as_taken else sweeps_as_taken(recorded)
         step = None if settings.zooms else settings.scan_step
         return cls(
             grid,
@@ -110,7 +116,7 @@ class PassLayout:
         along, coarse, full = self.sweeps()
         full_s, coarse_s = self.cost.seconds(full, self.camera), self.cost.seconds(coarse, self.camera)
         fine_s = 0.0
-        usual_ms = None if self.recorded is None else self.recorded.fine_ms
+        usual_ms = None if self.recorded is None else recorded_fine_ms(self.recorded)
         whole_s = self.cost.seconds([replace(one, exposure_ms=usual_ms) for one in full], self.camera)
         limit_s = seconds if budget is None else budget * whole_s
         if limit_s is not None:
@@ -162,8 +168,8 @@ class PassLayout:
         scan_passes, full = with_margin(scan_passes, camera, apart), with_margin(full, camera, apart)
         if self.recorded is None:
             return along, scan_passes, full
-        taken = self.recorded.uniform_scan() if self.as_taken else self.recorded.first_pass(scan_passes)
-        return along, taken, self.recorded.full_scan(full)
+        taken = sweeps_as_taken(self.recorded) if self.as_taken else recorded_first_pass(self.recorded, scan_passes)
+        return along, taken, recorded_full_scan(self.recorded, full)
 
     def _overlap(self, step: int) -> float:
         """Return the overlap of neighbouring sweeps that leaves 64 pixels at the greatest pointing error [px]."""
@@ -334,7 +340,7 @@ def choose_first_pass(
         for first_ms in offered_ms:
             first = every_nth(full, first_step, first_ms)
             if layout.recorded is not None:
-                first = layout.recorded.first_pass(first)
+                first = recorded_first_pass(layout.recorded, first)
                 first_ms = exposing(layout.camera, first[0]).exposure_ms
             left_s = seconds - layout.cost.seconds(first, layout.camera)
             if left_s < 0:

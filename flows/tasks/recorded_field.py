@@ -1,33 +1,29 @@
-"""Open the recording of a survey: source of lines, scene, and available passes."""
+"""Open the recording of a survey, and its scene."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from odc.geo.geobox import GeoBox
 
 from spectralzoom.flows.settings.load import merged, nested
 from spectralzoom.flows.settings.rules import OF_THE_PLAN, changed
 from spectralzoom.flows.settings.settings import MOST_STEP, Settings, parse_settings
 from spectralzoom.flows.settings.values import ALWAYS, BUILT_IN_SCENES, RECORDED
-from spectralzoom.flows.tasks.scene import FieldSource, unlit_scene
+from spectralzoom.flows.tasks.scene import unlit_scene
 from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.flows.terminal.figures import known_number
-from spectralzoom.pipeline.capture.recorded import RecordedSource
-from spectralzoom.pipeline.capture.recorded_passes import RecordedPasses
+from spectralzoom.pipeline.capture.recorded import Recording
+from spectralzoom.pipeline.capture.recorded_passes import sweeps_as_taken
 from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
 from spectralzoom.pipeline.errors import SceneError, SettingsError
 from spectralzoom.pipeline.rig.device_settings import OF_THE_LIGHT
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
-from spectralzoom.pipeline.source import Source
-from spectralzoom.storage.readers.recordings import Recording, find_recorded_run, open_recording
+from spectralzoom.storage.readers.recordings import find_recorded_run, open_recording
 from spectralzoom.storage.readers.scene_files import load_field_labels
 from spectralzoom.storage.runs import Run
 from spectralzoom.storage.store import is_archive, stage_key
@@ -66,61 +62,8 @@ def as_its_run(settings: Settings) -> Settings:
     return parse_settings({**stated, **merged(usual, nested(kept))})
 
 
-@dataclass(frozen=True)
-class RecordedField(FieldSource):
-    """Recording as the source of a survey."""
-
-    source: RecordedSource
-    content: Mapping[str, Any]  # identifies its lines
-    name = RECORDED
-
-    def key(self, field: str) -> dict[str, Any]:
-        return {"recording": dict(self.content)}
-
-    def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        return nullcontext(self.source)
-
-
-@dataclass(frozen=True)
-class OpenedRecording:
-    """Recording, and settings with its camera, size and line spacing."""
-
-    settings: Settings
-    recording: Recording
-    field: RecordedField
-    notes: tuple[str, ...]
-    geobox: GeoBox | None  # of the run that captured the lines, if it is of the same field
-
-    def scene(self) -> tuple[RasterScene, tuple[str, ...]]:
-        """Return the field as a scene with size, bands and the labels of the settings, and notes.
-
-        Raises SceneError: the labels are not valid.
-        """
-        height, width = self.field.source.field_shape
-        found = None
-        notes: tuple[str, ...] = ()
-        if self.settings.labels is not None:
-            found, notes = load_field_labels(self.settings.labels, (height, width))
-        scene = unlit_scene(
-            (height, width),
-            self.recording.wavelength_nm,
-            white_e=self.settings.camera.full_scale_e,
-            labels=None if found is None else found.index,
-            name=self.settings.name or (Path(str(self.settings.sweeps).rstrip("/")).stem or RECORDED),
-            key=f"{RECORDED}/{stage_key(RECORDED, 1, self.field.content, [])}/{width}x{height}",
-            white_reference=self.recording.sweeps[0].references.white_reference,
-            fwhm_nm=self.recording.fwhm_nm,
-            class_names=() if found is None else found.names,
-            class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
-            geobox=self.geobox,
-            acquired=self.recording.acquired,
-            pixel_m=self.recording.pixel_m,
-        )
-        return scene, (*self.notes, *notes)
-
-
-def open_recorded(settings: Settings) -> OpenedRecording:
-    """Open the recording of the settings, without reading lines.
+def open_recorded(settings: Settings) -> tuple[Settings, Recording]:
+    """Open the recording of the settings, without reading lines; return it, and the settings with its camera and size.
 
     Settings that are not stated are those of the run that took the lines.
 
@@ -144,9 +87,8 @@ def open_recorded(settings: Settings) -> OpenedRecording:
         mounting=settings.rig.mounting,
     )
     shape, notes = _field_shape(recording, settings.shape, settings.sweeps)
-    source = recording.source(shape)
+    recording = replace(recording, notes=(*recording.notes, *notes))
     camera = recording.camera
-    geobox = None
     if (found := find_recorded_run(str(settings.sweeps))) is not None:  # its full scan has the exposure of its camera
         run, of_run, place = found
         camera = replace(camera, exposure_ms=float(run.settings["camera"]["exposure_ms"]))
@@ -154,20 +96,46 @@ def open_recorded(settings: Settings) -> OpenedRecording:
             raise SettingsError("camera.exposure_ms is for a camera, and recorded lines have their own: leave it out")
         recording = replace(recording, acquired=time_of_visit(run))
         if of_run == shape and settings.pose is None:
-            geobox = place
-            recording = replace(recording, pixel_m=_pixel_of(run))
+            recording = replace(recording, geobox=place, pixel_m=_pixel_of(run))
     settings = settings.but(camera=camera, size=shape[::-1])
     if settings.as_taken:
-        step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
+        step = max(sweep.step for sweep in sweeps_as_taken(recording))
         if step > MOST_STEP:
             raise SceneError(
                 f"the lines of the recording lie {step} px of {recording.camera.ifov_rad * 1e6:.4g} urad apart, and a "
                 f"uniform scan may have up to {MOST_STEP} px between lines; correct the pointing, or "
                 "camera.focal_length_mm"
             )
-    return OpenedRecording(
-        settings, recording, RecordedField(source, recording.key()), (*recording.notes, *notes), geobox
+    return settings, recording
+
+
+def recorded_scene(settings: Settings, recording: Recording) -> tuple[RasterScene, tuple[str, ...]]:
+    """Return the field as a scene with size, bands and the labels of the settings; and notes.
+
+    Raises SceneError: the labels are not valid.
+    """
+    assert settings.size is not None
+    width, height = settings.size
+    found = None
+    notes: tuple[str, ...] = ()
+    if settings.labels is not None:
+        found, notes = load_field_labels(settings.labels, (height, width))
+    scene = unlit_scene(
+        (height, width),
+        recording.wavelength_nm,
+        white_e=settings.camera.full_scale_e,
+        labels=None if found is None else found.index,
+        name=settings.name or (Path(str(settings.sweeps).rstrip("/")).stem or RECORDED),
+        key=f"{RECORDED}/{stage_key(RECORDED, 1, recording.key)}/{width}x{height}",
+        white_reference=recording.sweeps[0].references.white_reference,
+        fwhm_nm=recording.fwhm_nm,
+        class_names=() if found is None else found.names,
+        class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
+        geobox=recording.geobox,
+        acquired=recording.acquired,
+        pixel_m=recording.pixel_m,
     )
+    return scene.in_light(settings.sky.fraction_of_clear), (*recording.notes, *notes)
 
 
 def _pixel_of(run: Run) -> float | None:
@@ -183,11 +151,8 @@ def _field_shape(
     if stated is not None:
         return stated, ()
     tangents = [np.where(one.valid_line[:, None], one.tangents, np.nan) for one in recording.sweeps]
-    covered = covered_field([one.sweep for one in recording.sweeps], tangents, recording.camera)
-    height, width = (
-        int(size - 2 * abs(off) + EDGE_PX) for size, off in zip(covered.shape, covered.centre_px, strict=True)
-    )
-    y, x = covered.centre_px
+    covered, (y, x) = covered_field([one.sweep for one in recording.sweeps], tangents, recording.camera)
+    height, width = (int(size - 2 * abs(off) + EDGE_PX) for size, off in zip(covered, (y, x), strict=True))
     if min(height, width) < 1:
         raise SceneError(
             f"the field of {where} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction at rest, "

@@ -1,4 +1,4 @@
-"""Open the rig of a survey. Imported only for a rig, since drivers import pyserial."""
+"""Open the rig of a survey, and keep other surveys from it."""
 
 from __future__ import annotations
 
@@ -6,55 +6,47 @@ import errno
 import hashlib
 import os
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
-
-import numpy as np
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from spectralzoom.flows.settings.settings import Settings
-from spectralzoom.flows.settings.values import RIG
 from spectralzoom.flows.stage import inside_flow
-from spectralzoom.flows.tasks.scene import FieldSource
+from spectralzoom.flows.tasks.observer import current_observer
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT
 from spectralzoom.pipeline.geometry.scan import Sweep, exposing, sweep_positions
-from spectralzoom.pipeline.rig import drivers
-from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
 from spectralzoom.pipeline.rig.device_settings import FAKE, check_times
-from spectralzoom.pipeline.rig.drivers import RigDevices
-from spectralzoom.pipeline.rig.rig_source import RigSource
-from spectralzoom.pipeline.simulator.effects.effect import Effect
-from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.pipeline.source import Source
 from spectralzoom.storage.arrays.spool import FetchedFiles
-from spectralzoom.storage.store import array_digest
 
-FETCHED = "camera"  # folder within a capture's spool
+if TYPE_CHECKING:
+    from spectralzoom.pipeline.rig.rig_source import RigSource
+
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 LEASE_S = 60  # until a lost process frees that limit
 TRY_S = 10  # between two tries to get it
 
 
 class RigHold:
-    """The rig of this machine, which a survey locks at its first capture until it ends."""
+    """The rig of this machine, which a survey locks at its first capture until the end of the block.
 
-    def __init__(self, port: str | None) -> None:
-        self.port = port  # None: nothing to lock
-        self._held: ExitStack | None = None
-        self._taken = False
-        self._note: Callable[[str], None] = lambda text: None
+    Without a ``port`` there is nothing to lock. ``note`` gets what the survey waits for.
+    """
 
-    @contextmanager
-    def released(self, note: Callable[[str], None]) -> Iterator[None]:
-        """Release the rig when the block ends, if it was taken."""
+    def __init__(self, port: str | None, note: Callable[[str], None]) -> None:
+        self.port = port
         self._note = note
-        with ExitStack() as self._held:
-            yield
-        self._held, self._taken = None, False
+        self._held = ExitStack()
+        self._taken = False
+
+    def __enter__(self) -> RigHold:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
+        self._taken = False
 
     def take(self) -> None:
         """Lock the rig, unless this survey has it. Raises RigError: another survey uses the rig.
@@ -62,7 +54,7 @@ class RigHold:
         Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
         is one.
         """
-        if self._held is None or self._taken or self.port is None:
+        if self._taken or self.port is None:
             return
         while inside_flow():  # signals are handled between tries
             from prefect.concurrency.sync import concurrency
@@ -77,78 +69,45 @@ class RigHold:
         self._taken = True
 
 
-@dataclass(frozen=True)
-class RigField(FieldSource):
-    """Rig of the settings; files of its camera are kept beside the lines."""
+def check_rig(settings: Settings, sweeps: Sequence[Sweep]) -> None:
+    """Check that camera and mirror of a rig allow the sweeps.
 
-    rig: RigSource
-    hold: RigHold
-    name = RIG
-
-    def key(self, field: str) -> dict[str, Any]:
-        rig = self.rig.rig
-        white = {"white_reference": rig.white_reference, "white_at_rest": rig.white_at_rest}
-        bands = {"wavelengths": array_digest(np.asarray(self.rig.wavelength_nm, np.float64))}
-        return {"field": field, **white, **bands} | (
-            {} if rig.mounting == STRAIGHT else {"mounting": asdict(rig.mounting)}
-        )
-
-    def check(self, sweeps: Sequence[Sweep]) -> None:
-        """Check that camera and mirror allow the sweeps.
-
-        Raises SettingsError: the camera does not allow an exposure or frame time; PoseError: the field exceeds the
-        mirror's range.
-        """
-        camera, mounting = self.rig.camera, self.rig.rig.mounting
-        for exposed in {exposing(camera, sweep) for sweep in sweeps} | {camera}:
-            check_times(exposed.exposure_ms, exposed.frame_ms, camera.max_rate_hz)
-        for sweep in sweeps if mounting != STRAIGHT else ():
-            mounting.to_device(sweep_positions(sweep, camera))
-
-    def saying(self, say: Callable[[str], None]) -> RigField:
-        return replace(self, rig=self.rig.saying(say))
-
-    @contextmanager
-    def to_oneself(self, note: Callable[[str], None]) -> Iterator[None]:
-        with self.hold.released(note):
-            yield
-
-    @contextmanager
-    def opened(self, spool: Path) -> Iterator[Source]:
-        self.hold.take()
-        source = self.rig.keeping(FetchedFiles(spool / FETCHED))
-        with source.session():
-            yield source
+    Raises SettingsError: the camera does not allow an exposure or frame time; PoseError: the field exceeds the
+    mirror's range.
+    """
+    camera, mounting = settings.camera, settings.rig.mounting
+    for exposed in {exposing(camera, sweep) for sweep in sweeps} | {camera}:
+        check_times(exposed.exposure_ms, exposed.frame_ms, camera.max_rate_hz)
+    for sweep in sweeps if mounting != STRAIGHT else ():
+        mounting.to_device(sweep_positions(sweep, camera))
 
 
-@dataclass(frozen=True)
-class SimulatedRigField(RigField):
-    """Rig with a fake camera, which sees the light of a simulated scene."""
+def rig_source(settings: Settings, name: str, simulated: SimulatedSource, hold: RigHold) -> RigSource:
+    """Return the rig before the field ``name``, not connected and no driver imported.
 
-    settings: Settings
-    simulated: SimulatedSource
-    simulates = True
+    A fake camera sees what ``simulated`` does, and its white reference.
+    """
+    from spectralzoom.pipeline.rig import drivers  # imports pyserial
+    from spectralzoom.pipeline.rig.rig_source import RigSource
 
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
-        seen = replace(self.simulated, chosen=chosen, clock=clock)
-        return RigField(self.rig.opening(lambda: open_devices(self.settings, seen=seen)), self.hold)
+    rig, scene = settings.rig, simulated.scene
+    fake = rig.camera_driver == FAKE
 
+    def connect(seen: SimulatedSource | None) -> drivers.RigDevices:
+        hold.take()
+        return drivers.open_devices(rig, settings.cost.vector_pairs, seen=seen)
 
-def rig_field(scene: RasterScene, settings: Settings, simulated: SimulatedSource) -> RigField:
-    """Return the rig, not connected and no driver imported. A fake camera sees the scene and its white reference."""
-    fake = settings.rig.camera_driver == FAKE
-    white = float(scene.white_reference.mean()) if fake else settings.rig.white_reference
-    rig = RigSource(
+    return RigSource(
         settings.camera,
         scene.wavelength_nm,
-        scene.shape,
-        lambda: open_devices(settings),
-        KeptInMemory(),
-        rig=replace(settings.rig, white_reference=round(white, 6)),
+        connect,
+        FetchedFiles,
+        rig=replace(rig, white_reference=round(float(scene.white_reference.mean()), 6)) if fake else rig,
         vector_pairs=settings.cost.vector_pairs,
+        field_name=name,
+        seen=simulated if fake else None,
+        say=current_observer().say,
     )
-    hold = RigHold(settings.rig.port if settings.on_hardware else None)
-    return SimulatedRigField(rig, hold, settings, simulated) if fake else RigField(rig, hold)
 
 
 @contextmanager
@@ -173,8 +132,3 @@ def rig_to_oneself(port: str) -> Iterator[None]:
                 f"cannot lock the rig at {port}: {error.strerror}; surveys of a rig need Linux's abstract sockets"
             ) from error
         yield
-
-
-def open_devices(settings: Settings, seen: SimulatedSource | None = None) -> RigDevices:
-    """Connect to mirror and camera, as `pipeline.rig.drivers.open_devices` does. Nothing moves."""
-    return drivers.open_devices(settings.rig, settings.cost.vector_pairs, seen=seen)

@@ -1,4 +1,4 @@
-"""Open the scene of a survey with its labels, and define its source of lines."""
+"""Open the scene of a survey with its labels."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import base64
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,20 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.flows.settings.settings import Settings
-from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, SIM
+from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RIG, RIG_FIELD, SIM
 from spectralzoom.models.weights.files import Description, Weights
 from spectralzoom.pipeline.errors import NoSceneYet, SceneError, SettingsError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
-from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.once import Once
-from spectralzoom.pipeline.simulator.effects.effect import Effect
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_scene
 from spectralzoom.pipeline.simulator.scenes.daylight import sun_elevation_deg
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene, SceneRadiance, SceneRaster, raster_from_values
-from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from spectralzoom.pipeline.source import Source
 from spectralzoom.storage.readers.cube_sources import ONE_FILE, machine_bytes
 from spectralzoom.storage.readers.labels import map_values
 from spectralzoom.storage.readers.open_cubes import split_variable
@@ -299,54 +293,6 @@ def judged_labels(scene: RasterScene, weights: Description | Weights) -> NDArray
 def pack_mask(mask: NDArray[np.bool_]) -> str:
     """Encode a mask for the record of weights: bits, deflated, base64."""
     return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")
-
-
-class FieldSource:
-    """Source of the lines of a survey; the base class is that of a raster, which has no lines."""
-
-    name = RASTER  # in receipts
-    simulates = False  # whether effects are chosen for it
-
-    def key(self, field: str) -> dict[str, Any]:
-        """Return parameters of its light besides scene, camera, seed, sweeps and effects."""
-        return {}
-
-    def check(self, sweeps: Sequence[Sweep]) -> None:
-        """Check that the source can capture these sweeps (SettingsError, PoseError: it cannot)."""
-
-    def saying(self, say: Callable[[str], None]) -> FieldSource:
-        """Return the source with a callback for its state before the first line."""
-        return self
-
-    @contextmanager
-    def to_oneself(self, note: Callable[[str], None]) -> Iterator[None]:
-        """Keep others from the source while the block runs, once it is opened; ``note`` says what it waits for."""
-        yield
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
-        """Return the source with chosen effects, and the start of each sweep by name [s]."""
-        return self
-
-    def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """Open the source; files of the device are kept in ``spool``. Raises SettingsError: it has no lines."""
-        raise SettingsError("a raster has no lines to capture; give --source sim for a simulated capture")
-
-
-@dataclass(frozen=True)
-class SimulatedField(FieldSource):
-    """Simulated rig in front of a scene."""
-
-    source: SimulatedSource
-    name = SIM
-    simulates = True
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
-        """Return the source with these effects."""
-        return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
-
-    def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """Return the simulated source."""
-        return nullcontext(self.source)
 
 
 def for_rig(settings: Settings) -> Settings:

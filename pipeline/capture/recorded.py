@@ -10,19 +10,22 @@ there, and one of them replaces it. So detail between the lines is not averaged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
 from spectralzoom.pipeline.errors import NotRecordedError, SceneError
 from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
-from spectralzoom.pipeline.geometry.scan import Floats, Sweep
+from spectralzoom.pipeline.geometry.scan import Axis, Floats, Sweep, exposing
 from spectralzoom.pipeline.source import Line, References
 
 Numbers = NDArray[np.intp]
@@ -81,19 +84,27 @@ class PickedLines:
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedSource:
-    """A :class:`pipeline.source.Source` over recorded sweeps.
+class Recording:
+    """A :class:`pipeline.source.Source` over recorded sweeps; no line is read before it is asked for.
+
+    ``camera`` has the bits, exposure and period of the recording, and the samples of a line that is not binned. A scan
+    without a mirror has a long focal length, so that lines are parallel.
 
     Raises SceneError: there is no sweep, or a sweep's lines have other samples or bands than the camera and the
     wavelengths.
     """
 
     sweeps: Sequence[RecordedSweep]  # in the order of capture
-    camera: LineCamera  # of the recording, with the samples of a line that is not binned
-    wavelength_nm: NDArray[np.float64]  # (band,)
-    field_shape: tuple[int, int]  # (y, x) [px]
-    notes: Sequence[str] = ()  # assumptions on the recording
+    camera: LineCamera
+    wavelength_nm: Floats  # (band,)
+    fwhm_nm: Floats | None = None  # (band,)
+    notes: tuple[str, ...] = ()  # assumptions
+    light: tuple[str, ...] = ()  # identity of the numbers: hashes of manifests, or sizes and times of files
+    acquired: str | None = None  # when the first lines were captured, a day or a moment in UTC, ISO 8601
+    pixel_m: float | None = None  # side of a pixel on the ground
+    geobox: GeoBox | None = None  # place of the field
     name = "recorded"
+    effects = ()
 
     def __post_init__(self) -> None:
         if not self.sweeps:
@@ -108,10 +119,27 @@ class RecordedSource:
                 )
 
     @property
-    def record(self) -> Mapping[str, Any]:
-        """Return the sweeps of the recording, and the assumptions on it."""
-        sweeps = [{"name": one.sweep.name, "lines": one.sweep.lines} for one in self.sweeps]
-        return {"recording": {"sweeps": sweeps, "notes": list(self.notes)}}
+    def key(self) -> dict[str, Any]:
+        """Return the light, bits, references and facts of lines, without the name of any file."""
+        facts = [
+            (one.sweep, one.references, one.position, one.time_s, one.exposure_ms, one.valid_line)
+            for one in self.sweeps
+        ]
+        return {"light": self.light, "bits": self.camera.bits, "sweeps": facts}
+
+    def opened(self, kept: Path) -> AbstractContextManager[Recording]:
+        """Return the recording itself, which has no device."""
+        return nullcontext(self)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the axes of the scene along which recorded lines lie."""
+        return tuple(dict.fromkeys(one.sweep.along for one in self.sweeps))
+
+    @property
+    def exposures_ms(self) -> list[float]:
+        """Return the exposures of the recorded sweeps, each once."""
+        return sorted({exposing(self.camera, one.sweep).exposure_ms for one in self.sweeps})
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
         """Yield the lines that serve a sweep, from line ``first`` on, in the order of `PickedLines`.

@@ -154,16 +154,12 @@ def _stated(value: float) -> float:
     return round(value, STATED_DIGITS) + 0.0  # no -0.0
 
 
-@dataclass(frozen=True)
-class CoveredField:
-    """The rectangle that scans cover: (y, x) size, and (y, x) of its centre from the undeflected direction [px]."""
-
-    shape: tuple[int, int]
-    centre_px: tuple[float, float]
-
-
-def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: LineCamera) -> CoveredField:
+def covered_field(
+    sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: LineCamera
+) -> tuple[tuple[int, int], tuple[float, float]]:
     """Return the largest rectangle in whole pixels that the scans cover together, with turned lines.
+
+    Returns its (y, x) size, and (y, x) of its centre from the undeflected direction [px].
 
     ``tangents`` are the line centres of each sweep, (line, 2) along the line and the scan. Along the line adjacent
     swaths add up; along the scan their intersection counts. Gaps between swaths are not detected.
@@ -193,7 +189,7 @@ def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: L
     low, high = min(across) + ends[0], max(across) + ends[1]
     size = (int(end - begin + EDGE_PX), int(high - low + EDGE_PX))
     centre = ((begin + end) / 2, (low + high) / 2)
-    return CoveredField(size[::-1], centre[::-1]) if axes == {"y"} else CoveredField(size, centre)
+    return (size[::-1], centre[::-1]) if axes == {"y"} else (size, centre)
 
 
 def flat_camera(camera: LineCamera, extent_px: float) -> LineCamera:

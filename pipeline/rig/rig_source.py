@@ -9,11 +9,12 @@ continues a transfer where it broke off, and captures only what the camera does 
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT
 from spectralzoom.pipeline.geometry.scan import Sweep, exposing
 from spectralzoom.pipeline.rig.camera.camera_cubes import as_references
-from spectralzoom.pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
+from spectralzoom.pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept, KeptInMemory
 from spectralzoom.pipeline.rig.capture_paths import (
     REFERENCES,
     CaptureRecord,
@@ -38,71 +39,86 @@ from spectralzoom.pipeline.rig.device_settings import SurveyRig
 from spectralzoom.pipeline.rig.drivers import RigDevices
 from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
 from spectralzoom.pipeline.signal.calibrate import full_scale_notes
-from spectralzoom.pipeline.source import Line, References
+from spectralzoom.pipeline.simulator.effects.effect import Chosen, Effect
+from spectralzoom.pipeline.simulator.simulated import SimulatedSource
+from spectralzoom.pipeline.source import RECORD, Line, References
 
 LOG = logging.getLogger(__name__)
 BARREN = 2  # captures in a row without a line, after which a sweep fails
 
 
+@dataclass(eq=False)
 class RigSource:
-    """A :class:`pipeline.source.Source` over a rig. Devices are opened when they are first needed.
+    """A :class:`pipeline.source.Source` over a rig, the devices of which are connected when they are first needed.
 
-    ``camera``, ``wavelength_nm`` (band,) [nm] and ``field_shape`` (y, x) [px] are those of the settings.
-    ``open_devices`` connects both; they are closed when a session, or a call outside of one, ends. ``kept`` stores the
-    camera's files and the journal; that of an earlier process continues its captures.
+    ``open_devices`` connects both; they are closed when a session, or a call outside of one, ends. A fake camera sees
+    the lines of ``seen``. ``keep`` opens a folder for the camera's files and the journal; that of an earlier process
+    continues its captures. ``say`` gets the present step while no line comes: upload, capture or transfer.
     """
 
+    camera: LineCamera
+    wavelength_nm: NDArray[np.float64]
+    open_devices: Callable[[SimulatedSource | None], RigDevices]
+    keep: Callable[[Path], Kept] = lambda folder: KeptInMemory()
+    rig: SurveyRig = field(default_factory=SurveyRig)
+    vector_pairs: int = 1500
+    field_name: str = ""
+    seen: SimulatedSource | None = None
+    say: Say = lambda step: None
+    unknown: list[str] = field(default_factory=list)  # why the rig's state is unknown; shared by copies of this source
     name = "rig"
 
-    def __init__(
-        self,
-        camera: LineCamera,
-        wavelength_nm: NDArray[np.float64],
-        field_shape: tuple[int, int],
-        open_devices: Callable[[], RigDevices],
-        kept: Kept,
-        *,
-        rig: SurveyRig | None = None,
-        vector_pairs: int = 1500,
-    ) -> None:
-        self.camera = camera
-        self.wavelength_nm = wavelength_nm
-        self.field_shape = field_shape
-        self.rig = SurveyRig() if rig is None else rig
-        self.vector_pairs = vector_pairs
-        self._open = open_devices
+    def __post_init__(self) -> None:
+        self._use(KeptInMemory())
+
+    def _use(self, kept: Kept) -> None:
+        """Use the files and the journal in ``kept``."""
         self._kept = kept
-        self._say: Say = lambda step: None
         self._journal = CaptureJournal(kept)
-        self._unknown: list[str] = []  # why the rig's state is unknown; shared by all copies of this source
         self._runner: CaptureRunner | None = None
         self._whole: dict[str, References] = {}  # of all samples, by folder
 
     @property
+    def key(self) -> Mapping[str, Any]:
+        """Return field, white reference and mounting; of a fake camera also what its scene depends on."""
+        white = {"white_reference": self.rig.white_reference, "white_at_rest": self.rig.white_at_rest}
+        seen = {} if self.seen is None else self.seen.key
+        return {"field": self.field_name, **white, "mounting": self.rig.mounting, **seen}
+
+    @property
+    def effects(self) -> Sequence[Effect]:
+        """Return those of the scene before a fake camera."""
+        return () if self.seen is None else self.seen.effects
+
+    @property
     def record(self) -> dict[str, Any]:
-        """Return settings and captures of this ``kept``, with the possible error of the lines' positions."""
+        """Return settings and captures of these files, with the possible error of the lines' positions."""
         rig: dict[str, Any] = {name: getattr(self.rig, name) for name in ("ends", "provenance")}
         if self.rig.mounting != STRAIGHT:
             rig["mounting"] = asdict(self.rig.mounting)
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
         return {"rig": rig, "captures": self._journal.captures, **damage}
 
+    def with_effects(self, chosen: Chosen, clock: Mapping[str, float]) -> RigSource:
+        """Return the same rig, before the fake camera of which the scene has these effects."""
+        return replace(self, seen=None if self.seen is None else self.seen.with_effects(chosen, clock))
+
     def keeping(self, kept: Kept) -> RigSource:
-        """Return the same source with its files elsewhere."""
-        return self._copied(_kept=kept, _journal=CaptureJournal(kept), _whole={})
-
-    def saying(self, say: Say) -> RigSource:
-        """Return the same source that calls ``say`` while no line comes, with its step: upload, capture or transfer."""
-        return self._copied(_say=say)
-
-    def opening(self, open_devices: Callable[[], RigDevices]) -> RigSource:
-        """Return the same source over other devices."""
-        return self._copied(_open=open_devices)
-
-    def _copied(self, **changed: Any) -> RigSource:
-        other = copy(self)
-        vars(other).update(changed, _runner=None)
+        """Return the same rig with its files elsewhere."""
+        other = replace(self)
+        other._use(kept)
         return other
+
+    @contextmanager
+    def opened(self, kept: Path) -> Iterator[RigSource]:
+        """Connect the devices for the block, with their files in ``kept``; the record of the captures is left there.
+
+        Raises as `session`.
+        """
+        source = self.keeping(self.keep(kept))
+        with source.session():
+            yield source
+        (kept / RECORD).write_text(json.dumps(source.record, indent=1) + "\n")
 
     @contextmanager
     def session(self) -> Iterator[CaptureRunner]:
@@ -111,16 +127,16 @@ class RigSource:
         Raises DeviceGone, DeadlinePassed or RigError where a device is missing or another one answers. Raises
         StateUnknown where a motion or capture of an earlier session was not acknowledged.
         """
-        if self._unknown:
-            raise StateUnknown(f"the rig gets no further command: {self._unknown[0]}; look at it, then run again")
-        devices = self._open() if self._runner is None else None
+        if self.unknown:
+            raise StateUnknown(f"the rig gets no further command: {self.unknown[0]}; look at it, then run again")
+        devices = self.open_devices(self.seen) if self._runner is None else None
         try:
             if devices is not None:
-                self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self._say)
+                self._runner = CaptureRunner(devices, self._journal, self.camera, self.rig, say=self.say)
             assert self._runner is not None
             yield self._runner
         except StateUnknown as error:
-            self._unknown.append(str(error))
+            self.unknown.append(str(error))
             raise
         finally:
             if devices is not None:
@@ -206,7 +222,7 @@ class RigSource:
         whole, notes = as_references(dark, white, white_reference=self.rig.white_reference, exposure_ms=exposure_ms)
         self._check_size(whole.dark.shape, folder)
         for note in (*notes, *full_scale_notes(whole.white, self.camera.full_scale_dn)):
-            self._say(note)
+            self.say(note)
         return whole
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:
@@ -215,7 +231,7 @@ class RigSource:
             captured = runner.devices.camera.fetch(
                 taken.folder,
                 self._kept,
-                lambda _, held, size: self._say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
+                lambda _, held, size: self.say(f"fetching: {held / 1e6:.1f} of {size / 1e6:.1f} MB"),
             )
         except RigError as error:
             if type(error) is not RigError:  # a device that is gone, or a full disk: the capture is in order

@@ -7,8 +7,11 @@ rest stays in the data: stray light, blur and keystone, air, sky, and the sun's 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +26,7 @@ from spectralzoom.pipeline.simulator.effects.lighting import VIGNETTING
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.pipeline.simulator.effects.spectrometer import PRNU, RESPONSE, SMILE, STRIPING
 from spectralzoom.pipeline.simulator.readout import dark_frame, read_out
-from spectralzoom.pipeline.simulator.render import USUAL, expected_light
+from spectralzoom.pipeline.simulator.render import EFFECTS, USUAL, expected_light
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from spectralzoom.pipeline.source import AT_REST, Line, References
@@ -49,17 +52,31 @@ class SimulatedSource:
     rig: Rig
     seed: int = 0
     chosen: Chosen = field(default_factory=USUAL.copy)
-    name: str = "sim"
     clock: Mapping[str, float] | None = None
     pointing: PointingErrors | None = None
+    name = "sim"
+    effects = EFFECTS  # to choose from
 
     def __post_init__(self) -> None:
         for effect, variant in self.chosen.items():
             if variant not in (*effect.variants, OFF):
                 raise SettingsError(f"effect {effect.name} has no variant {variant!r}; choose from {effect.variants}")
 
+    @property
+    def key(self) -> dict[str, Any]:
+        """Return seed and pointing errors; a survey stores the chosen effects."""
+        return {"seed": self.seed, "pointing": self.pointing}
+
+    def with_effects(self, chosen: Chosen, clock: Mapping[str, float]) -> SimulatedSource:
+        """Return the source with these effects, and the start of each sweep by its name [s]."""
+        return replace(self, chosen=chosen, clock=clock)
+
+    def opened(self, kept: Path) -> AbstractContextManager[SimulatedSource]:
+        """Return the source itself, which has no device."""
+        return nullcontext(self)
+
     @cached_property
-    def effects(self) -> Chosen:
+    def active(self) -> Chosen:
         """Return all effects that are on, pointing among them."""
         on = {effect: variant for effect, variant in self.chosen.items() if variant != OFF}
         return on if self.pointing is None else {self.pointing: "exact"} | on
@@ -71,10 +88,6 @@ class SimulatedSource:
     @property
     def wavelength_nm(self) -> NDArray[np.float64]:
         return self.scene.wavelength_nm
-
-    @property
-    def field_shape(self) -> tuple[int, int]:
-        return self.scene.shape
 
     def started_s(self, sweep: Sweep) -> float:
         return 0.0 if self.clock is None else float(self.clock.get(sweep.name, 0.0))
@@ -90,7 +103,7 @@ class SimulatedSource:
         for first in range(0, len(lines), BLOCK_LINES):
             some = slice(first, first + BLOCK_LINES)
             block = sweep_block(self.scene, self.rig, sweep, lines[some], seed=self.seed, started_s=started_s)
-            raw[some] = read_out(expected_light(self.scene, block, self.effects), block, self.effects)
+            raw[some] = read_out(expected_light(self.scene, block, self.active), block, self.active)
         return raw
 
     def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
@@ -114,10 +127,6 @@ class SimulatedSource:
             for number, data in zip(numbers, self.render(sweep, numbers), strict=True)
         ]
 
-    @property
-    def record(self) -> None:
-        """Return nothing: the manifest of the effects has it all."""
-
     def references(self, sweep: Sweep) -> References:
         """Return means of dark and white frames (sample, band), free of noise [DN]; dead and hot elements are bad.
 
@@ -126,29 +135,29 @@ class SimulatedSource:
         """
         rig = self.rig.taking(sweep)
         block = sweep_block(self.scene, rig, AT_REST, range(1))
-        dark = dark_frame(block, self.effects)
+        dark = dark_frame(block, self.active)
         light = np.full((1, rig.camera.samples, len(block.wavelength_nm)), block.white_e, np.float32)
-        for effect in (one for one in self.effects if one in SEEN):
+        for effect in (one for one in self.active if one in SEEN):
             if hasattr(effect, "gain"):
-                light = light * effect.gain(block, self.effects[effect])
+                light = light * effect.gain(block, self.active[effect])
             else:
-                light = effect.change(light, block, self.effects[effect])
+                light = effect.change(light, block, self.active[effect])
         seen: Frame = light[0]
         bad = None
-        if DEFECTS in self.effects:
+        if DEFECTS in self.active:
             dead = dead_elements(rig, seen.shape[1])
             seen[dead] = 0
             elements = dead | (hot_electrons(rig, seen.shape[1]) > 0)
             bad = elements if elements.any() else None
         white_reference = self.scene.white_reference.astype(np.float32)
-        if RESPONSE in self.effects:
-            white_reference = RESPONSE.change(white_reference[None, None], block, self.effects[RESPONSE])[0, 0]
+        if RESPONSE in self.active:
+            white_reference = RESPONSE.change(white_reference[None, None], block, self.active[RESPONSE])[0, 0]
         return References(
             dark=_rounded(dark),
             white=_rounded(dark + seen / np.float32(rig.camera.electrons_per_dn)),
             white_reference=white_reference,
             bad=bad,
-            by_mirror=VIGNETTING in self.effects,
+            by_mirror=VIGNETTING in self.active,
         )
 
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
-from spectralzoom.pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera
+from spectralzoom.pipeline.capture.recorded import RecordedSweep, Recording, line_runs
+from spectralzoom.pipeline.capture.straight_scans import fit_sweep, flat_camera
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError
 from spectralzoom.pipeline.exposures import all_alike, span_text
 from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
@@ -28,7 +27,7 @@ from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
-from spectralzoom.storage.store import MANIFEST, Archive, array_digest, check_store, is_archive, try_manifest
+from spectralzoom.storage.store import MANIFEST, Archive, check_store, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256
 
 SAME_PERIOD = 0.01
@@ -43,49 +42,6 @@ def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]
     raw = [products[name] for name in LINE_PRODUCTS if name in products]
     condensed = [products[name] for name in reversed(LINE_PRODUCTS.values()) if name in products]
     return raw if all(map(is_there, raw)) else condensed[:1] or raw
-
-
-@dataclass(frozen=True)
-class Recording:
-    """An open recording, of which no line has been read.
-
-    ``camera`` has the samples, bits, exposure and period of the recording. A scan without a mirror has a long focal
-    length, so that lines are parallel.
-    """
-
-    name: str
-    sweeps: tuple[RecordedSweep, ...]
-    wavelength_nm: Floats  # (band,)
-    fwhm_nm: Floats | None  # (band,)
-    camera: LineCamera
-    notes: tuple[str, ...]
-    light: tuple[str, ...]  # identity of the numbers: hashes of manifests, or sizes and times of files
-    acquired: str | None = None  # when the first lines were captured, by files: a day or a moment in UTC, ISO 8601
-    pixel_m: float | None = None  # side of a pixel on the ground, by positions in metres
-
-    def key(self) -> dict[str, Any]:
-        """Return the parameters of captures from it: lines, references, bands, bits and light, without names."""
-        arrays: list[NDArray[Any]] = []
-        for one in self.sweeps:
-            known = one.references
-            frames = (known.dark, known.white, known.white_reference, known.bad, known.exposure_ms)
-            arrays += [one.position, one.time_s, one.exposure_ms, one.valid_line]
-            arrays += [np.zeros(0) if frame is None else np.asarray(frame) for frame in frames]
-        return {
-            "light": list(self.light),
-            "sweeps": [asdict(one.sweep) for one in self.sweeps],
-            "lines": [array_digest(array) for array in arrays],
-            "by_mirror": [one.references.by_mirror for one in self.sweeps],
-            "wavelength_nm": self.wavelength_nm.tolist(),
-            "bits": self.camera.bits,
-        }
-
-    def source(self, field_shape: tuple[int, int] | None = None) -> RecordedSource:
-        """Return a source of lines for a field of (y, x) px, by default the one that the sweeps cover (SceneError)."""
-        if field_shape is None:
-            sweeps = [one.sweep for one in self.sweeps]
-            field_shape = covered_field(sweeps, [one.tangents for one in self.sweeps], self.camera).shape
-        return RecordedSource(self.sweeps, self.camera, self.wavelength_nm, field_shape, notes=self.notes)
 
 
 def open_recording(
@@ -108,21 +64,26 @@ def open_recording(
     ArchiveError, IncompleteStoreError, PoseError: the archive or a raw cube cannot be used.
     """
     camera = camera or LineCamera()
-    stores = find_raw_cubes(address)
+    path = Path(address)
+    if (of_archive := _run_with_cubes(address)) is not None:
+        stores = of_archive[2]
+    else:
+        beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
+        stores = [one for one in beside if _is_raw_cube(one)]
     flags = {"pointing": pointing, "dark": dark, "white": white, "wavelengths": wavelengths}
-    if stores is None:
-        paths = find_cubes(Path(address))
+    if not stores:
+        paths = find_cubes(path)
         opened = [open_file_cube(one, wavelengths, {"dark": dark, "white": white}) for one in paths]
         cubes = [_point(one, pointing, mounting, len(paths) == 1) for one in opened]
-        return _recording_of(str(address), dict(zip(paths, cubes, strict=True)), camera, white_reference)
+        return _recording_of(dict(zip(paths, cubes, strict=True)), camera, white_reference)
     if (flag := next((name for name, value in flags.items() if value is not None), None)) is not None:
         raise SettingsError(
             f"--{flag} is for files, and {address} holds raw cubes, which have their own; leave --{flag} out"
         )
-    return _stored_recording(str(address), stores, camera)
+    return _stored_recording(stores, camera)
 
 
-def _stored_recording(address: str, stores: Sequence[Path], camera: LineCamera) -> Recording:
+def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
     """Open raw cubes, or condensed sweeps, of an archive."""
     for folder in {path.parent for path in stores if (path.parent / MANIFEST).is_file()}:
         check_store(folder)
@@ -147,7 +108,7 @@ def _stored_recording(address: str, stores: Sequence[Path], camera: LineCamera) 
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
     notes = (RESTORED,) if any(isinstance(cube, RestoredCube) for cube in cubes) else ()
-    return Recording(address, sweeps, first.wavelength_nm, first.fwhm_nm, camera, notes, light)
+    return Recording(sweeps, camera, first.wavelength_nm, first.fwhm_nm, notes, light)
 
 
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
@@ -161,9 +122,7 @@ def _stamps(files: Iterable[Path]) -> list[str]:
     return [f"{file.name}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
 
 
-def _recording_of(
-    address: str, files: Mapping[Path, FileCube], camera: LineCamera, white_reference: ArrayLike
-) -> Recording:
+def _recording_of(files: Mapping[Path, FileCube], camera: LineCamera, white_reference: ArrayLike) -> Recording:
     """Return cubes of files as a recording."""
     paths, cubes = list(files), list(files.values())
     bands = cubes[0].source.bands
@@ -197,7 +156,7 @@ def _recording_of(
     unique = tuple(dict.fromkeys(notes))
     acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
     of_bands = bands.wavelength_nm, bands.fwhm_nm
-    return Recording(address, tuple(sweeps), *of_bands, camera, unique, light, acquired, cubes[0].pixel_m)
+    return Recording(tuple(sweeps), camera, *of_bands, unique, light, acquired, cubes[0].pixel_m)
 
 
 def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -> FileCube:
@@ -334,18 +293,6 @@ def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera) -
     return filled, notes
 
 
-def find_raw_cubes(address: str | Path) -> list[Path] | None:
-    """Return the raw cubes of an address, sorted by name; None if it has none.
-
-    Raises ArchiveError: the archive has no such run, or no run with raw cubes; SceneError: there is no such file.
-    """
-    path = Path(address)
-    if (of_archive := _run_with_cubes(address)) is not None:
-        return of_archive[2]
-    beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
-    return [one for one in beside if _is_raw_cube(one)] or None
-
-
 def _is_raw_cube(path: Path) -> bool:
     """Return whether a folder is a store of a survey's lines."""
     with suppress(IncompleteStoreError):
@@ -356,7 +303,7 @@ def _is_raw_cube(path: Path) -> bool:
 def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None, GeoBox | None] | None:
     """Return the run of an address, and size (y, x) and place of its field, if known; None if it is no archive's.
 
-    Raises SceneError, ArchiveError: as `find_raw_cubes`.
+    Raises SceneError: there is no such file; ArchiveError: the archive has no such run, or none with raw cubes.
     """
     if (found := _run_with_cubes(address)) is None:
         return None

@@ -102,8 +102,7 @@ def folder_rig(folder: Path) -> tuple[RigSource, CameraDriver, Program]:
     clock.program = Program(folder, FakeCamera(clock, small_source()))
     camera = open_camera_driver(settings, clock)
     devices = RigDevices(FakeMirror(clock), camera, clock)
-    seen = small_source()
-    source = RigSource(CAMERA, seen.wavelength_nm, seen.field_shape, lambda: devices, KeptInMemory(), rig=settings)
+    source = RigSource(CAMERA, small_source().wavelength_nm, lambda seen: devices, rig=settings)
     return source, camera, clock.program
 
 

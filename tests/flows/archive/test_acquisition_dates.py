@@ -168,6 +168,5 @@ def test_two_cubes_of_a_recording_have_the_date_of_the_first(tmp_path: Path) -> 
         write_envi(tmp_path / f"{number}.img", PIXELS.astype(np.uint16), "bil", **told)
         rows = "".join(f"{(line - 25) / 3000},0\n" for line in range(len(PIXELS)))
         (tmp_path / f"{number}.pointing.csv").write_text(f"mirror_x,mirror_y\n{rows}")
-    assert (
-        open_recorded(load_settings(None, {"sweeps": str(tmp_path), "size": "8x8"})).scene()[0].acquired == "2022-07-01"
-    )
+    _, recording = open_recorded(load_settings(None, {"sweeps": str(tmp_path), "size": "8x8"}))
+    assert recording.acquired == "2022-07-01"

@@ -122,7 +122,7 @@ def test_a_survey_waits_for_the_rig_of_another_one(scheduling: str, monkeypatch:
     from prefect import flow
 
     monkeypatch.setattr(rig_field, "TRY_S", 1)
-    hold, slot = RigHold(f"/dev/ttyTURNS{os.getpid()}"), {"names": [RIG_LIMIT], "slots": 1}
+    slot = {"names": [RIG_LIMIT], "slots": 1}
     with client() as asked:
         asked.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
         asked.increment_concurrency_slots(**slot, mode="concurrency")
@@ -130,7 +130,7 @@ def test_a_survey_waits_for_the_rig_of_another_one(scheduling: str, monkeypatch:
 
         @flow(persist_result=False)
         def captures() -> list[int]:
-            with hold.released(note):
+            with RigHold(f"/dev/ttyTURNS{os.getpid()}", note) as hold:
                 hold.take()
                 hold.take()
                 return [asked.read_global_concurrency_limit_by_name(RIG_LIMIT).active_slots]

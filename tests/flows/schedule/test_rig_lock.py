@@ -45,8 +45,7 @@ def test_a_killed_holder_frees_the_rig(tmp_path: Path) -> None:
 
 def test_a_survey_holds_the_rig_from_its_first_capture_to_its_end() -> None:
     """Stored captures need no rig; later ones find it held by their own survey."""
-    hold = RigHold(PORT)
-    with hold.released(lambda text: None):
+    with RigHold(PORT, print) as hold:
         with rig_to_oneself(PORT):
             assert_held(PORT)
         for _ in range(2):

@@ -12,7 +12,6 @@ from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages import effects as effect_choice
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
-from spectralzoom.flows.tasks.scene import SimulatedField
 from spectralzoom.pipeline.errors import IncompleteStoreError
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.render import EFFECTS
@@ -44,11 +43,10 @@ def test_manifest_and_source_have_the_chosen_effects(decided: Ref, settings: Set
     assert on.keys() == {*ASKED.split(","), "quantisation", "saturation"}
     assert rows["diffraction"]["bound"] > 0
     assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
-    field = SimulatedField(make_source(open_simulation(settings)[0], settings))
-    source = field.lit(chosen_effects(decided), {"a": 3.0}).source
-    assert {effect.name: variant for effect, variant in source.effects.items()} == on
+    source = make_source(open_simulation(settings)[0], settings).with_effects(chosen_effects(decided), {"a": 3.0})
+    assert {effect.name: variant for effect, variant in source.active.items()} == on
     assert source.clock == {"a": 3.0}
-    assert list(chosen_effects(decided)) == list(source.effects)
+    assert list(chosen_effects(decided)) == list(source.active)
 
 
 def test_effects_unknown_to_this_version_are_refused(monkeypatch: pytest.MonkeyPatch, decided: Ref) -> None:

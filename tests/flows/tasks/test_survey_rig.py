@@ -24,7 +24,7 @@ from spectralzoom.pipeline.rig.transports import DeviceGone
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.arrays.cubes import open_raw_cube
 from spectralzoom.storage.runs import verify_everything
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, stage_key
 from tests.conftest import QUIET
 
 FAKE = {"rig.mirror_driver": "fake", "rig.camera_driver": "fake"}
@@ -46,7 +46,7 @@ def small_settings(out: Path, **changed: Any) -> Settings:
 
 def fake_settings(out: Path, **changed: Any) -> Settings:
     """Return settings of a tiny survey through a fake rig."""
-    return small_settings(out, source="rig", **FAKE, **changed)
+    return small_settings(out, source="rig", **{**FAKE, **changed})
 
 
 def arrays_of(archive: Path, published: Published, product: str) -> dict[str, bytes]:
@@ -142,6 +142,17 @@ def test_field_without_a_picture_is_surveyed(tmp_path: Path, weights: Path) -> N
     assert "accuracy" not in published.receipt
     assert published.receipt["scene"].startswith("field/")
     assert published.receipt["settings"]["visit"]  # the date, so that a later survey is another visit
+
+
+@pytest.mark.parametrize(("camera_driver", "keys"), [("", 1), ("fake", 2)])
+def test_lines_of_a_real_rig_do_not_depend_on_the_seed(
+    tmp_path: Path, weights: Path, camera_driver: str, keys: int
+) -> None:
+    """Another seed finds the captures of a real camera again; a fake camera sees other noise."""
+    told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights)}
+    asked = [fake_settings(tmp_path, **told, **{"rig.camera_driver": camera_driver, "seed": one}) for one in (1, 2)]
+    views = [open_field(settings, planning=True).view for settings in asked]
+    assert len({stage_key("capture", 1, {"view": view}) for view in views}) == keys
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs
+from spectralzoom.pipeline.capture.recorded import RecordedSweep, Recording, line_runs
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.rig_model import Rig
@@ -40,9 +40,9 @@ def record(source: SimulatedSource, sweep: Sweep, counted: list[int] | None = No
     return RecordedSweep(sweep, *facts, read)
 
 
-def recorded_source(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) -> RecordedSource:
-    """Return a source over recorded sweeps of the simulated rig's field."""
-    return RecordedSource(sweeps, source.camera, source.wavelength_nm, source.field_shape)
+def recording_of(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) -> Recording:
+    """Return recorded sweeps of the simulated rig's field as a source."""
+    return Recording(sweeps, source.camera, source.wavelength_nm)
 
 
 def assert_same(found: list[Line], expected: list[Line]) -> None:

@@ -13,7 +13,7 @@ from spectralzoom.pipeline.capture.recorded import RecordedSweep, nearest_line
 from spectralzoom.pipeline.errors import NotRecordedError
 from spectralzoom.pipeline.geometry.scan import Sweep, line_positions
 from spectralzoom.pipeline.source import References
-from tests.pipeline.capture.recordings import CAMERA, FULL, assert_same, record, recorded_source, simulated
+from tests.pipeline.capture.recordings import CAMERA, FULL, assert_same, record, recording_of, simulated
 
 
 def assert_same_references(found: References, expected: References) -> None:
@@ -25,7 +25,7 @@ def assert_same_references(found: References, expected: References) -> None:
 def test_a_recorded_sweep_returns_its_lines_unchanged(sweep: Sweep) -> None:
     """Lines and references equal those of the source that was recorded, bit for bit, from any first line."""
     source = simulated()
-    recorded = recorded_source(source, [record(source, sweep)])
+    recorded = recording_of(source, [record(source, sweep)])
     lines = list(source.lines(sweep))
     assert_same(list(recorded.lines(sweep)), lines)
     assert_same(list(recorded.lines(sweep, 17)), lines[17:])
@@ -36,7 +36,7 @@ def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
     """Each coarse line is the recorded line just before its middle. The other lines are not read."""
     source = simulated()
     counted: list[int] = []
-    recorded = recorded_source(source, [record(source, FULL, counted)])
+    recorded = recording_of(source, [record(source, FULL, counted)])
     coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)
     found, full = list(recorded.lines(coarse)), list(source.lines(FULL))
     for number, line in enumerate(found):
@@ -51,7 +51,7 @@ def test_fine_lines_of_a_full_scan_are_found_by_position() -> None:
     """A planned run of lines reads only those lines and returns them as recorded."""
     source = simulated()
     counted: list[int] = []
-    recorded = recorded_source(source, [record(source, FULL, counted)])
+    recorded = recording_of(source, [record(source, FULL, counted)])
     found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
     assert_same([replace(line, number=line.number + 30) for line in found], list(source.lines(FULL))[30:42])
     assert counted == list(range(30, 42))
@@ -63,7 +63,7 @@ def test_a_recorded_coarse_sweep_is_preferred_to_the_full_scan() -> None:
     """If two sweeps can serve a request, the one that has exactly its lines is read."""
     source = simulated()
     coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4)
-    recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
+    recorded = recording_of(source, [record(source, FULL), record(source, coarse)])
     expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]
     assert_same(list(recorded.lines(Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4))), expected)
 
@@ -75,7 +75,7 @@ def test_a_backward_recording_returns_lines_in_order_of_time() -> None:
     backward = replace(
         whole, position=whole.position[::-1], read_lines=lambda numbers: whole.read_lines(79 - numbers[::-1])[::-1]
     )
-    found = list(recorded_source(source, [backward]).lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
+    found = list(recording_of(source, [backward]).lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
     times = [line.time_s for line in found]
     assert times == sorted(times)
     planned = line_positions(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12), CAMERA)
@@ -88,7 +88,7 @@ def test_two_sweeps_of_one_swath_serve_a_run_across_both() -> None:
     """A run across the end of one recorded sweep takes lines of both, and the times still ascend."""
     source = simulated()
     lower, upper = replace(FULL, lines=40), replace(FULL, name="scan-1", start_px=0.5, lines=40)
-    recorded = recorded_source(source, [record(source, lower), record(source, upper)])
+    recorded = recording_of(source, [record(source, lower), record(source, upper)])
     found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -4.5, 10)))
     expected = [*list(source.lines(lower))[35:], *list(source.lines(upper))[:5]]
     for line, same in zip(found, expected, strict=True):
@@ -101,7 +101,7 @@ def test_an_invalid_line_is_used_only_without_a_valid_neighbour() -> None:
     """In a coarse pass a valid neighbour replaces an invalid line. In a fine pass the line stays invalid."""
     source = simulated()
     lost = replace(record(source, FULL), valid_line=np.arange(80) != 5)
-    recorded = recorded_source(source, [lost])
+    recorded = recording_of(source, [lost])
     assert recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4)).line[:3].tolist() == [1, 6, 9]
     fine = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -35.5, 3)))
     assert [line.valid for line in fine] == [True, False, True]
@@ -121,7 +121,7 @@ def test_a_recorded_line_that_serves_two_planned_lines_is_valid_once() -> None:
         np.ones(40, bool),
         lambda numbers: np.zeros((len(numbers), 64, 3), np.uint16),
     )
-    found = list(recorded_source(simulated(), [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
+    found = list(recording_of(simulated(), [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
     assert len({line.mirror_x for line in found}) == sum(line.valid for line in found) < 10
 
 
@@ -141,7 +141,7 @@ def test_a_missing_line_is_named_before_any_line_is_read(asked: Sweep, message: 
     """Lines beyond the end of the recording, on another swath or along the other axis are refused."""
     source = simulated()
     counted: list[int] = []
-    recorded = recorded_source(source, [record(source, FULL, counted)])
+    recorded = recording_of(source, [record(source, FULL, counted)])
     with pytest.raises(NotRecordedError, match=message):
         next(recorded.lines(asked))
     assert counted == []
@@ -151,7 +151,7 @@ def test_a_plan_is_cut_to_the_recorded_lines() -> None:
     """Lines beyond either end are removed and lines in a gap stay. A plan on another swath becomes None."""
     source = simulated()
     lower, upper = replace(FULL, lines=30), replace(FULL, name="scan-1", start_px=10.5, lines=30)
-    recorded = recorded_source(source, [record(source, lower), record(source, upper)])
+    recorded = recording_of(source, [record(source, lower), record(source, upper)])
     beyond = Sweep("coarse-0", "coarse", "x", 0.0, -49.5, 30, step=4)
     assert recorded.cut_to_recorded(beyond) == replace(beyond, start_px=-41.5, lines=21)
     inside = replace(lower, name="fine", lines=10)
@@ -165,7 +165,7 @@ def test_a_coarse_line_next_to_a_gap_uses_one_of_its_own_four_lines() -> None:
     """With lines 1 to 3 lost, line 0 serves the first coarse line, because it is one of that line's four."""
     source = simulated()
     lost = replace(record(source, FULL), valid_line=~np.isin(np.arange(80), [1, 2, 3]))
-    picked = recorded_source(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4))
+    picked = recording_of(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4))
     assert picked.line[:2].tolist() == [0, 5]
 
 
@@ -174,7 +174,7 @@ def test_a_plan_equal_up_to_rounding_is_the_recorded_sweep() -> None:
     source = simulated()
     whole = record(source, FULL)
     strayed = replace(whole, position=whole.position + np.random.default_rng(0).normal(0, 3e-4, (80, 2)))
-    recorded = recorded_source(source, [strayed])
+    recorded = recording_of(source, [strayed])
     picked = recorded.pick(replace(FULL, name="planned", swath_px=3e-7, start_px=FULL.start_px - 2e-7))
     assert picked.line.tolist() == list(range(80))
 
@@ -182,7 +182,7 @@ def test_a_plan_equal_up_to_rounding_is_the_recorded_sweep() -> None:
 def test_lines_finer_than_recorded_are_refused() -> None:
     """A coarse recording serves no fine request."""
     source = simulated()
-    recorded = recorded_source(source, [record(source, Sweep("stepped", "coarse", "x", 0.0, -39.5, 20, step=4))])
+    recorded = recording_of(source, [record(source, Sweep("stepped", "coarse", "x", 0.0, -39.5, 20, step=4))])
     with pytest.raises(NotRecordedError, match="no finer than recorded"):
         recorded.pick(Sweep("fine-0", "fine", "x", 0.0, -9.5, 4))
 

@@ -15,7 +15,7 @@ from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.rectify.region import mosaic_rows
 from spectralzoom.pipeline.simulator.rig_model import Rig
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
-from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source
+from tests.pipeline.capture.recordings import CAMERA, FULL, record, recording_of
 from tests.pipeline.simulator.small_scenes import image_scene
 
 GRID = SceneGrid(80, 64, 16)
@@ -42,7 +42,7 @@ def test_a_coarse_pass_of_single_recorded_lines_is_not_displaced() -> None:
     Rows next to the border are left out, because the footprint of their lines reaches beyond the field.
     """
     source = _ramp()
-    recorded = recorded_source(source, [record(source, FULL)])
+    recorded = recording_of(source, [record(source, FULL)])
     lines = list(recorded.lines(COARSE))
     captured = RecordedSweep(
         COARSE,

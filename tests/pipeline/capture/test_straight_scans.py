@@ -95,26 +95,27 @@ def test_the_covered_field_of_a_full_scan_is_the_field() -> None:
     """Sweeps planned for a field cover it along the scan to 4 px, and along the line at least to its ends."""
     along, sweeps, _ = cheapest_full(SceneGrid(700, 1500, 64), CAMERA, CostModel(), overlap_px=0.0)
     tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
-    found = covered_field(sweeps, tangents, CAMERA)
+    shape, centre_px = covered_field(sweeps, tangents, CAMERA)
     scan, line = (0, 1) if along == "x" else (1, 0)
     wanted = (700, 1500)
-    assert abs(found.shape[scan] - wanted[scan]) <= 8
-    assert abs(found.centre_px[scan]) <= 4
-    assert abs(found.centre_px[line]) + wanted[line] / 2 <= found.shape[line] / 2
+    assert abs(shape[scan] - wanted[scan]) <= 8
+    assert abs(centre_px[scan]) <= 4
+    assert abs(centre_px[line]) + wanted[line] / 2 <= shape[line] / 2
 
 
 def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
     """100 lines of 640 samples cover (100, 640) px, centred on the lines. Lines without a position are ignored."""
     sweep = Sweep("s", "fine", "x", 0.0, 10.0, 100)
     tangents = direction_to_scene(position_to_direction(line_positions(sweep, CAMERA)))
-    found = covered_field([sweep], [tangents], CAMERA)
-    assert found.shape == (100, 640)
-    np.testing.assert_allclose(found.centre_px, (59.5, 0.0), atol=1e-6)
-    assert covered_field([replace(sweep, along="y")], [tangents], CAMERA).shape == (640, 100)
+    shape, centre_px = covered_field([sweep], [tangents], CAMERA)
+    assert shape == (100, 640)
+    np.testing.assert_allclose(centre_px, (59.5, 0.0), atol=1e-6)
+    assert covered_field([replace(sweep, along="y")], [tangents], CAMERA)[0] == (640, 100)
     beside = replace(sweep, swath_px=0.4)  # the lines turn by too little to see
     tangents = direction_to_scene(position_to_direction(line_positions(beside, CAMERA)))
-    found = covered_field([sweep, beside], [np.full((4, 2), np.nan), tangents], CAMERA)  # one without a position
-    assert (found.shape, round(found.centre_px[1], 6)) == ((100, 640), 0.4)
+    tracks = [np.full((4, 2), np.nan), tangents]  # one without a position
+    shape, centre_px = covered_field([sweep, beside], tracks, CAMERA)
+    assert (shape, round(centre_px[1], 6)) == ((100, 640), 0.4)
     with pytest.raises(SceneError, match="no line of the recording has a position"):
         covered_field([sweep], [np.full((4, 2), np.nan)], CAMERA)
 

@@ -116,7 +116,7 @@ def test_a_broad_band_image_is_the_mean_of_the_bands():
     )
     broad = broad_sweep(holed, CAMERA)  # type: ignore[arg-type]
     along, scan = sweep_to_scene(sweep, CAMERA)
-    y, x = scan + (source.field_shape[0] - 1) / 2, along + (source.field_shape[1] - 1) / 2
+    y, x = scan + (source.scene.shape[0] - 1) / 2, along + (source.scene.shape[1] - 1) / 2
     truth = seen_at(source.scene, y, x).mean(axis=-1)
     assert np.isnan(broad.image[7]).all()
     np.testing.assert_allclose(broad.image[kept], truth[kept], atol=2e-3)

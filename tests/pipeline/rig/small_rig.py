@@ -114,7 +114,7 @@ class SmallRig:
         """Return the captures that the camera began, without references."""
         return [folder for folder in self.camera.captures if "references" not in folder]
 
-    def devices(self) -> RigDevices:
+    def devices(self, seen: SimulatedSource | None = None) -> RigDevices:
         """Connect to both devices."""
         self.opened += 1
         rig = self
@@ -125,14 +125,8 @@ class SmallRig:
 
         return Devices(self.mirror, self.camera, self.clock)
 
-    def source(self, kept: Kept | None = None) -> RigSource:
+    def source(self, kept: Kept | None = None, **more: Any) -> RigSource:
         """Return a source that captures with the rig; each call acts as another process."""
-        return RigSource(
-            self.seen.camera,
-            self.wavelength_nm,
-            self.seen.field_shape,
-            self.devices,
-            KeptInMemory() if kept is None else kept,
-            rig=self.settings,
-            vector_pairs=self.vector_pairs,
-        )
+        more = {"rig": self.settings, "vector_pairs": self.vector_pairs, **more}
+        source = RigSource(self.seen.camera, self.wavelength_nm, self.devices, **more)
+        return source.keeping(KeptInMemory() if kept is None else kept)

@@ -14,6 +14,7 @@ import pytest
 import zarr
 from numpy.typing import NDArray
 
+from spectralzoom.pipeline.capture.straight_scans import covered_field
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError, WavelengthError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.mirror import direction_to_scene, position_to_direction
@@ -21,7 +22,7 @@ from spectralzoom.pipeline.geometry.scan import Sweep
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from spectralzoom.storage.readers.recordings import _middle_s, open_recording
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, stage_key
 from tests.envi_files import write_recorded_files
 from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
 from tests.storage.readers.test_envi_cubes import write_envi
@@ -137,7 +138,7 @@ def test_a_cube_without_pointing_is_an_even_straight_scan(files: Path) -> None:
     np.testing.assert_allclose(seen, np.stack([np.zeros(80), np.arange(80) - 39.5], axis=-1), atol=1e-6)
     assert "scan-0 has no pointing: taken as an even straight scan along y with one pixel a line" in recording.notes
     assert any("nothing says when lines were taken: one every 100 ms is assumed" in note for note in recording.notes)
-    assert recording.source().field_shape == (80, 64)
+    assert covered_field([sweep.sweep], [sweep.tangents], recording.camera)[0] == (80, 64)
 
 
 @pytest.mark.parametrize(
@@ -280,19 +281,23 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
 
 def test_the_key_of_a_recording_depends_on_its_content(files: Path, tmp_path: Path) -> None:
     """The key is the same at another address; other numbers, bits, pointing or frames change it."""
-    key = open_recording(files, CAMERA).key()
+
+    def key_of(path: Path, camera: LineCamera, **more: Path) -> str:
+        return stage_key("capture", 1, open_recording(path, camera, **more).key)
+
+    key = key_of(files, CAMERA)
     moved = files.rename(tmp_path / "moved")
-    assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
+    assert key_of(moved, CAMERA) == key_of(moved / "scan-0.hdr", CAMERA) == key
     np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
-    keys = [key, open_recording(moved, CAMERA, dark=tmp_path / "dark.npy").key()]
+    keys = [key, key_of(moved, CAMERA, dark=tmp_path / "dark.npy")]
     text = (moved / "scan-0.pointing.csv").read_text()
     (moved / "scan-0.pointing.csv").write_text(text.replace("0.05,", "0.06,", 1))
-    keys.append(open_recording(moved, CAMERA).key())
+    keys.append(key_of(moved, CAMERA))
     (moved / "scan-0.pointing.csv").write_text(text)
     flip(moved / "scan-0.bil", 100)
-    keys += [open_recording(moved, camera).key() for camera in (CAMERA, replace(CAMERA, bits=14))]
+    keys += [key_of(moved, camera) for camera in (CAMERA, replace(CAMERA, bits=14))]
     assert all(one != other for at, one in enumerate(keys) for other in keys[:at])
-    stored = [open_recording(path, CAMERA).key() for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]
+    stored = [key_of(path, CAMERA) for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]
     assert stored[0] == stored[1]
 
 
@@ -341,9 +346,8 @@ def test_nodata_values_are_invalid(tmp_path: Path, kind: str, void: int) -> None
     write_envi_cube(tmp_path / "a", values, data_ignore_value=void)
     recording = open_recording(tmp_path / "a.hdr")
     (sweep,) = recording.sweeps
-    source = recording.source((6, 16))
     np.testing.assert_array_equal(sweep.read_lines(np.arange(6)), np.where(values == void, np.int32(65535), values))
-    assert [line.valid for line in source.lines(sweep.sweep)] == [True, True, False, True, True, True]
+    assert [line.valid for line in recording.lines(sweep.sweep)] == [True, True, False, True, True, True]
     assert recording.camera.bits == 12
     assert f"a: the number {void} is no data, as the file says" in recording.notes
 

@@ -174,7 +174,7 @@ def test_a_rig_of_unknown_state_gets_no_command_in_an_open_session():
 def killed_amid(rig: SmallRig, kept: KeptInMemory) -> None:
     """Start to capture the sweep and get killed while waiting."""
     with pytest.raises(KilledError):
-        list(rig.source(kept).saying(lambda words: kill() if words.startswith("capturing") else None).lines(FINE))
+        list(rig.source(kept, say=lambda words: kill() if words.startswith("capturing") else None).lines(FINE))
 
 
 def test_a_capture_that_still_runs_is_waited_for():
