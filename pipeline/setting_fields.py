@@ -16,31 +16,38 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.fields import FieldInfo
 
+from spectralzoom.pipeline.toml_files import as_toml
+
 Table = TypeVar("Table")
+REQUIRED: Any = ...  # default of a setting that has none
 
 
 def _as_form(schema: dict[str, Any]) -> None:
     """Complete the schema of a table for forms and documents, without parameters of models. Changes the schema.
 
     A form would send null and defaults over those of a settings file: the default is in the description, and ``usual``
-    of the schema. ``about`` is the help with unit and source.
+    of the schema. ``about`` is the help with unit and source, ``shown`` the default or the example as TOML. What may
+    only stand in a file is ``hidden``.
     """
-    schema["properties"] = {name: one for name, one in schema["properties"].items() if "description" in one}
-    for name, one in schema["properties"].items():
+    shown = {name: one for name, one in schema["properties"].items() if "description" in one}
+    schema["hidden"] = {name: one for name, one in shown.items() if one.get("writeOnly")}
+    schema["properties"] = {name: one for name, one in shown.items() if name not in schema["hidden"]}
+    for name, one in shown.items():
         kinds = [kind for kind in one.pop("anyOf", ()) if kind.get("type") != "null"]
         one |= {"anyOf": kinds} if len(kinds) > 1 else dict(*kinds)
         one["title"] = name.replace("_", " ")
-        usual = {"usual": one.pop("default")} if "default" in one else {}
-        if "group" in one:
-            unit = f" [{one['unit']}]" if one["unit"] else ""
-            source = f"; {one['source']}" if one["source"] else ""
-            one |= usual | {"about": " ".join(one["description"].split()) + unit + source}
-            shown = None if one.get("usual") in (None, "") else one["example"] or one["usual"]
-            one["description"] = one["about"] + ("" if shown is None else f"; default: {shown}")
+        usual = one.pop("default", REQUIRED)
+        if "group" not in one:
+            continue
+        one["shown"] = as_toml(usual if one["example"] is None else one["example"])
+        one["about"] = " ".join(one["description"].split()) + (f" [{one['unit']}]" if one["unit"] else "")
+        one["about"] += f"; {one['source']}" if one["source"] else ""
+        one["description"] = one["about"] + ("" if usual in (None, "", REQUIRED) else f"; default: {one['shown']}")
+        if usual is not REQUIRED:
+            one["usual"] = str(usual) if usual == math.inf else usual
 
 
 CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra=_as_form)
-REQUIRED: Any = ...  # default of a setting that has none
 
 
 def stated(
@@ -64,6 +71,8 @@ def stated(
     pydantic's Field.
     """
     extra: dict[str, Any] = {"unit": unit, "source": source, "example": example, "group": group}
+    if more.get("exclude"):  # of receipts, and thus of forms
+        extra["writeOnly"] = True
     if isinstance(default, float) and math.isinf(default):
         more["allow_inf_nan"] = True
     return Field(default, description=about, ge=ge, le=le, json_schema_extra=extra, **more)
@@ -74,9 +83,10 @@ assumed = partial(stated, source="assumed")  # the default is not confirmed on a
 
 @dataclass_transform(frozen_default=True)
 def settings_table(make: type[Table]) -> type[Table]:
-    """Turn a class into a table of settings: a frozen dataclass, whose values a model of pydantic checks as it reads.
+    """Turn a class into a table of settings: a frozen dataclass.
 
-    Programs may give other values, such as the camera of a recording with fewer samples than a setting allows.
+    Values are checked where settings are read. A program may give others, such as the camera of a recording with fewer
+    samples than a setting allows.
     """
     for name, kind in make.__annotations__.items():
         about = make.__dict__.get(name)

@@ -1,7 +1,8 @@
-"""Read TOML files of users: settings of a survey, and what describes scenes."""
+"""Read and write TOML of users: settings of a survey, and what describes scenes."""
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -27,3 +28,12 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ValueError(str(error)) from error
     except RecursionError:
         raise ValueError("its lists or tables are nested too deeply") from None
+
+
+def as_toml(value: Any) -> str:
+    """Return a value as TOML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return f"[{', '.join(map(as_toml, value))}]" if isinstance(value, tuple | list) else str(value)

@@ -15,6 +15,7 @@ import spectralzoom.opened as opened
 from spectralzoom.flows.archive.plan_command import plan_content
 from spectralzoom.flows.settings.load import unnested
 from spectralzoom.flows.settings.settings import Settings, load_settings
+from spectralzoom.flows.tasks.recorded_field import usual_of_recording
 from spectralzoom.flows.terminal.processes import place_caches, send_no_analytics
 from spectralzoom.flows.terminal.progress import Listener, heard_by, on_stderr
 from spectralzoom.opened import OpenedRun
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 
 Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
-USUAL = {"engine": "plain"}  # a Prefect server starts only on request
 
 
 def survey(settings: Asked = None, *, progress: Listener | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
@@ -158,8 +158,15 @@ def train(
 def _settings(given: Asked, flags: Mapping[str, Any]) -> Settings:
     """Return the settings of a file or a table; keywords win over them."""
     path = None if given is None or isinstance(given, Mapping) else given
+    if not isinstance(given, str | Path | Mapping | None):
+        raise SettingsError(f"settings must be a settings file or a table of settings, got {given!r}")
     asked = unnested(given if isinstance(given, Mapping) else {}) | unnested(flags)
-    return load_settings(path, {key: _plain(value) for key, value in asked.items()}, usual=USUAL)
+
+    def usual(stated: Mapping[str, Any]) -> dict[str, Any]:
+        """Return other defaults: a Prefect server starts only on request."""
+        return {"engine": "plain", **usual_of_recording(stated)}
+
+    return load_settings(path, {str(key): _plain(value) for key, value in asked.items()}, usual=usual)
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
@@ -12,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, Switch
-from spectralzoom.flows.settings.load import unnested
+from spectralzoom.flows.settings.load import flag_of
 from spectralzoom.flows.settings.rules import OF_THE_PLAN
-from spectralzoom.flows.settings.settings import Settings
+from spectralzoom.flows.settings.settings import Settings, to_state
 from spectralzoom.flows.settings.values import ALWAYS, RECORDED
 from spectralzoom.flows.tasks.scores import score_of
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
@@ -22,7 +21,6 @@ from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
 from spectralzoom.storage.runs import Catalogue, Finding, Run, clear_up, verify_everything
 from spectralzoom.storage.store import Archive, descendants
-from spectralzoom.storage.whole_files import to_json
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "stage", "what")  # never folded
@@ -193,18 +191,15 @@ def command(settings: Mapping[str, Any], out: str) -> str:
     if settings.get("source") == RECORDED:
         repeated = settings.get("scan_exposure_ms") is not None and not chosen
         left_out |= {"scan_exposure_ms", *(OF_THE_PLAN if repeated else ())}
-    asked, usual = (json.loads(to_json(unnested(one))) for one in ({**settings, "out": out}, Settings().to_dict()))
+    asked = {name: one for name, one in settings.items() if name in Settings.model_fields and name not in left_out}
     parts = ["spectralzoom", "survey"]
-    for name, value in asked.items():
-        flag = name.replace("_", "-")
-        if value is None or value == usual.get(name) or name in left_out or name == "notes":
-            continue
+    for name, value in to_state({**asked, "out": out}).items():
         if isinstance(value, bool):
-            parts.append(f"--{flag}" if value else f"--no-{flag}")
-        elif isinstance(value, list):
-            parts += [f"--{flag}", ("x" if name == "size" else ",").join(map(str, value))]
+            parts.append(flag_of(name, off=not value))
         else:
-            parts += [f"--{flag}", str(value)]
+            joint = "x" if name == "size" else ","
+            text = joint.join(map(str, value)) if isinstance(value, list) else str(value)
+            parts += [f"{flag_of(name)}={text}"] if text.startswith("-") else [flag_of(name), text]
     return shlex.join(parts)
 
 

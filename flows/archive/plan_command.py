@@ -23,6 +23,7 @@ from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.score import load_plan, score
 from spectralzoom.flows.survey import run_stages
 from spectralzoom.flows.tasks.capture_plan import as_figures
+from spectralzoom.flows.tasks.recorded_field import usual_of_recording
 from spectralzoom.flows.terminal.figures import format_count
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import put_out, table
@@ -51,7 +52,9 @@ def plan(
     """
     if help_all:
         return print_every_flag()
-    put_out(plan_content(load_settings(settings, by_setting(flags))), show_plan, as_json=as_json)
+    put_out(
+        plan_content(load_settings(settings, by_setting(flags), usual=usual_of_recording)), show_plan, as_json=as_json
+    )
     return DONE
 
 

@@ -43,9 +43,10 @@ def survey(
     if help_all:
         return print_every_flag()
     from spectralzoom.flows.cli.tiles import COLUMNS, tiles_of  # numpy and readers take a second
+    from spectralzoom.flows.tasks.recorded_field import usual_of_recording
 
     files = settings or (None,)
-    loaded = [(str(file), load_settings(file, by_setting(flags))) for file in files]
+    loaded = [(str(file), load_settings(file, by_setting(flags), usual=usual_of_recording)) for file in files]
     every = [(name, tile) for name, one in loaded for tile in tiles_of(one)]
     tiled = len(every) > len(files)
     ends: list[End] = []

@@ -5,11 +5,9 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import textwrap
 from collections.abc import Iterator
-from typing import Any
 
 from spectralzoom.flows.settings.load import Schema, allowed, declared, listed
 from spectralzoom.flows.settings.settings import Settings
@@ -22,23 +20,9 @@ HEAD = """\
 """
 
 
-def about(one: Schema) -> str:
-    """Return the help of a setting, with its unit, the source of its default, and its choices."""
-    return str(one["about"]) + (f" ({listed(one)})" if "enum" in one else "")
-
-
-def toml_value(one: Schema) -> str:
-    """Return the default of a setting, or an example value, as TOML."""
-    return as_toml(one.get("usual") if one["example"] is None else one["example"])
-
-
-def as_toml(value: Any) -> str:
-    """Return a value as TOML."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return f"[{', '.join(map(as_toml, value))}]" if isinstance(value, tuple | list) else str(value)
+def about(one: Schema, *, usual: bool = False) -> str:
+    """Return the help of a setting with unit, source of the default and choices; with ``usual``, also its default."""
+    return str(one["description" if usual else "about"]) + (f" ({listed(one)})" if "enum" in one else "")
 
 
 def example_toml() -> str:
@@ -57,7 +41,7 @@ def example_toml() -> str:
 def _example_lines(name: str, one: Schema, *, off: bool) -> Iterator[str]:
     sign = "# " if off or one.get("usual") in (None, "") else ""
     help_lines = textwrap.wrap(about(one), WIDTH - COLUMN - 2, break_on_hyphens=False)
-    yield f"{sign}{name} = {toml_value(one)}".ljust(COLUMN - 1) + f" # {help_lines[0]}"
+    yield f"{sign}{name} = {one['shown']}".ljust(COLUMN - 1) + f" # {help_lines[0]}"
     yield from (" " * COLUMN + f"# {more}" for more in help_lines[1:])
 
 
@@ -76,7 +60,7 @@ def settings_table() -> str:
 def _shown(one: Schema) -> str:
     if "usual" not in one:
         return "to be given"
-    return "" if one["usual"] in (None, "") else f"`{toml_value(one)}`"
+    return "" if one["usual"] in (None, "") else f"`{one['shown']}`"
 
 
 def _values(one: Schema) -> str:

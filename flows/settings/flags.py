@@ -11,8 +11,8 @@ from typing import Annotated, Any
 from cyclopts import Group, Parameter
 from pydantic import BeforeValidator
 
-from spectralzoom.flows.settings.documents import about, toml_value
-from spectralzoom.flows.settings.load import declared
+from spectralzoom.flows.settings.documents import about
+from spectralzoom.flows.settings.load import declared, flag_of
 from spectralzoom.flows.settings.settings import MACHINE, OUTPUT, SCENE, TIME, Settings
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.setting_fields import numbers_of
@@ -44,7 +44,12 @@ Names = Annotated[  # with commas, one a flag, or both
 ]
 HelpAll = Annotated[bool, Parameter(negative="", help="Print the flags of every setting, and exit.")]
 GROUPS = {name: Group(name, sort_key=number) for number, name in enumerate((SCENE, TIME, OUTPUT, MACHINE))}
-KEYS = tuple(f"{table}.{key}".lstrip(".") for table, keys in declared(Settings).items() for key in keys)
+KEYS = tuple(  # of settings that may stand on a command line
+    f"{table}.{key}".lstrip(".")
+    for table, keys in declared(Settings).items()
+    for key, one in keys.items()
+    if not one.get("writeOnly")
+)
 
 
 def _flags(keys: Iterable[str], *, all_shown: bool) -> Any:
@@ -56,10 +61,9 @@ def _flags(keys: Iterable[str], *, all_shown: bool) -> Any:
     for full in keys:
         table, _, key = full.rpartition(".")
         one = declared(Settings)[table][key]
-        usual = "" if one.get("usual") is None else f"; default: {toml_value(one).strip(chr(34))}"
         kind: Any = bool if one.get("type") == "boolean" else str
         page: Any = {"group": GROUPS[one["group"]]} if one["group"] else {"show": all_shown}
-        flag = Parameter(name=f"--{full.replace('_', '-')}", help=about(one) + usual, **page)
+        flag = Parameter(name=flag_of(full), help=about(one, usual=True), **page)
         made.append((full.replace(".", "__"), Annotated[kind | None, flag], None))
     return make_dataclass("Flags", made, frozen=True, kw_only=True)
 
@@ -93,9 +97,10 @@ def print_every_flag() -> int:
     for title, keys in declared(Settings).items():
         print(f"\n[{title}]  {Settings.model_fields[title].description}" if title else "")
         for key, one in keys.items():
-            flag = f"--{title}.{key}".replace("--.", "--no-" if one.get("usual") is True else "--").replace("_", "-")
-            usual = "" if one.get("usual") in (None, "") else f"; default: {toml_value(one)}"
-            print(textwrap.fill(f"{flag:28} {about(one)}{usual}", 120, subsequent_indent=" " * 29))
+            if one.get("writeOnly"):
+                continue
+            flag = flag_of(f"{title}.{key}".lstrip("."), off=one.get("usual") is True)
+            print(textwrap.fill(f"{flag:28} {about(one, usual=True)}", 120, subsequent_indent=" " * 29))
     return 0
 
 

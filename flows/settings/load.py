@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from functools import cache
@@ -28,14 +27,15 @@ def declared(model: type[BaseModel]) -> dict[str, dict[str, Schema]]:
     found: dict[str, dict[str, Schema]] = {"": {}}
     for name, about in whole["properties"].items():
         if "$ref" in about:
-            found[name] = whole["$defs"][about["$ref"].rpartition("/")[2]]["properties"]
+            table = whole["$defs"][about["$ref"].rpartition("/")[2]]
+            found[name] = table["properties"] | table["hidden"]
         elif "group" in about:
             found[""][name] = about
     return found
 
 
 def allowed(about: Schema) -> str:
-    """Return the allowed values of a setting, for "must be ..."; empty where it has its own parser."""
+    """Return the allowed values of a setting, as after "must be"; empty for a type that says them itself."""
     if "enum" in about:
         return f"one of {listed(about)}"
     low, high, unit = about.get("minimum"), about.get("maximum"), about.get("unit")
@@ -44,7 +44,7 @@ def allowed(about: Schema) -> str:
         return f"a whole number from {low} to {high}"
     if kind == "number":
         span = f"of at least {low:g}" if high is None else f"from {low:g} to {high:g}"
-        return f"a number {span}" + (f" {unit}" if unit else "") + (" or inf" if about.get("usual") == math.inf else "")
+        return f"a number {span}" + (f" {unit}" if unit else "") + (" or inf" if about.get("usual") == "inf" else "")
     return {"boolean": "true or false", "string": "text that is not empty"}.get(str(kind), "")
 
 
@@ -54,11 +54,17 @@ def listed(about: Schema) -> str:
     return ("  " if any("," in word for word in words) else ", ").join(words)
 
 
+def flag_of(key: str, *, off: bool = False) -> str:
+    """Return the flag of a setting such as ``camera.samples``, or the one that turns it ``off``."""
+    table, dot, own = key.replace("_", "-").rpartition(".")
+    return f"--{table}{dot}{'no-' if off else ''}{own}"
+
+
 def place_of(key: str, origin: Mapping[str, str]) -> str:
     """Return how a message names a setting: as a flag, or with its file."""
     place = origin.get(key) or origin.get(key.partition(".")[0])
     if place == FLAG:
-        return f"--{key.replace('_', '-')}"
+        return flag_of(key)
     return f"'{key}'" + (f" in {place}" if place else "")
 
 
@@ -128,9 +134,9 @@ def anchor_paths(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 def known_only(table: Mapping[str, Any], model: type[BaseModel], origin: Mapping[str, str]) -> dict[str, Any]:
     """Return a table without absent values. Raises SettingsError: it has an unknown key, or true as a number."""
     tables = declared(model)
-    found = {name: value for name, value in table.items() if value is not None}
+    found = {str(name): value for name, value in table.items() if value is not None}
     for name, value in found.items():
-        if name not in tables:
+        if name not in tables or not name:
             _check("", name, value, tables, origin)
         elif isinstance(value, Mapping):
             found[name] = {key: one for key, one in value.items() if one is not None}
@@ -151,7 +157,7 @@ def _check(head: str, key: str, value: object, tables: Mapping[str, Any], origin
         return
     own = [*tables[head], *(name for name in tables if name and not head)]
     near = [f"{name}.{key}".lstrip(".") for name, keys in tables.items() if key in keys]
-    near = near or [prefix + name for name in difflib.get_close_matches(key, own, n=1, cutoff=0.5)]
+    near = near or [prefix + name for name in difflib.get_close_matches(key, own, n=1, cutoff=0.6)]
     hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(prefix + name for name in own)}"
     raise SettingsError(f"unknown setting {place}; {hint}")
 
@@ -166,8 +172,9 @@ def sentence_of(error: ValidationError, model: type[BaseModel], origin: Mapping[
     if first["type"] == "missing":
         missing = [str(one["loc"][1]) for one in error.errors() if one["type"] == "missing" and one["loc"][0] == head]
         return SettingsError(f"[{head}] lacks {', '.join(missing)}; give every one, or leave the table out")
-    if isinstance(cause, Exception) and key in tables:
-        return SettingsError(f"[{key}]: {cause}")
+    if key in tables:
+        wrong = cause or f"must be a table with its keys below it, got {first['input']!r}"
+        return SettingsError(f"[{key}]: {wrong}")
     place = place_of(key, origin)
     if isinstance(cause, Exception):
         joint = ": " if isinstance(cause, SettingsError) else " "

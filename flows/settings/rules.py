@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,35 +79,41 @@ def changed(settings: Settings, *names: str) -> list[str]:
     return found
 
 
-def mistakes(settings: Settings, origin: Mapping[str, str], *, stored: bool) -> Iterator[str]:
-    """Yield errors: settings that do not fit each other. A ``stored`` plan has its scan beside what chose it."""
-    checks = (_camera_errors, _scene_errors, _air_errors, _recorded_errors, _extent_errors, _limit_errors)
-    for check in checks if stored else (_scan_errors, *checks):
-        yield from check(settings, lambda name: place_of(name, origin))
+def mistakes(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+    """Yield errors: settings that do not fit each other. ``origin`` has the place of each setting that is stated."""
+
+    def at(name: str) -> str:
+        return place_of(name, origin)
+
+    if not settings.is_map:
+        yield from _scan_errors(settings, at, [name for name in changed(settings, *OF_THE_PLAN) if name in origin])
+    for check in (_camera_errors, _scene_errors, _air_errors, _recorded_errors, _extent_errors, _limit_errors):
+        yield from check(settings, at)
 
 
-def _scan_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
-    """Yield errors: settings that choose different scans."""
-    if settings.is_map:
-        return
-    # a first pass has them too
-    uniform = [] if settings.zoom == ALWAYS else changed(settings, "seconds", "scan_step")
-    passes = changed(settings, "budget", *(() if settings.macs else ("policy", "mask")))
+def _scan_errors(settings: Settings, at: Callable[[str], str], stated: Sequence[str]) -> Iterator[str]:
+    """Yield errors: ``stated`` settings that choose different scans."""
+    uniform = [name for name in ("seconds", "scan_step") if name in stated and settings.zoom != ALWAYS]
+    passes = [name for name in ("policy", "mask") if name in stated and not settings.macs]
+    passes += [name for name in ("budget",) if name in stated]
+    by_hand = [name for name in ("scan_step", "scan_exposure_ms") if name in stated]
     if uniform and passes:
         yield (
             f"{at(uniform[0])} asks for one uniform scan of the field, and {at(passes[0])} is for a survey that "
             "captures again; leave one of them out"
         )
-    if len(uniform) > 1:
+    if "scan_exposure_ms" in stated and settings.source == RECORDED:
+        yield f"{at('scan_exposure_ms')} is for a camera, and recorded lines have their own: leave it out"
+    if "seconds" in uniform and by_hand:
         yield (
-            f"{at(uniform[0])} leaves the choice of the scan to the weights' record, {at(uniform[1])} makes it: leave "
+            f"{at('seconds')} leaves the choice of the scan to the weights' record, {at(by_hand[0])} makes it: leave "
             "one out"
         )
-    exposure = at("scan_exposure_ms")
-    if settings.scan_exposure_ms is not None and settings.source == RECORDED:
-        yield f"{exposure} is for a camera, and recorded lines have their own: leave it out"
-    if settings.scan_exposure_ms is not None and not settings.zooms and settings.scan_step is None:
-        yield f"{exposure} is for lines that you choose: give --scan-step too (1 for every line), or --zoom always"
+    if by_hand == ["scan_exposure_ms"] and not settings.zooms:
+        yield (
+            f"{at('scan_exposure_ms')} is for lines that you choose: give --scan-step too (1 for every line), or "
+            "--zoom always"
+        )
 
 
 def _camera_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]:
@@ -225,8 +231,8 @@ def _limit_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
         )
     if settings.zooms and settings.macs is not None:
         yield (
-            f"{at('macs')} is for a uniform scan, and the survey takes two passes: leave it out, or --budget, "
-            "--zoom always and --policy"
+            f"{at('macs')} is for a uniform scan, and the survey takes two passes: leave it out, or --budget and "
+            "--zoom always"
         )
     if settings.macs is not None and settings.extent != WHOLE:
         yield f"{at('macs')} chooses among the patches of a whole field, {at('extent')} covers a part: leave one out"

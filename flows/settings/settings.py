@@ -5,7 +5,7 @@ The TOML, the flags, Prefect's form, the example file and the manual follow from
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -32,6 +32,7 @@ from spectralzoom.flows.settings.load import (
     nested,
     read_file,
     sentence_of,
+    unnested,
 )
 from spectralzoom.flows.settings.rules import completed, mistakes, with_source
 from spectralzoom.flows.settings.values import (
@@ -73,8 +74,7 @@ from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, U
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 OF_THE_MACHINE = ("scheduler", "workers", "bucket", "device")  # settings that depend on the machine of the survey
 MOST_STEP = 8  # greatest line spacing [px]
-AS_STORED = {"": "stored"}  # origin of settings that were checked before: nothing follows from them
-EVERY = "every value"  # context of a dump
+STORED = {"": "stored"}  # context of settings that were checked before: they are whole
 SCENE, TIME, OUTPUT, MACHINE = "Scene", "Time and accuracy", "Output", "Machine"  # groups of the help's first page
 
 
@@ -244,36 +244,31 @@ class Settings(BaseModel):
             table, origin = _over_file(table)
         table = known_only(table, cls, origin)
         try:
-            found = read(with_source(table) if origin is AS_STORED else completed(table))
+            found = read(with_source(table) if origin is STORED else completed(table))
         except ValidationError as error:
             raise sentence_of(error, cls, origin) from None
-        for wrong in mistakes(found, origin, stored=origin is AS_STORED):
+        for wrong in mistakes(found, origin):
             raise SettingsError(wrong)
+        found.model_fields_set.intersection_update(table)  # others follow from these
         return found
 
     @model_serializer(mode="wrap")
     def _changed_only(self, write: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
-        """Return all values; for a server those that differ from the defaults, with absolute paths."""
+        """Return all values; for a server those that a user would state, with absolute paths."""
         tables = declared(type(self))
-
-        def plain(settings: Settings) -> dict[str, Any]:
-            """Return all values, in tables only those of settings."""
-            return {
-                name: {key: value[key] for key in tables[name] if key in value} if name in tables and value else value
-                for name, value in write(settings).items()
-            }
-
-        if info.context is EVERY:
-            return plain(self)
-        usual = plain(Settings()) | {"source": AUTO}
-        return {name: value for name, value in anchor_paths(plain(self), Path.cwd()).items() if value != usual[name]}
+        table = {
+            name: {key: value[key] for key in tables[name] if key in value} if name in tables and value else value
+            for name, value in write(self).items()
+        }
+        return table if info.context is STORED else nested(to_state(anchor_paths(table, Path.cwd())))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for the receipt, without the password; `parse_settings` reads them back."""
-        return self.model_dump(mode="json", context=EVERY)
+        """Return plain values for the receipt, without the password and without parameters of models."""
+        return self.model_dump(mode="json", context=STORED)
 
     def but(self, **changes: object) -> Self:
         """Return the settings with other values, which are not checked."""
+        assert changes.keys() <= type(self).model_fields.keys()
         return self.model_copy(update=changes)
 
     @property
@@ -347,23 +342,37 @@ def load_settings(
     path: str | Path | None = None,
     flags: Mapping[str, object] | None = None,
     *,
-    usual: Mapping[str, object] | None = None,
+    usual: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda stated: {},
 ) -> Settings:
     """Return the checked settings of a TOML file (None: no file) and of flags, which override it.
 
     Relative paths in the file start at its folder, those of flags at the current one. Flags have the keys of the file,
-    with ``camera.exposure_ms`` for a key in a table; a value None is ignored. ``usual`` overrides the defaults.
+    with ``camera.exposure_ms`` for a key in a table; a value None is ignored. ``usual`` gives other defaults for what
+    is stated.
+
     Raises SettingsError, BudgetError: the first key that is not allowed, with its place and the allowed values.
     """
     table, origin = read_file(path)
-    below = merged(usual or {}, table)
     given = {key: value for key, value in (flags or {}).items() if value is not None}
-    return _checked(merged(below, nested(given)), origin | dict.fromkeys(given, FLAG))
+    stated = merged(table, nested(given))
+    return _checked(merged(usual(stated), stated), origin | dict.fromkeys(given, FLAG))
 
 
 def parse_settings(table: Mapping[str, object]) -> Settings:
-    """Return the settings of a receipt, of which nothing follows. Raises SettingsError: a value is not allowed."""
-    return _checked(table, AS_STORED)
+    """Return the settings of a receipt; nothing is completed. Raises SettingsError: a value is not allowed."""
+    return _checked(table, STORED)
+
+
+def to_state(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a whole table that a user would state to get it, by keys such as ``camera.samples``.
+
+    They differ from the defaults, or from what would follow from the others.
+    """
+    usual, every = unnested(Settings().to_dict()), unnested(table)
+    found = {key: one for key, one in every.items() if one is not None and one != usual.get(key) and key != "source"}
+    filled = usual | completed(nested(found))
+    kept = [key for key in ("source", "scene", "extent", "budget") if every.get(key) not in (None, filled[key])]
+    return {key: every[key] for key in (*found, *kept)}
 
 
 def _checked(table: Mapping[str, object], origin: Mapping[str, str]) -> Settings:
@@ -380,5 +389,9 @@ def _over_file(table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]
         raise SettingsError(
             "rig.password is not allowed as a parameter, since a server stores it; write it into settings_file"
         )
-    below, origin = read_file(table.get("settings_file"))
-    return merged(below, {key: value for key, value in table.items() if key != "settings_file"}), origin
+    file = table.get("settings_file") or None  # a form sends empty text
+    if not isinstance(file, str | Path | None):
+        raise SettingsError(f"settings_file must be the path of a TOML file, got {file!r}")
+    below, origin = read_file(file)
+    stated = {key: one for key, one in unnested(table).items() if one is not None and key != "settings_file"}
+    return merged(below, nested(stated)), origin | dict.fromkeys(stated, "")

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import reduce
-from operator import getitem
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from spectralzoom.flows.settings.load import merged, nested
-from spectralzoom.flows.settings.rules import OF_THE_PLAN, changed
+from spectralzoom.flows.settings.load import merged, nested, unnested
+from spectralzoom.flows.settings.rules import OF_THE_PLAN, changed, completed
 from spectralzoom.flows.settings.settings import MOST_STEP, Settings, parse_settings
-from spectralzoom.flows.settings.values import ALWAYS, BUILT_IN_SCENES, RECORDED
+from spectralzoom.flows.settings.values import ALWAYS, AUTO, BUILT_IN_SCENES, RECORDED
 from spectralzoom.flows.tasks.scene import unlit_scene
 from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.flows.terminal.figures import known_number
@@ -36,17 +35,18 @@ OF_THE_RUN = (
 BUILT_IN_WEIGHTS = "farm"
 
 
-def as_its_run(settings: Settings) -> Settings:
-    """Return settings of recorded sweeps with those of the run that took them, where nothing else is stated.
+def usual_of_recording(stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the defaults beside stated ``sweeps``: the settings of the run that took them; empty for others.
 
     So `survey --sweeps ARCHIVE/runs/NAME` plans as that run did, and its visit is the time of that run.
     Raises SceneError, ArchiveError: there is no such recording or run.
     """
-    found = None if settings.sweeps is None else find_recorded_run(settings.sweeps)
+    sweeps = stated.get("sweeps") if stated.get("source", AUTO) in (AUTO, RECORDED) else None
+    found = find_recorded_run(sweeps) if isinstance(sweeps, str | Path) else None
     if found is None:
-        return settings
+        return {}
     run, shape, _ = found
-    requested = set(changed(settings, *OF_THE_PLAN))
+    requested = {name for name in OF_THE_PLAN if stated.get(name) is not None}
     uniform = run.settings.get("zoom") != ALWAYS and (run.settings.get("seconds") or run.settings.get("scan_step"))
     another_plan = requested - {"macs"} if uniform else requested & {"seconds", "scan_step", "macs"}
     names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
@@ -57,9 +57,17 @@ def as_its_run(settings: Settings) -> Settings:
     usual |= {} if shape is None else {"size": shape[::-1]}
     if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
         usual["weights"] = BUILT_IN_WEIGHTS
-    stated = settings.to_dict()
-    kept = {key: reduce(getitem, key.split("."), stated) for key in changed(settings, *usual)}
-    return parse_settings({**stated, **merged(usual, nested(kept))})
+    return usual
+
+
+def as_its_run(settings: Settings) -> Settings:
+    """Return settings of recorded sweeps with those of the run that took them, where nothing else is stated."""
+    names = settings.model_fields_set
+    tables = set(changed(settings, *names))
+    every = unnested(settings.to_dict())
+    stated = nested({key: one for key, one in every.items() if key in tables or key in names})
+    usual = usual_of_recording(stated)
+    return parse_settings(completed(merged(usual, stated))) if usual else settings
 
 
 def open_recorded(settings: Settings) -> tuple[Settings, Recording]:

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from spectralzoom.flows.settings.documents import as_toml
 from spectralzoom.flows.settings.flags import AsJson, Switch
 from spectralzoom.flows.terminal.figures import counted
 from spectralzoom.flows.terminal.processes import DONE, writing
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
 from spectralzoom.pipeline.errors import PipelineError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
+from spectralzoom.pipeline.toml_files import as_toml
 from spectralzoom.storage.readers import label_files
 from spectralzoom.storage.readers.band_facts import bands_text
 from spectralzoom.storage.readers.cube_sources import CubeSource

@@ -23,7 +23,7 @@ from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.recorded_field import as_its_run
+from spectralzoom.flows.tasks.recorded_field import as_its_run, usual_of_recording
 from spectralzoom.flows.terminal.processes import DONE, PARTLY
 from spectralzoom.models.weights.files import save_weights
 from spectralzoom.pipeline.errors import SceneError, SettingsError
@@ -223,6 +223,10 @@ def test_a_survey_of_a_run_keeps_its_reference(tmp_path: Path, survey_png: Surve
     own = {"expected_loss": 0, "signal.step": 2}
     run = survey_png(tmp_path / "sim", budget=None, keep="raw", labels=None, **NARROW, **asked, **own)
     assert run.receipt["settings"]["scan_exposure_ms"] < 100
+    stated = {"sweeps": str(run.folder), "expected_loss": "0.3", "zoom": "always", "signal.false_alarm": "0.02"}
+    for found in (load_settings(None, stated, usual=usual_of_recording), as_its_run(load_settings(None, stated))):
+        assert (found.expected_loss, found.seconds, found.budget) == (0.3, 15, None)  # a stated default counts
+        assert (found.signal.step, found.signal.false_alarm) == (2, 0.02)
     again = survey_sweeps(tmp_path / "again", run.folder).receipt
     assert [again["settings"][name] for name in ("expected_loss", "signal")] == [0, run.receipt["settings"]["signal"]]
     assert again["recording"]["full_scan_s"] == run.receipt["savings"]["capture_s"]["full"]

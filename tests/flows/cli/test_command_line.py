@@ -71,8 +71,8 @@ def test_the_first_page_of_help_is_short(capsys: pytest.CaptureFixture[str]) -> 
     with pytest.raises(SystemExit):
         cli.main(["survey", "--help-all"])
     shown = capsys.readouterr().out.split()
-    assert {f"--{key.replace('_', '-')}" for key in KEYS} - set(shown) == {"--accuracy"}
-    assert "--no-accuracy" in shown
+    assert {f"--{key.replace('_', '-')}" for key in KEYS} - set(shown) == {"--accuracy", "--rig.white-at-rest"}
+    assert {"--no-accuracy", "--rig.no-white-at-rest"} <= set(shown)
 
 
 @pytest.mark.parametrize("verb", VERBS)

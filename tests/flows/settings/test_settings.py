@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import tomllib
 from dataclasses import fields
 from datetime import UTC, datetime
@@ -12,9 +13,12 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
+from spectralzoom.flows.archive.commands import command
+from spectralzoom.flows.cli.main import build_app
 from spectralzoom.flows.settings.documents import example_toml, settings_table
-from spectralzoom.flows.settings.flags import KEYS
+from spectralzoom.flows.settings.flags import KEYS, by_setting
 from spectralzoom.flows.settings.load import declared, nested
 from spectralzoom.flows.settings.settings import Settings, load_settings, parse_settings
 from spectralzoom.flows.settings.values import Tolerance
@@ -194,7 +198,7 @@ def test_numbers_are_finite_and_no_truth_values(key, about):
     """Infinity is allowed only where it is the default; NaN and true are never allowed."""
     pose = {f"pose.{name}": value for name, value in POSE.items()} if key.startswith("pose.") else {}
     for value in (True, math.nan, -math.inf, math.inf, "nan"):
-        if value is not True and value == about.get("usual"):
+        if str(value) == about.get("usual"):
             assert load_settings(flags={key: value}) == Settings()
             continue
         with pytest.raises(SettingsError, match=rf"^--{key.replace('_', '-')} must be a (whole )?number"):
@@ -322,10 +326,7 @@ VALUES = st.recursive(
 )
 
 
-@given(
-    st.dictionaries(st.sampled_from([key for key in KEYS if key != "rig.password"]), VALUES, min_size=1, max_size=4),
-    st.booleans(),
-)
+@given(st.dictionaries(st.sampled_from(KEYS), VALUES, min_size=1, max_size=4), st.booleans())
 def test_any_values_give_settings_or_one_sentence(values, stored):
     """Values of any type are read back from the receipt as they are, or refused in one line that names a setting."""
     try:
@@ -336,3 +337,58 @@ def test_any_values_give_settings_or_one_sentence(values, stored):
         sentence = ""
         assert parse_settings(settings.to_dict()) == settings
     assert "\n" not in sentence
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"scene": "x.tif", "source": "sim", "scan_step": 2},
+        {"prior": "latest", "seconds": 5, "extent": "whole"},
+        {"rig.mirror_axes": "-x,-y", "rig.white_at_rest": False, "source": "rig", "scene": "field"},
+        {"scene": "-x.tif", "accuracy": False, "bands": "0-2", "size": None},
+        {
+            "policy": "sobel",
+            "pose.lon_deg": -3,
+            **{f"pose.{key}": one for key, one in POSE.items() if key != "lon_deg"},
+        },
+        {"size": "64x32", "tol": "0.5dn", "wavelengths": "660.5", "bands": "3", "visit": "first of June"},
+    ],
+)
+def test_settings_are_stated_on_a_command_line_and_to_a_server(asked, monkeypatch, tmp_path):
+    """The command of a receipt and the parameters of a run give the same settings again."""
+    monkeypatch.chdir(tmp_path)
+    settings = load_settings(flags=asked)
+    words = shlex.split(command(json.loads(to_json(settings.to_dict())), "archive"))[1:]
+    _, bound, _ = build_app(listed=False).parse_args(words, exit_on_error=False, print_error=False)
+    assert load_settings(flags=by_setting(bound.arguments["flags"])) == settings
+    again = Settings(**json.loads(settings.model_dump_json()))
+    paths = {name: str(tmp_path / getattr(settings, name)) for name in ("out", "scene") if name in settings.to_dict()}
+    assert again == settings.but(out=paths["out"], scene=again.scene)
+
+
+def test_parameters_win_over_their_file_unless_they_are_null(toml):
+    """An error names the file only for what the file has; emptied fields of a form do not count."""
+    file = str(toml("seconds = 30\n[camera]\nexposure_ms = 50\n"))
+    found = Settings(settings_file=file, seconds=None, camera={"exposure_ms": None, "samples": 320})
+    assert (found.seconds, found.camera.exposure_ms, found.camera.samples) == (30, 50, 320)
+    assert Settings(settings_file="", seconds=4).seconds == 4
+    with pytest.raises(ValidationError, match=r"'seconds' must be a number .* got 'abc'"):
+        Settings(settings_file=file, seconds="abc")
+    with pytest.raises(ValidationError, match="settings_file must be the path of a TOML file, got 5"):
+        Settings(settings_file=5)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ({"policy": "mask", "mask": "m.png", "scan_step": 2}, "--scan-step asks for one uniform scan .* --policy is"),
+        ({"seconds": 9, "scan_exposure_ms": 25}, "--seconds leaves the choice of the scan .* --scan-exposure-ms makes"),
+        ({"scan_exposure_ms": 25}, "--scan-exposure-ms is for lines that you choose: give --scan-step too"),
+        ({"camera": Optics()}, r"\[camera\]: must be a table"),
+        ({"": 5}, "unknown setting --"),
+    ],
+)
+def test_contradictions_name_what_was_stated(flags, words):
+    """And not what follows from it."""
+    with pytest.raises(SettingsError, match=words):
+        load_settings(flags=flags)
