@@ -156,16 +156,22 @@ class InterruptedRunner(Runner):
 
 
 def _serve(deployments: Sequence[Any], limit: int, said: str) -> None:
-    """Serve the deployments until SIGINT or SIGTERM, which pause them, as `prefect.serve` does.
+    """Serve the deployments until SIGINT or SIGTERM, as `prefect.serve` does, then pause them.
 
     Raises PipelineError: Prefect's server does not answer, or its temporary folder belongs to another user.
     """
     began = datetime.now(UTC)
     try:
-        runner = InterruptedRunner(limit=limit)
-        _prepare([runner.add_deployment(one) for one in deployments], began)
+        runner = InterruptedRunner(limit=limit, pause_on_shutdown=False)  # SIGTERM would pause the first one only
+        served: list[Any] = [runner.add_deployment(one) for one in deployments]
+        _prepare(served, began)
         show_text(said)
-        asyncio.run(runner.start())
+        try:
+            asyncio.run(runner.start())
+        finally:
+            with get_client(sync_client=True) as client:
+                for one in served:
+                    client.pause_deployment(one)
     except (HTTPError, ExceptionGroup) as error:
         raise PipelineError(
             f"Prefect's server does not answer as expected ({error}): start it, then the same command serves again"
