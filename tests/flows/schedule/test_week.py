@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ import httpx
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.filters import FlowRunFilter
-from prefect.exceptions import ObjectNotFound
 from prefect.settings import temporary_settings
 from prefect.states import Cancelled, Cancelling, Pending
 
@@ -27,7 +26,7 @@ from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked
 from tests.flows.conftest import problems, server_for_all
-from tests.flows.schedule.test_deployments import PATIENCE_S, ROOT, planned, run_here, settings_of
+from tests.flows.schedule.test_deployments import PATIENCE_S, ROOT, planned, run_here
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
@@ -91,3 +90,74 @@ def test_a_week_of_visits(field_file: Callable[..., Path], prefect_home: Path, t
         assert [run.settings["visit"] for run in own] == due
         assert [run.receipt.get("prior_map") is None for run in own] == [True] + [False] * (len(due) - 1)
     assert problems(tmp_path / "archive") == []
+
+
+@contextmanager
+def serving(file: Path, port: int, **environment: str) -> Iterator[subprocess.Popen[str]]:
+    """Run `serve` for a field in another process for the block, with a runner that asks every second."""
+    known = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1", **environment}
+    words = [sys.executable, "-m", "spectralzoom.flows.cli.main", "serve", file, "--every", "365d", "--port", port]
+    with subprocess.Popen(list(map(str, words)), cwd=ROOT, env=known, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            assert any(line.startswith("serving") for line in process.stderr)
+            yield process
+        finally:
+            process.kill()
+
+
+def ask(name: str) -> Any:
+    """Ask for a run of a field, due now; return its id."""
+    with get_client(sync_client=True) as asked:
+        return planned(asked.read_deployment_by_name(f"survey/{name}").id, datetime.now(UTC)).id
+
+
+def wait_until(run: Any, *states: str) -> None:
+    """Wait until a run is in one of the states."""
+    end = time.monotonic() + PATIENCE_S
+    with get_client(sync_client=True) as asked:
+        while (state := asked.read_flow_run(run).state.name) not in states:
+            assert time.monotonic() < end, state
+            time.sleep(0.2)
+
+
+def test_accidents_of_a_served_week(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """Two fields of two schedules share a server, are due at once, and go on after a kill with the archive whole.
+
+    A lock on the archive holds surveys in mid-run, as long ones.
+    """
+    north, south = (field_file(name, source="raster", budget=None) for name in ("north", "south"))
+    root = Archive.open(tmp_path / "archive").root
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    api, password = f"http://127.0.0.1:{port}/api", root / ".prefect" / "password"
+    with ExitStack() as stack:
+        first = stack.enter_context(serving(north, port))
+        known = {"PREFECT_API_URL": api, "PREFECT_API_AUTH_STRING": password.read_text().strip()}
+        second = stack.enter_context(serving(south, port, **known))
+        stack.enter_context(temporary_settings({"api.url": api, "api.auth_string": known["PREFECT_API_AUTH_STRING"]}))
+        for run in [ask("north"), ask("south")]:
+            wait_until(run, "Completed")
+        with locked(root / ".locks" / "use.lock"):
+            outlives = ask("north")
+            wait_until(outlives, "Running")
+            wait_until(ask("north"), "Cancelled")
+        wait_until(outlives, "Completed")
+        with locked(root / ".locks" / "use.lock"):
+            by_hand = ask("north")
+            wait_until(by_hand, "Running")
+            with get_client(sync_client=True) as asked:
+                asked.set_flow_run_state(by_hand, Cancelling())
+            wait_until(by_hand, "Cancelled")
+            killed = ask("north")
+            wait_until(killed, "Running")
+            first.send_signal(signal.SIGKILL)
+            first.wait()
+            assert second.wait(PATIENCE_S) == 1
+        stack.enter_context(serving(north, port))
+        wait_until(killed, "Crashed", "Completed")  # its process outlives the killed server, and may end before
+        for run in [ask("north"), ask("south")]:
+            wait_until(run, "Completed")
+        assert second.poll() is None
+    assert problems(root) == []
