@@ -59,7 +59,7 @@ def serve(
     every
         Or an interval: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
     timezone
-        Time zone of --cron, such as Europe/Berlin; this machine's by default.
+        Time zone, such as Europe/Berlin; by default this machine's for --cron, and UTC for --every.
     out
         Archive for all fields; by default that of each field's settings.
     limit

@@ -154,7 +154,6 @@ def test_accidents_of_a_served_week(field_file: Callable[..., Path], tmp_path: P
             wait_until(killed, "Running")
             first.send_signal(signal.SIGKILL)
             first.wait()
-            assert second.wait(PATIENCE_S) == 1
         stack.enter_context(serving(north, port))
         wait_until(killed, "Crashed", "Completed")  # its process outlives the killed server, and may end before
         for run in [ask("north"), ask("south")]:
