@@ -5,9 +5,11 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -22,13 +24,7 @@ from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.survey import carry_out, survey_field
-from spectralzoom.flows.tasks.local_server import (
-    ServerUnavailable,
-    check_answers,
-    local_server,
-    quiet_environment,
-    wait_until_recorded,
-)
+from spectralzoom.flows.tasks.local_server import ServerUnavailable, local_server
 from spectralzoom.flows.tasks.observer import Observer, observed_by
 from spectralzoom.flows.tasks.scene import farm_refusal
 from spectralzoom.flows.terminal.progress import StageProgress
@@ -36,6 +32,8 @@ from spectralzoom.models.network.machine import give_back_freed_memory, keep_fre
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked, remove
+
+ANSWERED_WITHIN_S, RECORDED_WITHIN_S = 10.0, 5.0
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -76,7 +74,7 @@ def _survey(settings: Settings, console: Console) -> RunRef:
         try:
             with _prefect_server(settings.out):
                 state = survey(settings, return_state=True)
-                wait_until_recorded(state.state_details.flow_run_id)
+                _wait_until_recorded(state.state_details.flow_run_id)
                 return state.result()
         except ServerUnavailable as error:
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
@@ -105,8 +103,15 @@ def _prefect_server(out: str) -> Iterator[None]:
 
     A second survey of the archive has a temporary folder of its own. Raises ServerUnavailable.
     """
-    if "PREFECT_API_URL" in os.environ:
-        check_answers(os.environ["PREFECT_API_URL"])
+    if (named := os.environ.get("PREFECT_API_URL")) is not None:
+        import httpx
+
+        try:
+            httpx.get(f"{named.rstrip('/')}/health", timeout=ANSWERED_WITHIN_S)  # any answer, also a refusal
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            raise ServerUnavailable(
+                f"no Prefect server answers at {named}, which PREFECT_API_URL names ({error}): start it, or unset that"
+            ) from error
         yield
         return
     root = Archive.open(out).root
@@ -115,5 +120,19 @@ def _prefect_server(out: str) -> Iterator[None]:
         if not is_held:
             home = root / f".prefect-{os.getpid()}"
             atexit.register(remove, home)
-        with quiet_environment(home), local_server(home):
+        with local_server(home):
             yield
+
+
+def _wait_until_recorded(flow_run: Any) -> None:
+    """Wait for the final states of the tasks of a flow run, for 5 s at most: they are reported in batches."""
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import FlowRunFilter
+
+    of_run = FlowRunFilter.model_validate({"id": {"any_": [flow_run]}})
+    end = time.monotonic() + RECORDED_WITHIN_S
+    with suppress(Exception), get_client(sync_client=True) as client:  # the server may have stopped
+        while time.monotonic() < end:
+            if all(run.state and run.state.is_final() for run in client.read_task_runs(flow_run_filter=of_run)):
+                return
+            time.sleep(0.1)

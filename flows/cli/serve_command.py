@@ -1,11 +1,9 @@
-"""Serve fields by Prefect: check every field, then run its schedules and surveys until stopped."""
+"""Serve fields by Prefect: check every field, then run its schedule until stopped."""
 
 from __future__ import annotations
 
 import asyncio
 import os
-import re
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime, timedelta
@@ -23,19 +21,15 @@ from prefect.runner import Runner
 from prefect.states import Cancelled, Crashed
 from pydantic import ValidationError
 
+from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.archive.reprocess_flow import ONE_AT_A_TIME, reprocess_deployment
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.prefect_flow import survey
 from spectralzoom.flows.settings.settings import Settings, load_settings
-from spectralzoom.flows.tasks.local_server import check_answers, local_server, quiet_environment
+from spectralzoom.flows.tasks.local_server import configured, local_server
 from spectralzoom.flows.tasks.rig_field import RIG_LIMIT
-from spectralzoom.flows.tasks.survey_model import weights_path
-from spectralzoom.flows.terminal.processes import DONE, terminable
+from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import show_text
-from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
-from spectralzoom.pipeline.toml_files import read_toml
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked
 
@@ -43,7 +37,9 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def serve(
-    *fields: Path,
+    fields: list[Path],
+    /,
+    *,
     cron: str | None = None,
     every: timedelta | None = None,
     timezone: str | None = None,
@@ -62,7 +58,7 @@ def serve(
     every
         Or an interval: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
     timezone
-        Time zone of --cron, such as Europe/Berlin; this machine's by default.
+        Time zone, such as Europe/Berlin; by default this machine's for --cron, and UTC for --every.
     out
         Archive for all fields; by default that of each field's settings.
     limit
@@ -74,19 +70,26 @@ def serve(
     served = load_fields(fields, out)
     archives = {settings.out: Archive.open(settings.out).root for settings in served.values()}
     home = next(iter(archives.values())) / ".prefect"
-    with suppress(KeyboardInterrupt), terminable(), ExitStack() as held:
-        for name, root in archives.items():
-            if not held.enter_context(locked(root / ".locks" / "serve.lock", wait=False)):
-                raise ArchiveError(
-                    f"another serve uses the archive {name}; give all its fields to that one, or stop it"
-                )
-        pages = _start_server(home, port, held)
-        tempfile.tempdir = str(home)  # for Prefect's runner: another user may own its folder in /tmp
-        when = cron or f"every {every}".removesuffix(", 0:00:00")
-        show_text(f"serving {', '.join(str(one.name) for one in served.values())}, {when}; Ctrl-C stops it")
-        show_text(f"Prefect's pages: {pages}")
-        surveys = [survey_deployment(file, settings, schedule) for file, settings in served.items()]
-        _serve([*surveys, *map(reprocess_deployment, archives)], limit or len(served) + 1)
+    with suppress(KeyboardInterrupt), ExitStack() as held:
+
+        def hold(out: str, name: str) -> bool:
+            return held.enter_context(locked(archives[out] / ".locks" / f"{name}.lock", wait=False))
+
+        for settings in served.values():
+            if not hold(settings.out, f"serve-{settings.name}"):
+                raise ArchiveError(f"another serve surveys {settings.name} into {settings.out}: stop that one first")
+        deployments = [survey_deployment(file, settings, schedule) for file, settings in served.items()]
+        deployments += [reprocess_deployment(out) for out in archives if hold(out, "serve")]  # one serve has it
+        if (pages := os.environ.get("PREFECT_API_URL")) is not None:
+            held.enter_context(configured(home, **{"api.url": pages}))
+        elif hold(next(iter(archives)), "prefect"):
+            pages = held.enter_context(local_server(home, port, schedules=True))
+            show_text(f"the password of Prefect's pages is in {home / 'password'}")
+        else:
+            raise ArchiveError(f"another serve or survey uses {home}: name its server in PREFECT_API_URL, or stop it")
+        names = ", ".join(str(settings.name) for settings in served.values())
+        said = f"serving {names} at {pages.rstrip('/').removesuffix('/api')}; Ctrl-C stops it"
+        _serve(deployments, limit or len(served) + 1, said)
     show_text("stopped: no run starts from now on; the same command serves again")
     return DONE
 
@@ -96,25 +99,18 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> dict[Path, Set
 
     Raises PipelineError: a field cannot be surveyed; the message names its file.
     """
-    if not files:
-        raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
     fields: dict[str, tuple[Path, Settings]] = {}
     for file in files:
-        settings = load_settings(file, {"out": out})
-        if "scene" not in read_toml(file) and settings.source != "rig":
-            raise SettingsError(
-                f"{file} has neither scene nor source = 'rig'; set the field's scene ('field' for sweeps), or its rig"
-            )
-        name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
+        given = load_settings(file, {"out": out})
+        name = given.name or file.stem
         if name in fields:
             raise SettingsError(
                 f'{fields[name][0]} and {file} are both called {name}: give one of them another name = "..."'
             )
-        settings = settings.but(name=name, out=str(Path(settings.out).absolute()))
+        settings = load_settings(file, {"out": str(Path(given.out).absolute()), "name": name})
         try:
-            plan_survey(open_field(settings, planning=True))
+            dry_run(settings)
         except NoSceneYet as error:
-            describe_weights(weights_path(settings))  # raises where they are invalid
             show_text(f"{name}: {error}; each due run looks for it again")
         except PipelineError as error:
             raise type(error)(f"{file}: {error}") from error
@@ -137,33 +133,17 @@ def survey_deployment(file: Path, settings: Settings, schedule: Any) -> Any:
 
 def schedule_of(cron: str | None, every: timedelta | None, timezone: str | None = None) -> Any:
     """Return Prefect's schedule for a cron line in a time zone, or for an interval; SettingsError for others."""
-    if (cron is None) == (every is None):
-        got = "neither" if cron is None else "both"
-        raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
     try:
-        if every is not None and timezone is not None:
-            raise SettingsError("--timezone is that of --cron, and --every counts from midnight UTC; leave one out")
-        if every is not None:
-            return IntervalSchedule(interval=every, anchor_date=EPOCH, timezone="UTC")
-        return CronSchedule(cron=str(cron), timezone=timezone or tzlocal.get_localzone_name())
+        if every is not None and cron is None:
+            return IntervalSchedule(interval=every, anchor_date=EPOCH, timezone=timezone or "UTC")
+        if cron is not None and every is None:
+            return CronSchedule(cron=cron, timezone=timezone or tzlocal.get_localzone_name())
+        wrong = "neither --every nor --cron" if cron is None else "both --every and --cron"
     except ValidationError as error:
-        raise SettingsError(
-            f"no such schedule: {error.errors()[0]['msg']}; expected such as --every 30m or --cron '0 6 * * *' "
-            "--timezone Europe/Berlin"
-        ) from None
-
-
-def _start_server(home: Path, port: int, held: ExitStack) -> str:
-    """Start a server on this machine until ``held`` ends, or use that of PREFECT_API_URL; return its pages' address.
-
-    Raises SettingsError: that server does not answer, or the port is in use.
-    """
-    held.enter_context(quiet_environment(home))
-    if (named := os.environ.get("PREFECT_API_URL")) is not None:
-        check_answers(named)
-        return named.rstrip("/").removesuffix("/api")
-    api = held.enter_context(local_server(home, port, schedules=True))
-    return f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
+        wrong = error.errors()[0]["msg"]
+    raise SettingsError(
+        f"no such schedule: {wrong}; expected --every 30m, or --cron '0 6 * * *' --timezone Europe/Berlin"
+    )
 
 
 class InterruptedRunner(Runner):
@@ -174,13 +154,17 @@ class InterruptedRunner(Runner):
         raise KeyboardInterrupt
 
 
-def _serve(deployments: Sequence[Any], limit: int) -> None:
-    """Serve the deployments until SIGINT or SIGTERM, then pause them. Raises PipelineError: the server is away."""
+def _serve(deployments: Sequence[Any], limit: int, said: str) -> None:
+    """Serve the deployments until SIGINT or SIGTERM, as `prefect.serve` does, then pause them.
+
+    Raises PipelineError: Prefect's server does not answer, or its temporary folder belongs to another user.
+    """
     began = datetime.now(UTC)
     try:
-        runner = InterruptedRunner(pause_on_shutdown=False, limit=limit)  # it would pause the first one only
+        runner = InterruptedRunner(limit=limit, pause_on_shutdown=False)  # SIGTERM would pause the first one only
         served: list[Any] = [runner.add_deployment(one) for one in deployments]
         _prepare(served, began)
+        show_text(said)
         try:
             asyncio.run(runner.start())
         finally:
@@ -189,8 +173,10 @@ def _serve(deployments: Sequence[Any], limit: int) -> None:
                     client.pause_deployment(one)
     except (HTTPError, ExceptionGroup) as error:
         raise PipelineError(
-            f"Prefect's server does not answer as expected ({error}); the same command serves again"
+            f"Prefect's server does not answer as expected ({error}): start it, then the same command serves again"
         ) from error
+    except PermissionError as error:
+        raise PipelineError(f"{error.filename} belongs to another user: set TMPDIR to a folder of your own") from error
 
 
 def _prepare(deployments: Sequence[Any], now: datetime) -> None:

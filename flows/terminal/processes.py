@@ -137,12 +137,12 @@ def place_caches() -> Path | None:
 
 
 def place_pages() -> dict[str, str]:
-    """Return variables that let Prefect's server unpack its pages in the cache folder, if its own is read-only."""
+    """Return a setting that lets Prefect's server unpack its pages in the cache folder, if its own is read-only."""
     found = importlib.util.find_spec("prefect")
     folder = cache_folder()
     if folder is None or os.access(Path(str(found and found.origin)).parent / "server", os.W_OK | os.X_OK):
         return {}
-    return {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(folder / "spectralzoom" / "prefect-pages")}
+    return {"server.ui.static_directory": str(folder / "spectralzoom" / "prefect-pages")}
 
 
 def cache_folder() -> Path | None:

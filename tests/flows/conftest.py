@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +20,7 @@ from PIL import Image
 
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.stage import Stage
-from spectralzoom.flows.tasks.local_server import QUIET, local_server
+from spectralzoom.flows.tasks.local_server import CONSOLE, local_server
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.runs import verify_everything
 from spectralzoom.storage.store import Archive
@@ -189,15 +190,24 @@ def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Yield a folder for Prefect's files, set before the first import of Prefect, which reads its settings once."""
     home = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
+        for name, value in {CONSOLE: "CRITICAL", "DO_NOT_TRACK": "1", "PREFECT_HOME": str(home)}.items():
             patch.setenv(name, value)
         yield home
+
+
+@contextmanager
+def server_for_all(home: Path, **options: bool) -> Iterator[str]:
+    """Run a server and name it in the environment, for commands of this process and for others; yield its API."""
+    with local_server(home, **options) as api, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PREFECT_API_URL", api)
+        patch.setenv("PREFECT_API_AUTH_STRING", (home / "password").read_text().strip())
+        yield api
 
 
 @pytest.fixture(scope="module")
 def server(prefect_home: Path) -> Iterator[str]:
     """Yield the API address of a Prefect server that all flows of a module share."""
-    with local_server(prefect_home) as api:
+    with server_for_all(prefect_home) as api:
         yield api
 
 

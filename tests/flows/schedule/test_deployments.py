@@ -22,10 +22,10 @@ import yaml
 
 from spectralzoom.flows.cli.serve_command import _prepare, load_fields, schedule_of, survey_deployment
 from spectralzoom.flows.tasks import rig_field
-from spectralzoom.flows.tasks.local_server import local_server
 from spectralzoom.flows.tasks.rig_field import RIG_LIMIT, RigHold
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
+from tests.flows.conftest import server_for_all
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 300.0
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 @pytest.fixture(scope="module")
 def scheduling(prefect_home: Path) -> Iterator[str]:
     """Yield the API address of a server that schedules and watches deployments."""
-    with local_server(prefect_home / "scheduling", schedules=True) as api:
+    with server_for_all(prefect_home / "scheduling", schedules=True) as api:
         yield api
 
 
@@ -248,7 +248,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
             process.kill()
     lines = (tmp_path / "said").read_text().splitlines()
     began, ended = (one for one in lines if one.startswith("survey-north-20"))
-    assert [line.split()[0] for line in lines if line not in (began, ended)] == ["serving", "Prefect's", "stopped:"]
+    assert [line.split()[0] for line in lines if line not in (began, ended)] == ["serving", "stopped:"]
     assert began.endswith("Z: started")
     wanted = rf"{began.removesuffix('started')}completed after [\d.]+ s\. {re.escape(run.state.message)}"
     assert re.fullmatch(wanted, ended), ended

@@ -1,63 +1,140 @@
-"""Prefect's server in this process: its access control and its initial database."""
+"""Prefect's server in this process: who may use it, its files, and its initial database."""
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
 import sqlite3
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import httpx
 import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
-from spectralzoom.flows.tasks.local_server import ServerUnavailable, create_database, local_server
+from spectralzoom.flows.tasks.local_server import ServerUnavailable, copy_tables, local_server, private_files
+
+FOREIGN = "http://evil.example"
 
 
 def test_a_server_without_a_place_for_its_database_is_unavailable(tmp_path: Path) -> None:
     """This happens on a full disk; surveys then run without a server."""
     (tmp_path / "home").write_text("a file")
-    with pytest.raises(ServerUnavailable, match="the Prefect server has no database"), local_server(tmp_path / "home"):
+    with pytest.raises(ServerUnavailable, match="cannot use its folder"), local_server(tmp_path / "home"):
         pass
 
 
-def test_a_question_mark_in_the_path_is_no_query(tmp_path: Path) -> None:
+def test_an_empty_password_is_replaced(tmp_path: Path) -> None:
+    """A full disk leaves an empty file, which would let everybody in."""
+    (tmp_path / "password").touch()
+    first = private_files(tmp_path)
+    assert len(first.removeprefix("spectralzoom:")) >= 32
+    assert private_files(tmp_path) == first
+
+
+def test_signs_in_the_path_are_no_query(tmp_path: Path) -> None:
     """The database is in that folder, and a file with the name before the mark is unchanged."""
     (tmp_path / "field").write_text("mine")
-    with local_server(tmp_path / "field?1"):
-        assert (tmp_path / "field?1/prefect.db").stat().st_size > 100_000
+    with local_server(tmp_path / "field?1 #%20"):
+        assert (tmp_path / "field?1 #%20/prefect.db").stat().st_size > 100_000
     assert ((tmp_path / "field").read_text(), len([*tmp_path.iterdir()])) == ("mine", 2)
 
 
-def test_a_second_archive_copies_the_migrated_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_archive_copies_the_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Migrations run once for a version of Prefect: the copy has its tables, and no second process is started."""
-    create_database(tmp_path / "first.db")
+    copy_tables(tmp_path / "first.db")
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("migrates again"))
-    create_database(tmp_path / "second.db")
+    copy_tables(tmp_path / "second.db")
     with closing(sqlite3.connect(tmp_path / "second.db")) as made:
         tables = {name for (name,) in made.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         assert {"flow_run", "task_run", "deployment", "alembic_version"} <= tables
         assert made.execute("SELECT count(*) FROM flow_run").fetchone() == (0,)
 
 
-def test_failed_migrations_leave_no_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The server is then unavailable, and the next survey tries again."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("sys.executable", shutil.which("false"))
-    with pytest.raises(ServerUnavailable, match="Prefect cannot create its database"):
-        create_database(tmp_path / "home" / "prefect.db")
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-
-
-def test_a_user_without_a_cache_folder_waits_for_the_migrations(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("cache", ["cache", None])
+def test_failed_migrations_leave_no_database(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache: str | None
 ) -> None:
-    """The server creates its own tables then."""
-    monkeypatch.setattr("spectralzoom.flows.tasks.local_server.cache_folder", lambda: None)
-    create_database(tmp_path / "home" / "prefect.db")
-    assert [*tmp_path.rglob("*")] == [tmp_path / "home"]
+    """The server is then unavailable, and the next survey tries again; a user may have no cache folder."""
+    folder = None if cache is None else tmp_path / cache
+    monkeypatch.setattr("spectralzoom.flows.tasks.local_server.cache_folder", lambda: folder)
+    monkeypatch.setattr("sys.executable", shutil.which("false"))
+    with pytest.raises(ServerUnavailable, match="cannot use its folder"), local_server(tmp_path / "home"):
+        pass
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["password"]
 
 
-def test_the_server_needs_a_password(server: str) -> None:
-    """A request without one is refused; only the health address needs none."""
-    assert httpx.get(f"{server}/admin/version").status_code == 401
-    assert httpx.get(f"{server}/health").status_code == 200
+@pytest.fixture(scope="module")
+def home(prefect_home: Path) -> Path:
+    """Return the folder of the server of this module, which another user could open before."""
+    folder = prefect_home / "doors"
+    folder.mkdir(mode=0o755)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def api(home: Path) -> Iterator[str]:
+    """Yield the API address of a server with pages."""
+    with local_server(home, schedules=True) as address:
+        yield address
+
+
+@pytest.fixture
+def user(home: Path, api: str) -> tuple[str, ...]:
+    """Return name and password."""
+    return tuple((home / "password").read_text().strip().split(":"))
+
+
+def test_a_request_needs_the_password(api: str, user: tuple[str, str]) -> None:
+    """Only the health address and the pages themselves need none."""
+    address = f"{api}/admin/version"
+    assert httpx.get(address).status_code == 401
+    assert httpx.get(address, auth=(user[0], "guess")).status_code == 401
+    assert httpx.get(address, auth=user).status_code == 200
+    assert httpx.get(f"{api}/health").status_code == 200
+
+
+def test_another_name_of_this_machine_is_refused(api: str, user: tuple[str, str]) -> None:
+    """A page whose name is made to lead here reaches neither the API, with the password too, nor pages or sockets."""
+    for path in ("/admin/version", "/health", "/../", "/../ui-settings"):
+        for host in ("evil.example", "127.0.0.1.evil.example", ""):
+            assert httpx.get(f"{api}{path}", auth=user, headers={"Host": host}).status_code == 400
+    assert httpx.get(f"{api.replace('127.0.0.1', 'localhost')}/admin/version", auth=user).status_code == 200
+    with pytest.raises(InvalidStatus, match="400"):
+        connect(f"{api.replace('http', 'ws')}/events/in", additional_headers={"Host": "evil.example"})
+
+
+def test_pages_of_another_origin_are_refused(api: str, user: tuple[str, str]) -> None:
+    """A browser may not send the password from them, and may not show them an answer."""
+    asked = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "authorization"}
+    own = api.removesuffix("/api")
+    for origin, code, allowed in ((FOREIGN, 400, None), ("null", 400, None), (own, 200, own)):
+        preflight = httpx.options(f"{api}/flow_runs/filter", headers={"Origin": origin, **asked})
+        answer = httpx.get(f"{api}/admin/version", auth=user, headers={"Origin": origin})
+        assert preflight.status_code == code
+        assert answer.headers.get("access-control-allow-origin") == allowed
+    assert httpx.post(f"{api}/flow_runs/filter", headers={"Origin": FOREIGN}, content="{}").status_code == 401
+
+
+@pytest.mark.parametrize("path", ["events/in", "events/out", "logs/out"])
+def test_a_socket_needs_the_password(api: str, path: str, user: tuple[str, str]) -> None:
+    """Events and logs are neither sent nor read without it."""
+    address = f"{api.replace('http', 'ws')}/{path}"
+    with pytest.raises((ConnectionClosed, InvalidStatus)), connect(address) as line:
+        line.recv(timeout=10)
+    for token, end in (("guess", "closed"), (":".join(user), "auth_success")):
+        with connect(address, subprotocols=["prefect"]) as line:
+            line.send(json.dumps({"type": "auth", "token": token}))
+            try:
+                assert json.loads(line.recv(timeout=10))["type"] == end
+            except ConnectionClosed:
+                assert end == "closed"
+
+
+def test_other_users_cannot_open_the_folder(home: Path, api: str, user: tuple[str, str]) -> None:
+    """It was open before. The password is in no variable, so that no list of processes can show it."""
+    assert home.stat().st_mode & 0o777 == 0o700
+    assert user[1] not in str(os.environ)

@@ -13,7 +13,7 @@ from PIL import Image
 from spectralzoom.flows.cli.serve_command import load_fields
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.tasks.scene import scene_of_visit
-from spectralzoom.pipeline.errors import NoSceneYet, SettingsError, WeightsError
+from spectralzoom.pipeline.errors import NoSceneYet, SettingsError
 
 JUNE = datetime(2026, 6, 1, 12, tzinfo=UTC)
 
@@ -54,10 +54,8 @@ def test_a_scene_without_a_pattern_is_kept(tmp_path: Path) -> None:
 def test_a_schedule_may_begin_without_a_scene(
     field_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A message says so; unusable weights are refused at once."""
+    """A message says so."""
     pattern = {"scene": str(tmp_path / "scenes" / "{date:%Y-%m-%d}.png"), "source": None, "budget": None}
     (field,) = load_fields([field_file("north", **pattern)]).values()
     assert field.scene == pattern["scene"]
     assert "each due run looks for it again" in capsys.readouterr().err
-    with pytest.raises(WeightsError):
-        load_fields([field_file("south", **pattern, weights=str(tmp_path / "none.safetensors"))])

@@ -36,6 +36,18 @@ def stages(archive: Path) -> set[str]:
     return {folder.name for folder in (archive / "stages").iterdir()}
 
 
+def test_another_machine_goes_on_over_a_bucket(command_line: CommandLine, tmp_path: Path, bucket: str) -> None:
+    """The machine of the rig pushes the lines it has captured; the other one pulls and maps them, and captures none."""
+    asked = small(tmp_path / "rig", **UNIFORM)
+    with pytest.raises(SurveyStopped, match="stopped after capture"):
+        run_survey(asked.but(until="capture"), QUIET)
+    assert command_line("push", tmp_path / "rig", bucket).code == 0
+    assert command_line("pull", bucket, tmp_path / "office").code == 0
+    published = run_survey(asked.but(out=str(tmp_path / "office"), keep="raw"), QUIET)
+    states = {stage["name"]: stage["state"] for stage in published.receipt["stages"]}
+    assert (states["capture_coarse"], states["segment"]) == ("cached", "ran")
+
+
 @pytest.mark.parametrize(("scan", "engine"), [(UNIFORM, "plain"), (TWICE, "prefect")], ids=["uniform", "twice"])
 def test_a_stopped_survey_goes_on(tmp_path: Path, scan: dict[str, str], engine: str) -> None:
     """Lines are captured once, and the map equals that of a survey in one go; no network reads a uniform mosaic."""

@@ -76,7 +76,7 @@ def test_prefect_pages_are_unpacked_into_a_writable_folder(tmp_path: Path, monke
     monkeypatch.setattr(os, "access", lambda *_: True)
     assert place_pages() == {}
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert place_pages() == {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(tmp_path / "spectralzoom" / "prefect-pages")}
+    assert place_pages() == {"server.ui.static_directory": str(tmp_path / "spectralzoom" / "prefect-pages")}
 
 
 ROOT = Path(__file__).parents[3]
