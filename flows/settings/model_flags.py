@@ -130,8 +130,8 @@ class EvaluateFlags(SceneFlags):
     Parameters
     ----------
     weights
-        Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
-        trained on it.
+        Weights; repeat the flag for several seeds or folds, whose scores are averaged. Each is judged on the frames
+        that it was not trained on.
     out
         Folder of evaluation.json.
     fractions
