@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ from spectralzoom.flows.training.data import Report
 from spectralzoom.models.evaluation import metrics
 from spectralzoom.models.evaluation.expected_scores import MapScores, ScoredMap, expected_counts
 from spectralzoom.models.network.spectral import LineSpec
-from spectralzoom.models.policies.placement import ReadTwice
+from spectralzoom.models.policies.placement import CascadeTable, ReadTwice
 from spectralzoom.models.reading.inference import coarse_prediction_of_columns, map_of_columns
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, STEPS, CaptureAugmentation
 from spectralzoom.models.training.examples import Example
-from spectralzoom.models.weights.files import BY_LAW, Weights
+from spectralzoom.models.weights.files import BY_LAW, CASCADE, Weights
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.planning.coverage import frame_patches
 
@@ -25,20 +26,23 @@ Judged = tuple[ScoredMap, metrics.Floats]  # a map of a scan, and the counts of 
 VALIDATED_FRACTION = 0.35  # of the patches: that of surveys with K = 35 %
 
 
-def read_twice(weights: Weights, examples: Iterable[Example]) -> list[ReadTwice]:
-    """Segment each scene by the overview alone, and in full."""
-    found = []
+def judge_reading(weights: Weights, examples: Iterable[Example]) -> dict[str, Any]:
+    """Return the figures of scenes with no patch, some by gain, and all, and the cascade of a network, for a record."""
+    scenes = []
     for example in examples:
         grid, labels = _parts(weights, example)
         seen = coarse_prediction_of_columns(weights, example.columns.astype(np.float32), grid)
-        found.append(ReadTwice.of(weights, seen, labels))
-    return found
+        scenes.append(ReadTwice.of(weights, seen, labels))
+    validation = validate(scenes, weights.config.classes)
+    if not weights.config.corrected:
+        return {"validation": validation}
+    useless = validation["all"]["miou"] <= validation["none"]["miou"]
+    losses = CascadeTable.of_overview() if useless else CascadeTable.judged(scenes, weights.config.classes)
+    return {"validation": validation, CASCADE: asdict(losses)}
 
 
-def validate(scenes: Sequence[ReadTwice], classes: int) -> dict[str, Any] | None:
-    """Return `agreement` over all scenes with no patch, some by gain, and all; None without a scene."""
-    if not scenes:
-        return None
+def validate(scenes: Sequence[ReadTwice], classes: int) -> dict[str, Any]:
+    """Return `agreement` over all scenes with no patch, some by gain, and all."""
     rows: dict[str, list[metrics.Counts]] = {"none": [], "gain": [], "all": []}
     for scene in scenes:
         part = np.zeros(scene.gain.shape, np.bool_)
@@ -49,15 +53,15 @@ def validate(scenes: Sequence[ReadTwice], classes: int) -> dict[str, Any] | None
     return {"scenes": len(scenes), "fraction": VALIDATED_FRACTION, **figures}
 
 
-def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) -> dict[str, Any] | None:
-    """Return the calibration of maps of full scans; None without a scene."""
+def judge_calibration(weights: Weights, examples: Iterable[Example], seed: int) -> dict[str, Any]:
+    """Return the calibration of maps of full scans."""
     maps = []
     for example in examples:
         grid, labels = _parts(weights, example)
         _, every_class = map_of_columns(weights, example.columns.astype(np.float32), grid)
         valid = (labels != UNLABELLED) & ~np.isnan(every_class[..., 0])
         maps.append(metrics.JudgedMap(every_class[valid], labels[valid]))
-    return metrics.judge_confidence(maps, seed) if maps else None
+    return metrics.judge_confidence(maps, seed)
 
 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the darkest of the training is judged, too

@@ -17,7 +17,7 @@ from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
 from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
-from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
@@ -171,29 +171,22 @@ def _common(request: TrainRequest, scene: RasterScene, scenes: int) -> Common:
         else int(np.clip(COLUMN_BYTES / (2 * scenes * scene.planes[..., 0].size), *COLUMNS_OF_FILES))
     )
     basis = SpectralBasis.spanning(scene.wavelength_nm, most)
-    patch = request.flags.patch or suggested_patch(scene.shape, built_in=built_in)
-    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
-    network_config(request.flags, common)  # raises for invalid sizes before the first scene is imaged
-    return common
+    patch = patch_of(scene.shape, built_in=built_in)
+    return Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
 
 
-def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
+def patch_of(shape: tuple[int, int], *, built_in: bool) -> int:
     """Return the patch size for scenes of this shape: 16 for the farm, 32 for frames, less for small scenes."""
-    return 16 if built_in or 256 <= min(shape) < 512 else 32 if min(shape) >= 512 else 8
+    return 16 if built_in or 256 <= min(shape) < 512 else DEEP_PATCH_PX if min(shape) >= 512 else 8
 
 
-def network_config(flags: TrainFlags, common: Common) -> SegmenterConfig:
-    """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
+def network_config(common: Common) -> SegmenterConfig:
+    """Return the sizes of the network."""
     deep = common.patch >= DEEP_PATCH_PX
-    try:
-        return SegmenterConfig(
-            classes=len(common.names),
-            columns=common.basis.columns,
-            patch=common.patch,
-            deep=deep,
-            dim=flags.dim,
-            heads=flags.heads,
-            layers=flags.layers or (1 if deep else SegmenterConfig.layers),
-        )
-    except ValueError as error:
-        raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
+    return SegmenterConfig(
+        classes=len(common.names),
+        columns=common.basis.columns,
+        patch=common.patch,
+        deep=deep,
+        layers=1 if deep else SegmenterConfig.layers,
+    )
