@@ -145,13 +145,15 @@ def train(
     Error
         A value or a file is not valid.
     """
-    from spectralzoom.flows.cli.model_verbs import run_training
     from spectralzoom.flows.settings.model_flags import TrainFlags
+    from spectralzoom.flows.training.train import run_train
+    from spectralzoom.flows.training.train_scenes import TrainRequest
 
     arguments = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
-    asked = _flags(TrainFlags, "train", flags)
+    command = f"spectralzoom.train({', '.join(arguments)})"
+    request = TrainRequest(str(dataset), Path(out), _flags(TrainFlags, "train", flags), command)
     with _working(progress, quiet=quiet) as console:
-        run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(arguments)})", console)
+        run_train(request, console)
     return Path(out)
 
 
