@@ -21,9 +21,8 @@ from spectralzoom.flows.training import figures
 from spectralzoom.flows.training.data import (
     Report,
     TrainingData,
-    alike_note,
     check_out,
-    filled,
+    check_taught,
     law_of,
     open_training_data,
     read_farm_name,
@@ -55,7 +54,7 @@ from spectralzoom.models.weights.files import (
     save_weights,
     with_record,
 )
-from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
@@ -126,13 +125,11 @@ def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> T
 
 def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], None]) -> None:
     """Tell the classes without a training pixel. Raises SceneError: fewer than two classes have one."""
-    names, frames = scenes.common.names, [*scenes.train.keys]
-    taught = [name for number, name in enumerate(names) if number not in scenes.untaught]
-    if len(taught) < 2:
-        note = filled(alike_note(taught[0]), frames) if taught else f"no pixel of {list_some(frames)} has a label"
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
-    if scenes.untaught:
-        tell(untaught_note([names[number] for number in scenes.untaught]))
+    untaught = [scenes.common.names[number] for number in scenes.untaught]
+    taught = [name for name in scenes.common.names if name not in untaught]
+    check_taught(request.dataset, taught, [*scenes.train.keys])
+    if untaught:
+        tell(untaught_note(untaught))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.settings.model_flags import NO_TRAIN_FLAGS, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
-from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, alike_note, filled, trained_pixels
+from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, check_taught, trained_pixels
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
@@ -159,11 +159,7 @@ def _imaged(
 
 
 def _common(request: TrainRequest, scene: RasterScene, scenes: int) -> Common:
-    if not scene.class_names:
-        raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
-    if len(scene.class_names) < 2:
-        note = filled(alike_note(scene.class_names[0]), [scene.name])
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
+    check_taught(request.dataset, scene.class_names, [scene.name])
     built_in = bool(built_in_laws(request.dataset))
     most = (
         COLUMNS

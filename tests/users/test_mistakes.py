@@ -91,7 +91,7 @@ CASES = {
     "several label files": (1, TRAIN + "several", "001_labels.png and .*001_mask.png; keep one"),
     "two files of one stem": (1, TRAIN + "one_stem", "001.png and .*001.tif would both have the labels"),
     "labels of one class": (1, TRAIN + "soil", "two or more classes.* unlabelled = "),
-    "no labelled pixel": (1, TRAIN + "unlabelled", "has no pixel with a class; correct its labels, or 'unlabelled'"),
+    "no labelled pixel": (1, TRAIN + "unlabelled", "no pixel of 001 has a class; correct the labels, or 'unlabelled'"),
     "soft labels": (1, TRAIN + "soft", "at most 64.* hard edges"),
     "scenes of other bands": (1, TRAIN + "other_bands", "other bands"),
     "unknown key of scene.toml": (1, TRAIN + "bad_key", "unknown key label; known are"),
