@@ -19,7 +19,7 @@ from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
-from spectralzoom.models.weights.files import PLAIN, Weights, load_weights
+from spectralzoom.models.weights.files import PLAIN, load_weights
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.whole_files import to_json, write_whole
 
@@ -94,18 +94,15 @@ def _judge_frames(
     show: Report,
 ) -> list[dict[str, dict[Choice, Row]]]:
     """Judge every frame by its weights; return the rows of the frames of each of the weights."""
-    device = choose_device(flags.device)
-    loaded: dict[int, Weights] = {}
+    device, seed = choose_device(flags.device), flags.seed
+    loaded = [load_weights(one.path).on(device) for one in candidates]
     runs: list[dict[str, dict[Choice, Row]]] = [{} for _ in candidates]
     for number, (name, judges) in enumerate(frames.items()):
+        show("judging frames", number / len(frames), name)
         scene = data.scene(name)
-        for at, index in enumerate(judges):
-            one = candidates[index]
-            show("judging frames", (number + at / len(judges)) / len(frames), f"{name}, {one.path.name}")
-            if index not in loaded:
-                loaded[index] = load_weights(one.path).on(device)
-            frame = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
-            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], fractions, flags.seed)
+        for at in judges:
+            frame = observe_frame(scene, name, loaded[at], candidates[at].camera, seed)
+            runs[at][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[at], fractions, seed)
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 

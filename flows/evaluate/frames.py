@@ -95,13 +95,13 @@ def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
     """Return the data with the frames to judge in ``train``. Raises SettingsError: no such frame, too."""
-    built_in = bool(built_in_laws(dataset))
-    data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
-    if built_in:
+    if built_in_laws(dataset):
         count = FARM_TEST_SCENES if scenes is None else scenes
         if count < 1:
             raise SettingsError(f"--scenes must be at least 1, got {count}")
-        data = farm_test_data(count, camera, dataset)
+        data = farm_test_data(count, camera, dataset, **choices)
+    else:
+        data = open_training_data(dataset, 0, scenes, camera, **choices)
     if unknown := [name for name in frames if name not in data.train]:
         raise SettingsError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)

@@ -184,8 +184,9 @@ class TrainingData:
         return scene_of_file(self.files.load(name), self.camera)
 
 
-def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:
-    """Return built-in scenes to judge weights on, all in ``train``."""
+def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW, **choices: object) -> TrainingData:
+    """Return built-in scenes to judge weights on, all in ``train``. Raises SettingsError: a choice of files."""
+    _refuse_choices(choices)
     laws = built_in_laws(dataset)
     return TrainingData(",".join(laws), farm_days(FARM_TEST_SEED, scenes, laws, odd=True), (), (), camera)
 
@@ -213,6 +214,14 @@ def read_farm_name(name: str) -> tuple[int, int, float]:
     return int(seed), int(day), float(hour)
 
 
+def _refuse_choices(choices: Mapping[str, object]) -> None:
+    """Raise SettingsError for a choice of files."""
+    for choice, value in choices.items():
+        if value not in (None, ()):
+            flag = "--" + choice.replace("_", "-")
+            raise SettingsError(f"{flag} is for scene files; built-in scenes are drawn by seed and bring their own")
+
+
 def law_of(name: str) -> str:
     """Return the law of a built-in scene by its name."""
     return next((law for law, prefix in _PREFIXES.items() if prefix and name.startswith(prefix)), FARM_LAW)
@@ -228,10 +237,7 @@ def open_training_data(
     for built-in scenes, or the other way round.
     """
     if laws := built_in_laws(dataset):
-        for choice, value in choices.items():
-            if value not in (None, ()):
-                flag = "--" + choice.replace("_", "-")
-                raise SettingsError(f"{flag} is for scene files; built-in scenes are drawn by seed and bring their own")
+        _refuse_choices(choices)
         train = farm_days(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes, laws)
         left = FARM_VALIDATION * len(laws) if validation is None else validation
         judged = farm_days(FARM_VALIDATION_SEED, left, laws, odd=True)
