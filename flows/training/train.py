@@ -97,7 +97,9 @@ def train_weights(
                 record = learner.written(learned, learner.whole(learned))
             else:
                 kept = counted(len(learner.scenes.validation.keys), "validation scene")
-                tell(f"the classifiers took the --minutes: they did not learn from {kept}, and have no network")
+                tell(
+                    f"the classifiers took half of --minutes or more: none learns from {kept}, and there is no network"
+                )
     checkpoint.unlink(missing_ok=True)
     return record
 

@@ -87,5 +87,5 @@ def test_classifiers_that_take_the_time_are_fitted_once(tmp_path: Path, monkeypa
     assert (list(record["split"]["train"]), list(record["split"]["validation"])) == (["002", "003", "004"], ["001"])
     assert record["trained_on"]["scenes"] == 3
     assert notes == [
-        "the classifiers took the --minutes: they did not learn from 1 validation scene, and have no network"
+        "the classifiers took half of --minutes or more: none learns from 1 validation scene, and there is no network"
     ]
