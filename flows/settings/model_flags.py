@@ -69,8 +69,12 @@ class TrainFlags(SceneFlags):
         Time limit of the training [min]: of the processor, or on an accelerator that of the clock. Reading scenes and
         the last validation are not included. The classifiers of files need their time in any case; a network, and
         classifiers that learn from validation scenes too, follow if the time suffices.
+    start
+        For built-in scenes: weights from which the training starts. Bands, classes and sizes must be theirs, and
+        DATASET must contain the scenes that they know. The result is the mean of both networks, or the trained one
+        where it reads the validation scenes better.
     learning_rate
-        Highest learning rate.
+        Highest learning rate. Default: 0.0015, or a third of it with --start.
     min_exposure_ms
         Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
         1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
@@ -80,7 +84,8 @@ class TrainFlags(SceneFlags):
     validation: int | None = None
     steps: int = TrainingSettings.steps
     minutes: float = TrainingSettings.minutes
-    learning_rate: float = TrainingSettings.learning_rate
+    start: Path | None = None
+    learning_rate: float | None = None
     min_exposure_ms: float = TrainingSettings.darkest_ms
 
     def choices(self) -> dict[str, Any]:
@@ -95,7 +100,7 @@ class TrainFlags(SceneFlags):
             minutes=self.minutes,
             seed=self.seed,
             darkest_ms=self.min_exposure_ms,
-            learning_rate=self.learning_rate,
+            learning_rate=self.learning_rate or TrainingSettings.learning_rate / (3 if self.start else 1),
         )
 
 

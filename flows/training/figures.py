@@ -172,3 +172,13 @@ def corrected_miou(base: Weights, network: Weights, examples: Sequence[Example])
             drawn = (first + np.float32(part) * (last - first)).argmax(axis=-1).astype(np.uint8)
             counts[part] = counts[part] + metrics.confusion(labels, drawn, base.config.classes)
     return {part: metrics.mean_iou(one) for part, one in counts.items()}
+
+
+def miou_of(weights: Weights, examples: Sequence[Example]) -> float:
+    """Return the mIoU of all scenes together, by every line at the reference exposure."""
+    counts = np.zeros((weights.config.classes,) * 2, np.int64)
+    for example in examples:
+        grid, labels = _parts(weights, example)
+        drawn, _ = map_of_columns(weights, example.columns.astype(np.float32), grid)
+        counts += metrics.confusion(labels, drawn.classes, weights.config.classes)
+    return metrics.mean_iou(counts)

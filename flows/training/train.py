@@ -37,7 +37,14 @@ from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
 from spectralzoom.models.training.mixture import fit_mixture
-from spectralzoom.models.training.train import LabelledPixels, TrainingSettings, linear_classifier, scaled, train
+from spectralzoom.models.training.train import (
+    LabelledPixels,
+    TrainingSettings,
+    halfway,
+    linear_classifier,
+    scaled,
+    train,
+)
 from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
@@ -51,6 +58,7 @@ from spectralzoom.models.weights.files import (
     add_map_scores,
     add_spectra,
     load_encoder,
+    load_weights,
     save_weights,
     with_record,
 )
@@ -70,25 +78,35 @@ def train_weights(
     """Train, validate and save weights; return their record. ``tell`` gets notes on left-out scenes.
 
     Raises SceneError: no labels, a single class, or scenes of different bands or classes; SettingsError: an invalid
-    output path, or an unavailable device.
+    output path, weights to start from that do not fit, or an unavailable device.
     """
-    flags = request.flags
+    flags, settings = request.flags, request.flags.settings
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
+    if flags.start is not None and not built_in_laws(request.dataset):
+        raise SettingsError(
+            "--start is for built-in scenes; training on files takes seconds: train anew on all of them together"
+        )
+    begun = None if flags.start is None else load_weights(flags.start)
     device = choose_device(flags.device)
     data = open_training_data(request.dataset, flags.validation, flags.scenes, CAMERA, **flags.choices())
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
     check_classes(request, scenes if data.files is None else scenes.joined, tell)
-    normalisation = measured_normalisation(scenes.train.examples, math.sqrt(flags.min_exposure_ms * REFERENCE_MS))
-    learner = Learner(request, data, scenes.normalised(normalisation), normalisation, checkpoint, device, report)
+    if begun is None:
+        normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
+    else:
+        check_start(request, begun, scenes)
+        normalisation = begun.normalisation
+    scenes = scenes.normalised(normalisation)
+    learner = Learner(request, data, scenes, normalisation, begun, checkpoint, device, report)
     if data.files is None:
         record = learner.written(learner.network())
     else:
         if len(scenes.untaught) > len(scenes.common.names) - 2:  # the other classes are in scenes for validation
-            learner = replace(learner, scenes=learner.scenes.joined)
+            learner = replace(learner, scenes=scenes.joined)
         mixed = learner.mixture()
         record = learner.written(mixed)  # usable after seconds
         if learner.scenes.validation.examples:
@@ -134,6 +152,24 @@ def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], N
         tell(untaught_note(untaught))
 
 
+def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
+    """Raise SettingsError unless a training can start from these weights.
+
+    Bands, classes and sizes must be theirs, and the training must contain the scenes that they know: its record names
+    them all.
+    """
+    for what, kept in {
+        "classes": (begun.class_names, begun.config.untaught) == (scenes.common.names, scenes.untaught),
+        "training scenes": {*begun.record.get("split", {}).get("train", {}).values()} <= {*scenes.train.keys.values()},
+        "bands": begun.basis == scenes.common.basis,
+        "sizes of the network": replace(begun.config, untaught=()) == network_config(scenes.common),
+    }.items():
+        if not kept:
+            raise SettingsError(
+                f"--start {request.flags.start}: its training had other {what}; give its data set and options"
+            )
+
+
 @dataclass(frozen=True)
 class Learned:
     """Weights and entries of their record."""
@@ -150,6 +186,7 @@ class Learner:
     data: TrainingData
     scenes: Scenes
     normalisation: Normalisation
+    begun: Weights | None  # to start from
     checkpoint: Path
     device: str
     report: Report
@@ -172,12 +209,16 @@ class Learner:
         return TrainingSpectra.measured(scenes, self.normalisation.whitening)
 
     def network(self) -> Learned:
-        """Train networks from a linear classifier of mean spectra."""
-        examples = self.scenes.train.examples
+        """Train networks from a linear classifier of mean spectra, or from weights."""
+        examples, begun = self.scenes.train.examples, self.begun
         rng = np.random.default_rng([0x1DA])
         pixels = LabelledPixels.drawn(examples, rng, self.augmentation).brightened(self.normalisation.gain_shift, rng)
         start = linear_classifier(pixels, self.config.classes) | (load_encoder() if self.config.deep else {})
-        model, summary = self._trained(self.config, start, self.request.flags.settings)
+        tensors = start if begun is None else begun.segmenter.state_dict()
+        model, summary = self._trained(self.config, tensors, self.request.flags.settings)
+        if begun is not None:
+            mean, frames = halfway(begun.segmenter, model), self.scenes.validation.examples
+            model = max((model, mean), key=lambda one: figures.miou_of(self._weights(one), frames)) if frames else mean
         return Learned(self._weights(model), {"training": summary})
 
     def mixture(self) -> Learned:
@@ -254,6 +295,7 @@ class Learner:
             "camera": asdict(CAMERA),
             CAPTURED: request.captured,
             "device": self.device,
+            **({} if self.begun is None else {"started_from": self.begun.record.get("command", "")}),
         }
 
     def _judged(self, weights: Weights) -> dict[str, Any]:

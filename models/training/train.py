@@ -333,6 +333,16 @@ def train(
     return trainer.averaged.to(PROCESSOR), trainer.summary()
 
 
+def halfway(start: Segmenter, trained: Segmenter) -> Segmenter:
+    """Return a network with the mean weights of both: good where either was (Wortsman et al. 2022, WiSE-FT)."""
+    mean = copy.deepcopy(trained)
+    with torch.no_grad():
+        for own, before in zip(mean.state_dict().values(), start.state_dict().values(), strict=True):
+            if own.is_floating_point():
+                own.lerp_(before.to(own.device), 0.5)
+    return mean
+
+
 def run_identity(
     config: SegmenterConfig, examples: list[Example], settings: TrainingSettings, start: Mapping[str, Tensor] | None
 ) -> str:

@@ -28,7 +28,7 @@ from spectralzoom.models.reading.prior_map import (
     pooled,
 )
 from spectralzoom.models.training.objective import map_loss
-from spectralzoom.models.training.train import scaled
+from spectralzoom.models.training.train import halfway, scaled
 from spectralzoom.models.weights.files import Weights, with_record
 from spectralzoom.pipeline.errors import ShapeError
 from spectralzoom.storage.arrays.class_maps import (
@@ -62,10 +62,11 @@ def _check(log_probability: np.ndarray, untaught: tuple[int, ...]) -> None:
     np.testing.assert_allclose(chance.sum(axis=-1), 1, atol=1e-4)
 
 
-MIXTURES: dict[str, Callable[[Weights], Weights]] = {
-    "network": lambda one: one,
-    "half of it": lambda one: replace(one, segmenter=scaled(one.segmenter, 0.5)),
-    "temperature": lambda one: with_record(one, calibration={"temperature": 5.0}),
+MIXTURES: dict[str, Callable[[Weights, Weights], Weights]] = {
+    "network": lambda one, other: one,
+    "half of it": lambda one, other: replace(one, segmenter=scaled(one.segmenter, 0.5)),
+    "halfway": lambda one, other: replace(one, segmenter=halfway(other.segmenter, one.segmenter)),
+    "temperature": lambda one, other: with_record(one, calibration={"temperature": 5.0}),
 }
 
 
@@ -73,7 +74,7 @@ MIXTURES: dict[str, Callable[[Weights], Weights]] = {
 @given(seed=SEEDS, untaught=NEVER)
 def test_untaught_classes_are_never_drawn(mixture: str, seed: int, untaught: tuple[int, ...]) -> None:
     """Neither the overview, nor patches, nor any mixture of classifiers draws them, whatever their logits."""
-    weights = MIXTURES[mixture](_weights(seed, untaught))
+    weights = MIXTURES[mixture](_weights(seed, untaught), make_weights(seed + 1, classes=CLASSES))
     coarse_pass, fine = scene_columns(weights, 16, 24, seed)
     seen = read_coarse_prediction(weights, coarse_pass)
     assert not seen.probability[..., untaught].any()

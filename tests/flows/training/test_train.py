@@ -5,12 +5,15 @@ from __future__ import annotations
 import io
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from rich.console import Console
 
@@ -23,7 +26,7 @@ from spectralzoom.flows.training import figures
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
 from spectralzoom.flows.training.train import run_train, train_weights
-from spectralzoom.flows.training.train_scenes import Common, TrainRequest, network_config, patch_of
+from spectralzoom.flows.training.train_scenes import Common, Imaged, TrainRequest, network_config, patch_of
 from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.network.spectral import SpectralBasis
 from spectralzoom.models.policies.placement import ReadTwice
@@ -271,15 +274,66 @@ def test_whitening_uses_the_noise_of_short_exposures(folder: Path, out: Path):
     assert sizes[1] < sizes[0]
 
 
-def test_built_in_scenes_train_networks(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They start from a linear classifier, not from a mixture; the record has season and sun of the scenes."""
+def test_continued_training_is_for_built_in_scenes(folder: Path, out: Path) -> None:
+    """On files a training takes seconds."""
+    with pytest.raises(SettingsError, match=r"--start is for built-in scenes; .*: train anew on all of them together"):
+        train_weights(_request(folder, out, start=Path("first.safetensors")))
+
+
+def test_training_continues_on_built_in_scenes(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normalisation stays; without validation scenes the mean of both networks is kept."""
     monkeypatch.setattr("spectralzoom.flows.training.data.FARM_SHAPE", (32, 48))
     # choosing takes seconds
     monkeypatch.setattr("spectralzoom.models.training.examples.chosen_effects", lambda *_: USUAL)
-    record = train_weights(_request("farm", out, scenes=1, validation=0))
-    assert record["training"]["steps"] == 1
-    assert load_weights(out).config.parts == ()
-    assert TrainedOn.read(record["trained_on"]).day == (200, 200)
+    train_weights(_request("farm", out, "first", scenes=1, validation=0))
+    trained = flow.train
+    ends: list[Any] = []
+    monkeypatch.setattr(flow, "train", lambda *given, **options: ends.append(trained(*given, **options)) or ends[0])
+    more: dict[str, Any] = {"scenes": 1, "validation": 0, "start": out, "seed": 1}
+    record = train_weights(_request("farm", tmp_path / "b.safetensors", **more))
+    first, second = load_weights(out), load_weights(tmp_path / "b.safetensors")
+    assert record["started_from"] == "first"
+    np.testing.assert_array_equal(second.normalisation.whitening, first.normalisation.whitening)
+    networks = (one.parameters() for one in (first.segmenter, second.segmenter, ends[0][0]))
+    for before, halfway, after in zip(*networks, strict=True):
+        torch.testing.assert_close(after, before, atol=0.01, rtol=0)
+        torch.testing.assert_close(halfway, (before + after) / 2)
+
+
+@pytest.mark.parametrize(
+    ("what", "common", "scenes", "dim"),
+    [
+        ("classes", {"names": ("a", "c")}, {}, 64),
+        ("classes", {}, {"untaught": (0,)}, 64),
+        ("training scenes", {}, {"train": Imaged(keys={"2": "other"})}, 64),
+        ("bands", {"basis": SpectralBasis.spanning(np.linspace(500, 700, 4))}, {}, 64),
+        ("sizes of the network", {}, {}, 32),
+        (None, {}, {"train": Imaged(keys={"1": "one", "2": "other"})}, 64),
+    ],
+)
+def test_continued_training_names_what_differs(
+    what: str | None, common: dict[str, Any], scenes: dict[str, Any], dim: int
+) -> None:
+    """Classes, scenes, bands and sizes are those of the first training; more scenes are allowed."""
+    nm = np.linspace(500, 800, 4)
+    known = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), 8, nm)
+    begun: Any = SimpleNamespace(
+        class_names=known.names,
+        config=replace(network_config(known), dim=dim),
+        basis=known.basis,
+        record={"split": {"train": {"1": "one"}}},
+    )
+    usual = {"common": replace(known, **common), "untaught": (), "train": Imaged(keys={"1": "one"})}
+    request = _request("farm", Path("w.safetensors"), start=Path("first"))
+    with nullcontext() if what is None else pytest.raises(SettingsError, match=f"its training had other {what}; give"):
+        flow.check_start(request, begun, SimpleNamespace(**usual | scenes))
+
+
+def test_continued_training_has_a_lower_learning_rate() -> None:
+    """Its rate is a third unless a flag sets it."""
+    anew, on = (TrainFlags(start=start).settings for start in (None, Path("first.safetensors")))
+    assert 3 * on.learning_rate == pytest.approx(anew.learning_rate)
+    assert TrainFlags(learning_rate=2e-3).settings.learning_rate == 2e-3
 
 
 @pytest.mark.parametrize("unfit", ["copy", "unlabelled"])

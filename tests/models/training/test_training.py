@@ -235,3 +235,17 @@ def test_linear_classifiers_are_fitted_to_dark_pixels() -> None:
     assert dark < bright / 2
     assert same == pytest.approx(bright, rel=0.2)
     assert {len(one.labels) for one in drawn} == {64 * 64}
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_halfway_network_has_the_mean_of_each_weight(deep: bool) -> None:
+    """The means and variances of batch norms are those of both too; both networks themselves stay as they are."""
+    one, other = (Segmenter(replace(DEEP, deep=deep)) for _ in range(2))
+    for norm in (one for one in other.modules() if isinstance(one, torch.nn.BatchNorm2d)):
+        norm.running_mean.fill_(3.0)
+    before = [tensor.clone() for tensor in (*one.state_dict().values(), *other.state_dict().values())]
+    for middle, first, second in zip(
+        *(net.state_dict().values() for net in (training.halfway(one, other), one, other)), strict=True
+    ):
+        torch.testing.assert_close(middle, ((first + second) / 2).to(middle.dtype))
+    assert all(map(torch.equal, before, (*one.state_dict().values(), *other.state_dict().values())))
