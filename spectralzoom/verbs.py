@@ -145,15 +145,13 @@ def train(
     Error
         A value or a file is not valid.
     """
+    from spectralzoom.flows.cli.model_verbs import run_training
     from spectralzoom.flows.settings.model_flags import TrainFlags
-    from spectralzoom.flows.training.train import run_train
-    from spectralzoom.flows.training.train_scenes import TrainRequest
 
     arguments = [repr(Path(dataset).name), *(f"{name}={value!r}" for name, value in flags.items())]
-    command = f"spectralzoom.train({', '.join(arguments)})"
-    request = TrainRequest(str(dataset), Path(out), _flags(TrainFlags, "train", flags), command)
+    asked = _flags(TrainFlags, "train", flags)
     with _working(progress, quiet=quiet) as console:
-        run_train(request, console)
+        run_training(str(dataset), Path(out), asked, f"spectralzoom.train({', '.join(arguments)})", console)
     return Path(out)
 
 

@@ -74,7 +74,7 @@ def _run(arguments: list[str]) -> int:
         return SettingsError.exit_code
     except KeyboardInterrupt as error:
         what, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", INTERRUPTED)
-        resumes = next(iter(arguments), "") in GOES_ON
+        resumes = next(iter(arguments), "") in GOES_ON and not any("train-temporal" in word for word in arguments)
         stderr.print(what + ("; run the same command to resume" if resumes else ""), highlight=False)
         return code
     except BrokenPipeError:

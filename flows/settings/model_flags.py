@@ -75,6 +75,10 @@ class TrainFlags(SceneFlags):
         where it reads the validation scenes better.
     learning_rate
         Highest learning rate. Default: 0.0015, or a third of it with --start.
+    train_temporal
+        Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
+        reader that they have. It takes --scenes, --steps, --minutes and --seed; it does not resume. It
+        needs 4 GB of memory, and half an hour for reading the scenes besides --minutes.
     min_exposure_ms
         Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
         1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
@@ -86,6 +90,7 @@ class TrainFlags(SceneFlags):
     minutes: float = TrainingSettings.minutes
     start: Path | None = None
     learning_rate: float | None = None
+    train_temporal: Path | None = None
     min_exposure_ms: float = TrainingSettings.darkest_ms
 
     def choices(self) -> dict[str, Any]:

@@ -200,18 +200,25 @@ def add_map_scores(weights: Path, map_scores: MapScores) -> None:
 
     Raises WeightsError: the file cannot be read or written.
     """
-    _add_part(weights, MAP_SCORES, map_scores.as_dict())
+    _add_part(weights, weights, MAP_SCORES, map_scores.as_dict(), {})
 
 
 def add_spectra(weights: Path, spectra: TrainingSpectra) -> None:
     """Add the statistics of the training spectra to a file of weights. Raises as `add_map_scores`."""
-    _add_part(weights, SPECTRA, spectra.as_dict())
+    _add_part(weights, weights, SPECTRA, spectra.as_dict(), {})
 
 
-def _add_part(weights: Path, part: str, content: Mapping[str, Any]) -> None:
-    about = describe_weights(weights).about
-    keys = {**about["keys"], part: key_of(content, {})}
-    write_checksummed(weights, {**about, "keys": keys, part: content}, read_tensors(weights, about))
+def add_reader(weights: Path, out: Path, reader: TemporalReader, record: Mapping[str, Any]) -> None:
+    """Write the weights of a file with a temporal reader to ``out``. Raises as `add_map_scores`."""
+    _add_part(weights, out, READER, {"sizes": asdict(reader.sizes), "record": dict(record)}, dict(reader.state_dict()))
+
+
+def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    described = describe_weights(source)
+    kept = read_tensors(source, described.about, lambda name: not name.startswith(f"{part}."))
+    added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
+    keys = {**described.about["keys"], part: key_of(about, tensors)}
+    write_checksummed(out, {**described.about, "keys": keys, part: about}, kept | added)
 
 
 def load_reader(weights: Path) -> TemporalReader:
@@ -220,7 +227,10 @@ def load_reader(weights: Path) -> TemporalReader:
 
     described = describe_weights(weights)
     if described.reader is None:
-        raise WeightsError(f"{weights} has no temporal reader; the weights that are shipped have one")
+        raise WeightsError(
+            f"{weights} has no temporal reader; train one with: spectralzoom train DATASET --train-temporal "
+            f"{weights} -o {weights}"
+        )
     from spectralzoom.models.network.temporal_reader import TemporalReader
 
     with torch.device("meta"):

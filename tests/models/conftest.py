@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,10 @@ from torch import Tensor
 from spectralzoom.models.network.segmenter import Segmenter, cut
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Capture, LineSpec, Normalisation, SpectralBasis
-from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.reading.inference import CoarsePass, CoarsePrediction, read_coarse_pass, read_coarse_prediction
 from spectralzoom.models.training.examples import Example
 from spectralzoom.models.training.train import Progress
-from spectralzoom.models.weights.checksummed_files import key_of, read_tensors, write_checksummed
-from spectralzoom.models.weights.files import READER, Weights, describe_weights
+from spectralzoom.models.weights.files import Weights
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 
 SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "width": 8, "overview_width": 8} | {
@@ -114,12 +111,3 @@ def make_weights(seed: int = 0, **sizes: Any) -> Weights:
         np.arange(3 * model.config.classes, dtype=np.uint8).reshape(-1, 3),
         {"seed": seed},
     )
-
-
-def add_reader(path: Path, reader: TemporalReader) -> None:
-    """Add a temporal reader to a file of weights, as the shipped weights have one."""
-    about, content = describe_weights(path).about, {"sizes": asdict(reader.sizes), "record": {"seed": 1}}
-    tensors = {f"{READER}.{name}": tensor for name, tensor in reader.state_dict().items()}
-    kept = read_tensors(path, about, lambda name: not name.startswith(f"{READER}."))
-    keys = {**about["keys"], READER: key_of(content, reader.state_dict())}
-    write_checksummed(path, {**about, "keys": keys, READER: content}, kept | tensors)

@@ -23,14 +23,13 @@ from spectralzoom.flows.archive.reprocess_command import run_reprocess
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.models.network.sizes import TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
-from spectralzoom.models.weights.files import load_weights
+from spectralzoom.models.weights.files import add_reader, load_weights
 from spectralzoom.pipeline.errors import SettingsError, WeightsError
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.storage.runs import read_run
 from spectralzoom.storage.store import Archive
 from tests.conftest import CLASSES, QUIET, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
-from tests.models.conftest import add_reader
 from tests.prior_work import without_effects
 from tests.storage.readers.test_label_grids import write
 
@@ -220,14 +219,14 @@ def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weig
     config = load_weights(own).config
     reader = TemporalReader(TemporalSizes(config.classes, config.columns, 8, 4))
     torch.nn.init.normal_(reader.leave.weight, std=0.2)
-    add_reader(own, reader)
+    add_reader(own, own, reader, {})
     flags = {**RASTER, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
     published = survey_png(visited, **flags)
     assert len(published.receipt["prior_map"]["reader"]) == 20
     first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
     decode = [one.receipt["savings"]["multiply_adds"]["detail"] for one in (published, first)]
     assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
-    add_reader(own, TemporalReader(TemporalSizes(3, 7)))
+    add_reader(own, own, TemporalReader(TemporalSizes(3, 7)), {})
     with pytest.raises(WeightsError, match=r"own\.safetensors.* temporal reader is for another network"):
         survey_png(visited, **flags)
 

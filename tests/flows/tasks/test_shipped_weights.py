@@ -13,9 +13,8 @@ from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.tasks.survey_model import shipped_weights, weights_path
 from spectralzoom.flows.tradeoff import coarse_of_sweeps
 from spectralzoom.models.evaluation.metrics import mean_iou
-from spectralzoom.models.network.sizes import TemporalSizes
 from spectralzoom.models.policies.placement import ReadTwice
-from spectralzoom.models.weights.files import Weights, describe_weights, load_reader, load_weights
+from spectralzoom.models.weights.files import Weights, describe_weights, load_weights
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import frame_patches, full_sweeps
@@ -49,13 +48,6 @@ def test_file_is_small_and_has_a_training_record(weights: Weights) -> None:
     split = weights.record["split"]
     assert not set(split["train"]) & set(split["validation"])
     assert ScanPerformance.read(weights.record["scans"]).steps == (1, 2, 4, 8)
-
-
-def test_its_temporal_reader_fits_the_weights() -> None:
-    """It was trained on lands of its own, with seeds from 200,000 up."""
-    found = describe_weights(PATH).reader
-    assert min(found.record["lands"]) >= 200_000
-    assert found.sizes == load_reader(PATH).sizes == TemporalSizes(11, 24)
 
 
 def test_a_plan_expects_the_score_of_its_law(tmp_path: Path) -> None:

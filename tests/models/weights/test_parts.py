@@ -16,7 +16,7 @@ from spectralzoom.models.network.sizes import TemporalSizes
 from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.weights import files
 from spectralzoom.pipeline.errors import WeightsError
-from tests.models.conftest import add_reader, make_weights
+from tests.models.conftest import make_weights
 
 SEEN = files.TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
 
@@ -32,7 +32,7 @@ def with_reader(path: Path, **changed: int) -> None:
     """Add a temporal reader to the weights."""
     config = files.describe_weights(path).config
     sizes = {"classes": config.classes, "columns": config.columns, "width": 8}
-    add_reader(path, TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed})))
+    files.add_reader(path, path, TemporalReader(TemporalSizes(**{**sizes, "coarse_width": 4, **changed})), {"seed": 1})
 
 
 def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
@@ -50,7 +50,7 @@ def test_added_parts_leave_the_weights_unchanged(path: Path) -> None:
     assert told.map_scores.as_dict() == scores.as_dict()
     assert told.reader.record == {"seed": 1}
     assert told.spectra.limits == (3.0, 1.5)
-    add_reader(path, files.load_reader(path))
+    files.add_reader(path, path, files.load_reader(path), {"seed": 1})
     again = files.describe_weights(path)
     assert again.reader.key == told.reader.key
     for name, tensor in files.load_weights(path).segmenter.state_dict().items():
@@ -63,9 +63,9 @@ def test_training_description_round_trips() -> None:
     assert [files.TrainedOn.read(json.loads(json.dumps(asdict(one)))) for one in (SEEN, bare)] == [SEEN, bare]
 
 
-def test_a_missing_reader_is_refused(path: Path) -> None:
-    """The error names the file."""
-    with pytest.raises(WeightsError, match=r"own\.safetensors has no temporal reader"):
+def test_a_missing_reader_names_the_command(path: Path) -> None:
+    """The error names the file and the command that makes the reader."""
+    with pytest.raises(WeightsError, match=r"own\.safetensors.*spectralzoom train DATASET --train-temporal"):
         files.load_reader(path)
 
 
@@ -105,7 +105,7 @@ def test_a_reader_with_nan_is_refused(path: Path) -> None:
     found = files.load_reader(path)
     with torch.no_grad():
         found.gates[0] = torch.nan
-    add_reader(path, found)
+    files.add_reader(path, path, found, {})
     with pytest.raises(WeightsError, match="not finite"):
         files.load_reader(path)
 
