@@ -10,7 +10,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,7 +28,7 @@ from spectralzoom.flows.settings.flags import AsJson, OutFile
 from spectralzoom.flows.settings.settings import Settings, SignalChoice, load_settings
 from spectralzoom.flows.settings.values import RASTER
 from spectralzoom.flows.tasks.scene import check_labels
-from spectralzoom.flows.terminal.figures import format_bytes
+from spectralzoom.flows.terminal.figures import counted, format_bytes
 from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import on_stdout, print_json, show_text, stderr, table
 from spectralzoom.models.evaluation.metrics import confusion, mean_iou
@@ -112,67 +112,34 @@ class Tradeoff:
     takes_scene: bool = False
 
 
-@dataclass(frozen=True)
-class Point:
-    """The four measures of one setting. Times are the least of all rounds."""
-
-    setting: Setting
-    error: float
-    time_s: float  # of the camera where the setting scans, else by the wall clock
-    processor_s: float
-    bytes: int
-
-
-@dataclass(frozen=True)
-class Result:
-    """Points of all settings of one trade-off."""
-
-    stage: str
-    knob: str
-    error: str
-    bytes: str
-    default: Setting | None
-    repeats: int
-    seed: int
-    machine: Mapping[str, object]
-    points: tuple[Point, ...]
-
-
-def describe_machine() -> dict[str, object]:
-    """Return processor, cores, system, threads in use and versions of the numerical packages."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
+def describe_machine() -> dict[str, Any]:
+    """Return processor, cores, load and versions of the numerical packages."""
+    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines() if Path("/proc/cpuinfo").exists() else []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return {
         "processor": next(names, platform.processor() or "unknown"),
         "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "threads": 1,
-        "versions": {name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
+        "load": round(os.getloadavg()[0], 2),  # over the last minute
+        "versions": {
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
+        },
     }
-
-
-def mean_load() -> float:
-    """Return the mean number of running processes over the last minute."""
-    return round(os.getloadavg()[0], 2)
 
 
 def measure_tradeoff(
     tradeoff: Tradeoff, *, repeats: int = 5, seed: int = 0, scene: str | None = None, weights: Path | None = None
-) -> Result:
+) -> dict[str, Any]:
     """Judge every setting by its first run, and time ``repeats`` runs of each in turn, on one thread.
 
-    Every round begins with another setting.
+    Every round begins with another setting. Times are the least of all rounds; ``time_s`` is that of the camera where
+    the setting scans.
     """
     run, judge = tradeoff.prepare(seed, scene, weights)
     settings = list(tradeoff.settings)
     figures: dict[Setting, Figures] = {}
     clocks: dict[Setting, list[tuple[float, float]]] = {one: [] for one in settings}
     with one_thread():
-        load_before = mean_load()
         for turn in range(repeats):
             first = turn % len(settings)
             for one in settings[first:] + settings[:first]:
@@ -182,13 +149,13 @@ def measure_tradeoff(
                 clocks[one].append((time.perf_counter() - wall, time.process_time() - processor))
                 if turn == 0:
                     figures[one] = judge(one, result)
-        machine = describe_machine() | {"load_before": load_before, "load_after": mean_load()}
     points = []
     for one, found in figures.items():
         wall, processor = (min(times) for times in zip(*clocks[one], strict=True))
-        points.append(Point(one, found.error, found.camera_s or wall, processor, found.bytes))
-    about = tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.bytes, tradeoff.default
-    return Result(*about, repeats, seed, machine, tuple(points))
+        times = {"time_s": found.camera_s or wall, "processor_s": processor}
+        points.append({"setting": one, "error": found.error, **times, "bytes": found.bytes})
+    about = {name: getattr(tradeoff, name) for name in ("stage", "knob", "error", "bytes", "default")}
+    return {**about, "repeats": repeats, "seed": seed, "machine": describe_machine(), "points": points}
 
 
 # rectify: kernels, between the pixels of a blurred farm
@@ -237,14 +204,14 @@ EXACT = "exact"
 TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma
 
 
-def decide_for_lines(seed: int) -> tuple[RasterScene, tuple[SweepBlock, ...], dict[Setting, Decision]]:
+def decide_for_lines(seed: int) -> tuple[RasterScene, list[SweepBlock], dict[Setting, Decision]]:
     """Return a farm, lines of the first sweep of its full scan, and the decision on effects for every tolerance."""
     scene = farm_scene(seed, LAND_SHAPE)
     rig = Rig()
     _, sweeps, _ = cheapest_full(SceneGrid(*LAND_SHAPE, PATCH), rig.camera, CostModel())
     probe = probe_scene(scene, rig, sweeps)
     starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
-    blocks = tuple(sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts)
+    blocks = [sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts]
     limits: dict[Setting, float] = {EXACT: 0.0} | {one: one for one in TOLERANCES}
     return scene, blocks, {one: decide(probe, rig, EFFECTS, limit) for one, limit in limits.items()}
 
@@ -516,7 +483,7 @@ def tradeoff(
         with stderr.status(f"measuring {one.stage}: {one.knob}"):
             results.append(measure_tradeoff(one, repeats=repeats, seed=seed, scene=scene, weights=weights))
         print_tradeoff(results[-1], stderr if as_json else on_stdout())
-    content = {"tradeoffs": [asdict(result) for result in results]}
+    content = {"tradeoffs": results}
     with writing(out):
         (out / "tradeoff.json").write_text(to_json(content), encoding="utf-8")
     show_text(str(out / "tradeoff.json"))
@@ -541,20 +508,19 @@ def choose_tradeoffs(stage: str | None, scene: str | None, weights: Path | None)
     return chosen
 
 
-def print_tradeoff(result: Result, console: Console) -> None:
+def print_tradeoff(result: Mapping[str, Any], console: Console) -> None:
     """Print the four measures of all settings, from the least error up."""
     rows = []
-    for point in sorted(result.points, key=lambda point: point.error):
-        name = f"{point.setting} (default)" if point.setting == result.default else str(point.setting)
-        times = [f"{seconds:.3g} s" for seconds in (point.time_s, point.processor_s)]
-        rows.append([escape(name), f"{point.error:.3g}", *times, format_bytes(point.bytes)])
+    for point in sorted(result["points"], key=lambda point: float(point["error"])):
+        name = f"{point['setting']}{' (default)' if point['setting'] == result['default'] else ''}"
+        times = [f"{point[time]:.3g} s" for time in ("time_s", "processor_s")]
+        rows.append([escape(name), f"{point['error']:.3g}", *times, format_bytes(point["bytes"])])
     headings = ("error", "time", "processor\ntime", "bytes")
-    title = f"{result.stage}: what accuracy costs"
-    console.print(table((escape(result.knob), *headings), rows, title=title, whole=headings))
-    machine = result.machine
+    title = f"{result['stage']}: what accuracy costs"
+    console.print(table((escape(result["knob"]), *headings), rows, title=title, whole=headings))
+    machine = result["machine"]
     caption = (
-        f"error: {result.error}; bytes: {result.bytes}\n"
-        f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn, {machine['threads']} thread, "
-        f"load {machine['load_before']} to {machine['load_after']}, {machine['processor']}"
+        f"error: {result['error']}; bytes: {result['bytes']}\n{counted(result['repeats'], 'repeat')} in turn, one"
+        f" thread, load {machine['load']}, {machine['processor']}"
     )
     console.print(escape(caption))

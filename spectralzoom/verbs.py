@@ -138,7 +138,7 @@ def train(
     progress, quiet
         As for `survey`.
     flags
-        Those of `spectralzoom train`, lists as Python's: ``steps=500``, ``hold_out=["059"]``, ``dim=64``.
+        Those of `spectralzoom train`, lists as Python's: ``steps=500``, ``hold_out=["059"]``.
 
     Raises
     ------

@@ -12,21 +12,21 @@ from rich.markup import escape
 from rich.table import Table
 
 from spectralzoom.flows.evaluate.frames import Candidate, observe_frame, open_candidates, open_frames, sort_frames
-from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, seeds_of, summarise
+from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, summarise
 from spectralzoom.flows.settings.model_flags import EvaluateFlags
 from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from spectralzoom.flows.terminal.processes import writing
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
-from spectralzoom.models.weights.files import PLAIN, Weights, load_weights
+from spectralzoom.models.weights.files import PLAIN, load_weights
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.whole_files import to_json, write_whole
 
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
 CAPTION = (
     "K: fraction of the valid patches. mIoU: of the counts of all frames, mean over the classes of the labels. "
-    "overall: fraction of right pixels. ±: standard deviation over seeds, else over random draws. "
+    "overall: fraction of right pixels. ±: standard deviation over weights, else over random draws. "
     "MACs: multiply-adds a frame."
 )
 
@@ -65,20 +65,18 @@ def evaluate_weights(
     content = {
         "dataset": data.law,
         "weights": [
-            {
-                "file": one.path.name,
-                "key": one.described.key[:16],
-                "frames": len(covers := [name for name, judges in jobs.frames.items() if number in judges]),
-                "covers": covers,
-                "left_out": sorted({*jobs.frames, *jobs.left_out} - set(covers)),
-            }
-            for number, one in enumerate(candidates)
+            {"file": one.path.name, "key": one.described.key[:16], "frames": list(run)}
+            for one, run in zip(candidates, runs, strict=True)
         ],
         "frames": list(jobs.frames),
         "left_out": jobs.left_out,
         "settings": {"fractions": fractions, "seed": flags.seed, "camera": asdict(candidates[0].camera)},
-        "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
-        **summarise(runs, candidates[0].described.class_names, fractions, candidates[0].described.config.patch),
+        **summarise(
+            [run for run in runs if run],
+            candidates[0].described.class_names,
+            fractions,
+            candidates[0].described.config.patch,
+        ),
         "data_notes": [*data.notes, *jobs.notes, *(note for one in candidates for note in one.notes)],
         "files": [] if flags.out is None else [str(flags.out / "evaluation.json")],
     }
@@ -96,18 +94,15 @@ def _judge_frames(
     show: Report,
 ) -> list[dict[str, dict[Choice, Row]]]:
     """Judge every frame by its weights; return the rows of the frames of each of the weights."""
-    device = choose_device(flags.device)
-    loaded: dict[int, Weights] = {}
+    device, seed = choose_device(flags.device), flags.seed
+    loaded = [load_weights(one.path).on(device) for one in candidates]
     runs: list[dict[str, dict[Choice, Row]]] = [{} for _ in candidates]
     for number, (name, judges) in enumerate(frames.items()):
+        show("judging frames", number / len(frames), name)
         scene = data.scene(name)
-        for at, index in enumerate(judges):
-            one = candidates[index]
-            show("judging frames", (number + at / len(judges)) / len(frames), f"{name}, {one.path.name}")
-            if index not in loaded:
-                loaded[index] = load_weights(one.path).on(device)
-            frame = observe_frame(scene, name, loaded[index], one.camera, flags.seed)
-            runs[index][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[index], fractions, flags.seed)
+        for at in judges:
+            frame = observe_frame(scene, name, loaded[at], candidates[at].camera, seed)
+            runs[at][name] = judge_frame(*frame, len(scene.wavelength_nm), loaded[at], fractions, seed)
     show("judging frames", 1.0, f"{len(frames)} frames")
     return runs
 
@@ -120,9 +115,7 @@ def print_evaluation(content: dict[str, Any], console: Console) -> None:
     lines = [_sentence(content["brief"], named)]
     lines += [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
     if len(weights) > 1:
-        lines += [f"  {one['file']}: {one['frames']} frames: {', '.join(one['covers']) or 'none'}" for one in weights]
-        together = "; ".join(" + ".join(names) for names in content["seeds"])
-        lines.append(f"  seeds of the training: {len(content['seeds'])} ({together})")
+        lines += [f"  {one['file']}: {', '.join(one['frames']) or 'no frame'}" for one in weights]
     for line in lines:
         show_text(line, console)
     console.print(_accuracy(content))
@@ -152,7 +145,7 @@ def _accuracy(content: dict[str, Any]) -> Table:
             format_points(row["pixel_accuracy"]),
             format_points(row["average_accuracy"]),
             DASH if math.isnan(row["kappa"]) else f"{row['kappa']:.2f}",
-            format_count(row["cost"]["multiply_adds"]["done"]),
+            format_count(row["multiply_adds"]),
         )
         rows.append(cells)
     return table(columns, rows, whole=columns[1:])

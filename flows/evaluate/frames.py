@@ -1,8 +1,4 @@
-"""Choose the frames on which weights are judged: those whose labels they were not trained on.
-
-With frames held out in turn (folds) each file is judged on its own held-out frames. Its validation frames are held out
-by another file.
-"""
+"""Choose the frames on which weights are judged: those whose labels they were not trained on."""
 
 from __future__ import annotations
 
@@ -76,27 +72,22 @@ class Candidate:
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """Read the descriptions of the weights.
 
-    Raises SettingsError: no weights, or weights of different cameras, sizes or classes; WeightsError: a file cannot be
-    read.
+    Raises SettingsError: no weights, or weights of different cameras, patches or classes; WeightsError: a file cannot
+    be read.
     """
     if not paths:
         raise SettingsError("give --weights FILE, the weights to judge; spectralzoom train DATASET -o FILE makes them")
     found = [Candidate(path, describe_weights(path)) for path in paths]
     first = found[0]
     for one in found[1:]:
-        # a fold may lack a class, or have another mixture
-        configs = [
-            replace(of.described.config, untaught=(), parts=(), components=(0, 0), context=False, corrected=True)
-            for of in (one, first)
-        ]
-        alike = configs[0] == configs[1] and one.camera == first.camera
-        if not alike or one.described.class_names != first.described.class_names:
+        alike = [(of.camera, of.described.config.patch, of.described.class_names) for of in (one, first)]
+        if alike[0] != alike[1]:
             raise SettingsError(
-                f"{one.path} differs from {first.path} in camera, sizes or classes; several --weights are seeds of one"
-                " training: evaluate different ones separately"
+                f"{one.path} differs from {first.path} in camera, patch or classes; several --weights are seeds or"
+                " folds of one training: evaluate different ones separately"
             )
     if len({one.described.key for one in found}) < len(found):
-        raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
+        raise SettingsError("the same weights are given twice in --weights; give each file once")
     return found
 
 
@@ -104,13 +95,13 @@ def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
     """Return the data with the frames to judge in ``train``. Raises SettingsError: no such frame, too."""
-    built_in = bool(built_in_laws(dataset))
-    data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
-    if built_in:
+    if built_in_laws(dataset):
         count = FARM_TEST_SCENES if scenes is None else scenes
         if count < 1:
             raise SettingsError(f"--scenes must be at least 1, got {count}")
-        data = farm_test_data(count, camera, dataset)
+        data = farm_test_data(count, camera, dataset, **choices)
+    else:
+        data = open_training_data(dataset, 0, scenes, camera, **choices)
     if unknown := [name for name in frames if name not in data.train]:
         raise SettingsError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)
@@ -145,28 +136,10 @@ class Jobs:
     notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
 
-def _judges(scene: RasterScene, weights: Sequence[Candidate]) -> tuple[int, ...]:
-    """Return the indices of the weights that were not trained on a scene, or not on the same pixels of it."""
-    for one in weights:
-        check_labels(scene, one.described)
-    in_turn = len({tuple(one.split.get("held_out", ())) for one in weights}) > 1
-    fit = tuple(
-        at
-        for at, one in enumerate(weights)
-        if seen_in_training(scene, one.described) != "all" and not (in_turn and one.validated_on(scene))
-    )
-    left = [np.asarray(judged_labels(scene, weights[at].described)) for at in fit]
-    if other := next((at for at, labels in zip(fit, left, strict=True) if not np.array_equal(labels, left[0])), None):
-        both = f"{weights[other].path} and {weights[fit[0]].path}"
-        raise SettingsError(f"{both} were trained on different pixels of {scene.name}; evaluate them separately")
-    return fit
-
-
 def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, *, named: bool = False) -> Jobs:
     """Assign to each frame the weights that were not trained on it; every ``named`` one needs some.
 
-    Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels;
-    SettingsError: weights were trained on different pixels of a frame.
+    Raises SceneError: no frame or labelled pixel is left, a named frame has no weights left, or a frame has no labels.
     """
     jobs = Jobs()
     notes = SceneNotes()
@@ -176,7 +149,9 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
             raise SceneError(
                 f"frame {scene.name} has no labels, which a map is judged by; give --labels or a scene.toml"
             )
-        fit = _judges(scene, weights)
+        for one in weights:
+            check_labels(scene, one.described)
+        fit = tuple(at for at, one in enumerate(weights) if seen_in_training(scene, one.described) != "all")
         if not fit:
             jobs.left_out.append(name)
             continue
@@ -186,8 +161,7 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
         if any(seen_in_training(scene, weights[at].described) for at in fit):
             notes[TAUGHT].append(name)
         notes.add(name, scene)
-        labels = judged_labels(scene, weights[fit[0]].described)
-        labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
+        labelled = labelled or bool(np.any(judged_labels(scene, weights[fit[0]].described) != UNLABELLED))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
     if jobs.left_out and (named or not jobs.frames):
         raise SceneError(

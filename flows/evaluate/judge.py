@@ -1,12 +1,8 @@
-"""Judge a frame by some weights, and summarise many: means and standard deviations over seeds.
-
-Weights without a common frame are folds of one training and count as one seed. Weights that share a frame are different
-seeds.
-"""
+"""Judge a frame by some weights, and summarise many: means and standard deviations over weights."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,7 +34,7 @@ class Row:
     multiply_adds: int
 
 
-Run = Mapping[str, Mapping[Choice, Row]]  # rows of each frame, by some weights or by a seed
+Run = Mapping[str, Mapping[Choice, Row]]  # rows of each frame, by some weights
 
 
 def judge_frame(
@@ -70,38 +66,6 @@ def judge_frame(
     return rows
 
 
-def seeds_of(runs: Sequence[Iterable[str]]) -> list[list[int]]:
-    """Group weights without a common frame into seeds; return their indices. Weights without a frame are left out.
-
-    ``runs`` are the names of the frames of each of the weights.
-    """
-    seeds: list[tuple[set[str], list[int]]] = []
-    for number, names in enumerate(map(set, runs)):
-        if not names:
-            continue
-        covered, members = next((one for one in seeds if not one[0] & names), (set(), []))
-        if not members:
-            seeds.append((covered, members))
-        covered.update(names)
-        members.append(number)
-    return [members for _, members in seeds]
-
-
-def counts_of(seeds: Sequence[Run], choice: Choice) -> Counts:
-    """Return the counts of one policy and fraction, (seed, draw, frame, class, class).
-
-    Frames without a labelled pixel are left out, those that a seed did not judge are zeros.
-    """
-    names = sorted({name for run in seeds for name, rows in run.items() if rows[choice].counts.any()})
-    shape = next(iter(seeds[0].values()))[choice].counts.shape
-    counts = np.zeros((len(seeds), shape[0], len(names), *shape[1:]), np.int64)
-    for number, run in enumerate(seeds):
-        for at, name in enumerate(names):
-            if name in run:
-                counts[number, :, at] = run[name][choice].counts
-    return counts
-
-
 def summarise(
     runs: Sequence[Run], class_names: Sequence[str], fractions: Sequence[float], patch: int
 ) -> dict[str, Any]:
@@ -109,51 +73,55 @@ def summarise(
 
     ``runs`` are the rows of `judge_frame` by each of the weights, whose patches have ``patch`` px a side.
     """
-    seeds = [{name: rows for number in members for name, rows in runs[number].items()} for members in seeds_of(runs)]
-    shared = [(policy, fraction) for policy in POLICIES for fraction in fractions]
-    whole = counts_of(seeds, ALL)
-    known = all(ALONE in rows for run in seeds for rows in run.values())
-    pixels = patch**2 * _cost(seeds, ALL)["patches"]
-    brief = {
-        name: {
-            "miou": _accuracy(counts_of(seeds, choice), class_names)["miou"],
-            "multiply_adds_a_pixel": _cost(seeds, choice)["multiply_adds"] / pixels,
-        }
-        for name, choice in (("weights", ALL), *([(PLAIN, ALONE)] if known else []))
+    choices = [NONE, *((policy, fraction) for policy in POLICIES for fraction in fractions), ALL]
+    table = [
+        {"policy": one[0], "fraction": one[1], **_accuracy(runs, one, class_names), **_cost(runs, one)}
+        for one in choices
+    ]
+    brief = {"weights": ALL}
+    if all(ALONE in rows for run in runs for rows in run.values()):
+        brief[PLAIN] = ALONE
+    pixels = patch**2 * _cost(runs, ALL)["patches"]
+    labelled = {name: rows[ALL].counts[0].sum(axis=1) for run in runs for name, rows in run.items()}
+    return {
+        "brief": {
+            name: {
+                "miou": _accuracy(runs, one, class_names)["miou"],
+                "multiply_adds_a_pixel": _cost(runs, one)["multiply_adds"] / pixels,
+            }
+            for name, one in brief.items()
+        },
+        "rows": table,
+        "support": dict(zip(class_names, np.sum([*labelled.values()], axis=0).tolist(), strict=True)),
     }
-    support = whole.sum(axis=4).max(axis=(0, 1)).sum(axis=0)  # labelled pixels of each class, each frame once
-    table = []
-    for choice in (NONE, *shared, ALL):
-        done, full = (_cost(seeds, one) for one in (choice, ALL))  # their ratio is that to all patches
-        cost = {name: {"done": done[name], "ratio": done[name] / full[name] if full[name] else None} for name in done}
-        figures = _accuracy(counts_of(seeds, choice), class_names)
-        table.append({"policy": choice[0], "fraction": choice[1], **figures, "cost": cost})
-    return {"brief": brief, "rows": table, "support": dict(zip(class_names, support.tolist(), strict=True))}
 
 
-def _cost(seeds: Sequence[Run], choice: Choice) -> dict[str, float]:
+def _cost(runs: Sequence[Run], choice: Choice) -> dict[str, float]:
     """Return the mean patches and multiply-adds of a frame."""
-    rows = [of_frame[choice] for run in seeds for of_frame in run.values()]
+    rows = [of_frame[choice] for run in runs for of_frame in run.values()]
     return {name: float(np.mean([getattr(row, name) for row in rows])) for name in ("patches", "multiply_adds")}
 
 
-def _accuracy(counts: Counts, class_names: Sequence[str]) -> dict[str, Any]:
-    """Return means over seeds and draws; the spread of the mIoU is that over seeds, for a single seed over draws."""
+def _accuracy(runs: Sequence[Run], choice: Choice, class_names: Sequence[str]) -> dict[str, Any]:
+    """Return means over weights and draws of the figures of all frames together.
+
+    The spread of the mIoU is its standard deviation over the weights, for a single file over the draws.
+    """
+    totals = [np.sum([rows[choice].counts for rows in run.values()], axis=0) for run in runs]
 
     def each(figure: Callable[[Counts], Any]) -> NDArray[np.float64]:
-        """Return a figure of the summed counts, (seed, draw) or (seed, draw, class)."""
-        return np.array([[figure(run.sum(axis=0)) for run in seed] for seed in counts])
+        """Return a figure, (weights, draw) or (weights, draw, class)."""
+        return np.array([[figure(draw) for draw in run] for run in totals])
 
     miou = each(metrics.mean_iou)
-    seeds = [_mean(draws) for draws in miou]
-    repeats = seeds if len(seeds) > 1 else miou[0]
+    by_weights = [_mean(draws) for draws in miou]
+    repeats = by_weights if len(by_weights) > 1 else miou[0]
     classes = np.moveaxis(each(metrics.iou_per_class), 2, 0)
     false = each(metrics.false_pixels).mean(axis=(0, 1)).tolist()
     return {
-        "frames": counts.shape[2],
         "miou": _mean(miou),
         "spread": float(np.std(repeats, ddof=1)) if len(repeats) > 1 else None,
-        "by_seed": seeds,
+        "by_weights": by_weights,
         "pixel_accuracy": _mean(each(metrics.overall_accuracy)),
         "average_accuracy": _mean(each(metrics.average_accuracy)),
         "kappa": _mean(each(metrics.kappa)),

@@ -67,9 +67,8 @@ class TrainFlags(SceneFlags):
         Maximum number of steps; training stops at --steps or --minutes, whichever comes first.
     minutes
         Time limit of the training [min]: of the processor, or on an accelerator that of the clock. Reading scenes and
-        the last validation are not included.
-    patch
-        Size of a patch [px]. Default: 16 for the farm, 8 to 32 for files, by their size.
+        the last validation are not included. The classifiers of files need their time in any case; a network, and
+        classifiers that learn from validation scenes too, follow if the time suffices.
     start
         For built-in scenes: weights from which the training starts. Bands, classes and sizes must be theirs, and
         DATASET must contain the scenes that they know. The result is the mean of both networks, or the trained one
@@ -80,16 +79,6 @@ class TrainFlags(SceneFlags):
         Weights to which only a temporal reader is added, for surveys with --prior. The training starts from the
         reader that they have. It takes --scenes, --steps, --minutes and --seed; it does not resume. It
         needs 4 GB of memory, and half an hour for reading the scenes besides --minutes.
-    dim
-        Token width of the transformer.
-    layers
-        Number of transformer layers. Default: 3, or 1 for frames of 512 px and more.
-    heads
-        Number of attention heads; a divisor of --dim.
-    crop
-        Size of the crops [px].
-    batch
-        Crops per step; half as many, of twice the area, in the last 30 % of the steps.
     min_exposure_ms
         Shortest exposure [ms]: augments training with simulated noise of exposures up to 100 ms and line spacings of
         1 to 8 px. With validation scenes, the weights record the scan performance, which `survey --seconds` needs.
@@ -99,15 +88,9 @@ class TrainFlags(SceneFlags):
     validation: int | None = None
     steps: int = TrainingSettings.steps
     minutes: float = TrainingSettings.minutes
-    patch: int | None = None
     start: Path | None = None
     learning_rate: float | None = None
     train_temporal: Path | None = None
-    dim: int = 64
-    layers: int | None = None
-    heads: int = 4
-    crop: int = TrainingSettings.crop
-    batch: int = TrainingSettings.batch
     min_exposure_ms: float = TrainingSettings.darkest_ms
 
     def choices(self) -> dict[str, Any]:
@@ -117,10 +100,13 @@ class TrainFlags(SceneFlags):
     @property
     def settings(self) -> TrainingSettings:
         """Return the settings of the network's training."""
-        same = {name: getattr(self, name) for name in ("steps", "minutes", "seed", "crop", "batch")}
-        usual = TrainingSettings.learning_rate / (3 if self.start else 1)
-        rate = usual if self.learning_rate is None else self.learning_rate
-        return TrainingSettings(**same, darkest_ms=self.min_exposure_ms, learning_rate=rate)
+        return TrainingSettings(
+            steps=self.steps,
+            minutes=self.minutes,
+            seed=self.seed,
+            darkest_ms=self.min_exposure_ms,
+            learning_rate=self.learning_rate or TrainingSettings.learning_rate / (3 if self.start else 1),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,8 +116,8 @@ class EvaluateFlags(SceneFlags):
     Parameters
     ----------
     weights
-        Weights; repeat the flag for several seeds or folds. Each frame is evaluated by the weights that were not
-        trained on it.
+        Weights; repeat the flag for several seeds or folds, whose scores are averaged. Each is judged on the frames
+        that it was not trained on.
     out
         Folder of evaluation.json.
     fractions

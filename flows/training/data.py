@@ -49,6 +49,7 @@ SEASON_DAYS = (96, 304)  # of training scenes: April to October
 SCOUTED_DAYS = (136, 200)  # of scouted fields and trials
 SEASON_HOURS = (9, 15)  # true solar time
 _PREFIXES = {FARM_LAW: "", SCOUTING_LAW: "scouting-", TRIAL_LAW: "trial-"}  # of the names of scenes
+_SEASONS = {FARM_LAW: SEASON_DAYS, SCOUTING_LAW: SCOUTED_DAYS, TRIAL_LAW: SCOUTED_DAYS}
 _GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps that cover a circle evenly
 Report = Callable[[str, float, str], None]  # activity, fraction done, figure
 
@@ -183,37 +184,27 @@ class TrainingData:
         return scene_of_file(self.files.load(name), self.camera)
 
 
-def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW) -> TrainingData:
-    """Return built-in scenes to judge weights on, all in ``train``."""
+def farm_test_data(scenes: int, camera: LineCamera, dataset: str = FARM_LAW, **choices: object) -> TrainingData:
+    """Return built-in scenes to judge weights on, all in ``train``. Raises SettingsError: a choice of files."""
+    _refuse_choices(choices)
     laws = built_in_laws(dataset)
-    return TrainingData(",".join(laws), _built_in_days(laws, FARM_TEST_SEED, scenes, odd=True), (), (), camera)
+    return TrainingData(",".join(laws), farm_days(FARM_TEST_SEED, scenes, laws, odd=True), (), (), camera)
 
 
-def _built_in_days(laws: tuple[str, ...], first_seed: int, count: int, *, odd: bool = False) -> tuple[str, ...]:
-    """Name ``count`` scenes, of each law in turn."""
-    names: list[str] = []
-    for number, law in enumerate(laws):
-        own = len(range(number, count, len(laws)))
-        season = SEASON_DAYS if law == FARM_LAW else SCOUTED_DAYS
-        names += [_PREFIXES[law] + name for name in farm_days(first_seed, own, odd=odd, season=season)]
-    return tuple(names)
-
-
-def farm_days(
-    first_seed: int, count: int, *, odd: bool = False, season: tuple[int, int] = SEASON_DAYS
-) -> tuple[str, ...]:
-    """Name scenes of the farm by consecutive seeds, each with a day of the season and an hour.
+def farm_days(first_seed: int, count: int, laws: Sequence[str] = (FARM_LAW,), *, odd: bool = False) -> tuple[str, ...]:
+    """Name scenes of each law in turn by consecutive seeds, each with a day of the season and an hour.
 
     Days follow the golden section, which covers the season evenly for any number of scenes. Training has even days,
     evaluation ``odd`` ones.
     """
-    first, last = season
     morning, evening = SEASON_HOURS
     names = []
-    for i in range(count):
-        day = first + 2 * int((0.5 + i * _GOLDEN) % 1 * ((last - first) // 2)) + odd
-        hour = morning + int((0.5 + i * _SILVER) % 1 * (evening - morning + 1))
-        names.append(f"{first_seed + i}-day-{day}-hour-{hour}")
+    for number, law in enumerate(laws):
+        first, last = _SEASONS[law]
+        for i in range(len(range(number, count, len(laws)))):
+            day = first + 2 * int((0.5 + i * _GOLDEN) % 1 * ((last - first) // 2)) + odd
+            hour = morning + int((0.5 + i * _SILVER) % 1 * (evening - morning + 1))
+            names.append(f"{_PREFIXES[law]}{first_seed + i}-day-{day}-hour-{hour}")
     return tuple(names)
 
 
@@ -221,6 +212,14 @@ def read_farm_name(name: str) -> tuple[int, int, float]:
     """Return seed, day and hour of a name of `farm_days`."""
     seed, _, day, _, hour = name.removeprefix(_PREFIXES[law_of(name)]).split("-")
     return int(seed), int(day), float(hour)
+
+
+def _refuse_choices(choices: Mapping[str, object]) -> None:
+    """Raise SettingsError for a choice of files."""
+    for choice, value in choices.items():
+        if value not in (None, ()):
+            flag = "--" + choice.replace("_", "-")
+            raise SettingsError(f"{flag} is for scene files; built-in scenes are drawn by seed and bring their own")
 
 
 def law_of(name: str) -> str:
@@ -238,13 +237,10 @@ def open_training_data(
     for built-in scenes, or the other way round.
     """
     if laws := built_in_laws(dataset):
-        for choice, value in choices.items():
-            if value not in (None, ()):
-                flag = "--" + choice.replace("_", "-")
-                raise SettingsError(f"{flag} is for scene files; built-in scenes are drawn by seed and bring their own")
-        train = _built_in_days(laws, FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes)
+        _refuse_choices(choices)
+        train = farm_days(FARM_TRAIN_SEED, FARM_SCENES if scenes is None else scenes, laws)
         left = FARM_VALIDATION * len(laws) if validation is None else validation
-        judged = _built_in_days(laws, FARM_VALIDATION_SEED, left, odd=True)
+        judged = farm_days(FARM_VALIDATION_SEED, left, laws, odd=True)
         return TrainingData(",".join(laws), train, judged, (), camera)
     if scenes is not None:
         raise SettingsError(f"--scenes is for built-in scenes; {dataset} has its own scenes")
@@ -267,6 +263,14 @@ def untaught_note(names: Sequence[str]) -> str:
     if len(names) == 1:
         return f"class {names[0]} has no pixel in the training frames; it will never be drawn"
     return f"classes {', '.join(names)} have no pixel in the training frames; they will never be drawn"
+
+
+def check_taught(dataset: str, taught: Sequence[str], frames: Sequence[str]) -> None:
+    """Raise SceneError for fewer than two classes that frames have."""
+    if len(taught) < 2:
+        note = f"no pixel of {list_some(frames)} has a class; correct the labels, or 'unlabelled' in scene.toml"
+        note = filled(alike_note(taught[0]), frames) if taught else note
+        raise SceneError(f"{dataset}: training needs two or more classes, and {note}")
 
 
 EMPTY = "{scenes} without any value left out: {names}"

@@ -15,14 +15,14 @@ import numpy as np
 from rich.console import Console
 
 from spectralzoom.flows.settings.model_flags import TrainFlags
+from spectralzoom.flows.terminal.figures import counted
 from spectralzoom.flows.terminal.progress import one_after_the_other, show_text, table
 from spectralzoom.flows.training import figures
 from spectralzoom.flows.training.data import (
     Report,
     TrainingData,
-    alike_note,
     check_out,
-    filled,
+    check_taught,
     law_of,
     open_training_data,
     read_farm_name,
@@ -34,7 +34,6 @@ from spectralzoom.models.network.machine import PROCESSOR, choose_device
 from spectralzoom.models.network.segmenter import Segmenter
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation
-from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS, CaptureAugmentation
 from spectralzoom.models.training.examples import measured_normalisation
 from spectralzoom.models.training.mixture import fit_mixture
@@ -50,7 +49,6 @@ from spectralzoom.models.weights.checksummed_files import load_checkpoint
 from spectralzoom.models.weights.files import (
     CALIBRATION,
     CAPTURED,
-    CASCADE,
     CLASS_VALUES,
     PLAIN,
     SCANS,
@@ -64,7 +62,7 @@ from spectralzoom.models.weights.files import (
     save_weights,
     with_record,
 )
-from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
@@ -80,78 +78,47 @@ def train_weights(
     """Train, validate and save weights; return their record. ``tell`` gets notes on left-out scenes.
 
     Raises SceneError: no labels, a single class, or scenes of different bands or classes; SettingsError: an invalid
-    output path, sizes that do not fit, or an unavailable device.
+    output path, weights to start from that do not fit, or an unavailable device.
     """
+    flags, settings = request.flags, request.flags.settings
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     check_out(request.out)
     load_checkpoint(checkpoint)  # a damaged one fails before minutes are spent
-    flags = request.flags
     if flags.start is not None and not built_in_laws(request.dataset):
         raise SettingsError(
             "--start is for built-in scenes; training on files takes seconds: train anew on all of them together"
         )
     begun = None if flags.start is None else load_weights(flags.start)
     device = choose_device(flags.device)
-    settings = flags.settings
     data = open_training_data(request.dataset, flags.validation, flags.scenes, CAMERA, **flags.choices())
     for note in data.notes:
         tell(note)
     scenes = observe_all(request, data, report, tell)
-    taught = scenes if data.files is None else scenes.joined  # in the end
-    check_classes(request, taught, tell)
+    check_classes(request, scenes if data.files is None else scenes.joined, tell)
     if begun is None:
         normalisation = measured_normalisation(scenes.train.examples, math.sqrt(settings.darkest_ms * REFERENCE_MS))
     else:
         check_start(request, begun, scenes)
         normalisation = begun.normalisation
     scenes = scenes.normalised(normalisation)
-    augmentation = CaptureAugmentation(normalisation, min_exposure_ms=settings.darkest_ms) if request.captured else None
-    about = {
-        "command": request.command,
-        "data": data.law,
-        **({CLASS_VALUES: list(scenes.common.values)} if scenes.common.values else {}),
-        TRAINED_ON: asdict(_trained_on(data, taught, settings.darkest_ms)),
-        "split": taught.split | {"validation": scenes.validation.keys, "held_out": list(data.held_out)},
-        "settings": asdict(settings),
-        "camera": asdict(CAMERA),
-        CAPTURED: request.captured,
-        "device": device,
-        **({} if begun is None else {"started_from": begun.record.get("command", "")}),
-    }
-    learner = Learner(request, scenes, normalisation, augmentation, checkpoint, device, report)
+    learner = Learner(request, data, scenes, normalisation, begun, checkpoint, device, report)
     if data.files is None:
-        record = _written(learner, about, learner.network(begun))
+        record = learner.written(learner.network())
     else:
         if len(scenes.untaught) > len(scenes.common.names) - 2:  # the other classes are in scenes for validation
-            learner = replace(learner, scenes=learner.scenes.joined)
+            learner = replace(learner, scenes=scenes.joined)
         mixed = learner.mixture()
-        record = _written(learner, about, mixed)  # usable after seconds
+        record = learner.written(mixed)  # usable after seconds
         if learner.scenes.validation.examples:
-            learned = learner.correction(mixed)
-            record = _written(learner, about, learned, learner.whole(learned))
+            if (minutes := learner.minutes_left(mixed)) > 0:
+                learned = learner.correction(mixed, minutes)
+                record = learner.written(learned, learner.whole(learned))
+            else:
+                kept = counted(len(learner.scenes.validation.keys), "validation scene")
+                tell(
+                    f"the classifiers took half of --minutes or more: none learns from {kept}, and there is no network"
+                )
     checkpoint.unlink(missing_ok=True)
-    return record
-
-
-def _written(
-    learner: Learner, about: Mapping[str, Any], learned: Learned, whole: Learned | None = None
-) -> dict[str, Any]:
-    """Judge weights, save them, or others of the ``whole`` data, and return their record."""
-    weights, request = learned.weights, learner.request
-    frames, kept = learner.scenes.validation.examples, whole or learned
-    record = {**about, **kept.found, **learner.judged(weights)}
-    seed = request.flags.settings.seed
-    laws = [law_of(name) if built_in_laws(request.dataset) else "" for name in learner.scenes.validation.keys]
-    scans = figures.judge_scans(
-        with_record(weights, **record), frames, laws, learner.augmentation, seed, learner.report
-    )
-    if scans is not None:
-        record[SCANS] = scans[0]
-    save_weights(with_record(kept.weights.on(PROCESSOR), **record), request.out)
-    if learner.spectra is not None:
-        add_spectra(request.out, learner.spectra)
-    if scans is not None:
-        add_map_scores(request.out, scans[1])
     return record
 
 
@@ -178,13 +145,11 @@ def _trained_on(data: TrainingData, scenes: Scenes, min_exposure_ms: float) -> T
 
 def check_classes(request: TrainRequest, scenes: Scenes, tell: Callable[[str], None]) -> None:
     """Tell the classes without a training pixel. Raises SceneError: fewer than two classes have one."""
-    names, frames = scenes.common.names, [*scenes.train.keys]
-    taught = [name for number, name in enumerate(names) if number not in scenes.untaught]
-    if len(taught) < 2:
-        note = filled(alike_note(taught[0]), frames) if taught else f"no pixel of {list_some(frames)} has a label"
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
-    if scenes.untaught:
-        tell(untaught_note([names[number] for number in scenes.untaught]))
+    untaught = [scenes.common.names[number] for number in scenes.untaught]
+    taught = [name for name in scenes.common.names if name not in untaught]
+    check_taught(request.dataset, taught, [*scenes.train.keys])
+    if untaught:
+        tell(untaught_note(untaught))
 
 
 def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
@@ -197,7 +162,7 @@ def check_start(request: TrainRequest, begun: Weights, scenes: Scenes) -> None:
         "classes": (begun.class_names, begun.config.untaught) == (scenes.common.names, scenes.untaught),
         "training scenes": {*begun.record.get("split", {}).get("train", {}).values()} <= {*scenes.train.keys.values()},
         "bands": begun.basis == scenes.common.basis,
-        "sizes of the network": replace(begun.config, untaught=()) == network_config(request.flags, scenes.common),
+        "sizes of the network": replace(begun.config, untaught=()) == network_config(scenes.common),
     }.items():
         if not kept:
             raise SettingsError(
@@ -215,12 +180,13 @@ class Learned:
 
 @dataclass(frozen=True)
 class Learner:
-    """The ways to learn from normalised scenes."""
+    """The ways to learn from normalised scenes, and to write what was learned."""
 
     request: TrainRequest
+    data: TrainingData
     scenes: Scenes
     normalisation: Normalisation
-    augmentation: CaptureAugmentation | None
+    begun: Weights | None  # to start from
     checkpoint: Path
     device: str
     report: Report
@@ -228,7 +194,13 @@ class Learner:
     @cached_property
     def config(self) -> SegmenterConfig:
         """Return the sizes of the networks."""
-        return replace(network_config(self.request.flags, self.scenes.common), untaught=self.scenes.untaught)
+        return replace(network_config(self.scenes.common), untaught=self.scenes.untaught)
+
+    @cached_property
+    def augmentation(self) -> CaptureAugmentation | None:
+        """Return the simulation of captures; None for scenes of files that stay as they are."""
+        darkest_ms = self.request.flags.min_exposure_ms
+        return CaptureAugmentation(self.normalisation, min_exposure_ms=darkest_ms) if self.request.captured else None
 
     @cached_property
     def spectra(self) -> TrainingSpectra | None:
@@ -236,9 +208,9 @@ class Learner:
         scenes = [one.columns[: one.shape[0], : one.shape[1]] for one in self.scenes.train.examples]
         return TrainingSpectra.measured(scenes, self.normalisation.whitening)
 
-    def network(self, begun: Weights | None) -> Learned:
+    def network(self) -> Learned:
         """Train networks from a linear classifier of mean spectra, or from weights."""
-        examples = self.scenes.train.examples
+        examples, begun = self.scenes.train.examples, self.begun
         rng = np.random.default_rng([0x1DA])
         pixels = LabelledPixels.drawn(examples, rng, self.augmentation).brightened(self.normalisation.gain_shift, rng)
         start = linear_classifier(pixels, self.config.classes) | (load_encoder() if self.config.deep else {})
@@ -252,19 +224,22 @@ class Learner:
     def mixture(self) -> Learned:
         """Fit a mixture of classifiers, without a network."""
         worked, began = time.process_time(), time.monotonic()
-        seed = self.request.flags.settings.seed
+        seed = self.request.flags.seed
         mixed = fit_mixture(self.scenes.train.examples, self.normalisation, self.config, seed, self.report)
         seconds, processor = round(time.monotonic() - began, 1), round(time.process_time() - worked, 1)
         spent = {"steps": 0, "seconds": seconds, "processor_seconds": processor}
         found = {"candidates": [asdict(one) for one in mixed.judged], PLAIN: mixed.plain, "training": spent}
         return Learned(self._weights(mixed.segmenter), found)
 
-    def correction(self, mixed: Learned) -> Learned:
-        """Train networks that correct a mixture; return the mixture unless they read the validation scenes better."""
-        scenes, settings = self.scenes, self.request.flags.settings
+    def minutes_left(self, mixed: Learned) -> float:
+        """Return the minutes for a network, beside two fits of the mixture: the last one to all scenes."""
         spent = mixed.found["training"]["processor_seconds" if self.device == PROCESSOR else "seconds"]
-        minutes = settings.minutes - 2 * spent / 60  # in the end a mixture is fitted to all scenes
-        if minutes <= 0 or len(scenes.joined.train.examples) < CORRECTED_SCENES:
+        return float(self.request.flags.minutes - 2 * spent / 60)
+
+    def correction(self, mixed: Learned, minutes: float) -> Learned:
+        """Train networks that correct a mixture; return the mixture unless they read the validation scenes better."""
+        scenes = self.scenes
+        if len(scenes.joined.train.examples) < CORRECTED_SCENES:
             return Learned(mixed.weights, {})
         config = replace(mixed.weights.config, corrected=True)
         start = {**mixed.weights.segmenter.state_dict(), **(load_encoder() if config.deep else {})}
@@ -274,7 +249,8 @@ class Learner:
             scores.update(figures.corrected_miou(mixed.weights, self._weights(model), scenes.validation.examples))
             return max(scores, key=lambda part: scores[part])
 
-        model, summary = self._trained(config, start, replace(settings, minutes=minutes), lambda model: best(model) > 0)
+        settings = replace(self.request.flags.settings, minutes=minutes)
+        model, summary = self._trained(config, start, settings, lambda model: best(model) > 0)
         stopped = bool(scores) and max(scores, key=lambda part: scores[part]) == 0
         part = 0.0 if stopped else best(model)
         found = {"training": summary, "corrections": {f"{part:g}": miou for part, miou in scores.items()}}
@@ -289,19 +265,47 @@ class Learner:
             own.load_state_dict({**networks, **anew.weights.segmenter.state_dict()})
         return Learned(self._weights(own), {**anew.found, **learned.found})
 
-    def judged(self, weights: Weights) -> dict[str, Any]:
+    def written(self, learned: Learned, whole: Learned | None = None) -> dict[str, Any]:
+        """Judge weights by the validation scenes, save them or those of the ``whole`` data, and return the record."""
+        taught, kept = (self.scenes, learned) if whole is None else (self.scenes.joined, whole)
+        seed, frames = self.request.flags.seed, self.scenes.validation
+        record = {**self._about(taught), **kept.found, **self._judged(learned.weights)}
+        laws = [law_of(name) if built_in_laws(self.request.dataset) else "" for name in frames.keys]
+        judged = with_record(learned.weights, **record)
+        scans = figures.judge_scans(judged, frames.examples, laws, self.augmentation, seed, self.report)
+        if scans is not None:
+            record[SCANS] = scans[0]
+        save_weights(with_record(kept.weights.on(PROCESSOR), **record), self.request.out)
+        if self.spectra is not None:
+            add_spectra(self.request.out, self.spectra)
+        if scans is not None:
+            add_map_scores(self.request.out, scans[1])
+        return record
+
+    def _about(self, taught: Scenes) -> dict[str, Any]:
+        """Return the entries of a record on command and data, for weights that learned from some scenes."""
+        request, data, values = self.request, self.data, self.scenes.common.values
+        return {
+            "command": request.command,
+            "data": data.law,
+            **({CLASS_VALUES: list(values)} if values else {}),
+            TRAINED_ON: asdict(_trained_on(data, taught, request.flags.min_exposure_ms)),
+            "split": taught.split | {"validation": self.scenes.validation.keys, "held_out": list(data.held_out)},
+            "settings": asdict(request.flags.settings),
+            "camera": asdict(CAMERA),
+            CAPTURED: request.captured,
+            "device": self.device,
+            **({} if self.begun is None else {"started_from": self.begun.record.get("command", "")}),
+        }
+
+    def _judged(self, weights: Weights) -> dict[str, Any]:
         """Return figures on the validation scenes, for the record."""
         frames = self.scenes.validation.examples
-        twice = figures.read_twice(weights, frames)
-        found: dict[str, Any] = {"validation": figures.validate(twice, weights.config.classes)}
-        if twice and weights.config.corrected:
-            useless = found["validation"]["all"]["miou"] <= found["validation"]["none"]["miou"]
-            losses = CascadeTable.of_overview() if useless else CascadeTable.judged(twice, weights.config.classes)
-            found[CASCADE] = asdict(losses)
-        if frames:
-            self.report("validating", 0.0, f"{len(frames)} scenes")
-            found[CALIBRATION] = figures.judge_calibration(weights, frames, self.request.flags.settings.seed)
-        return found
+        if not frames:
+            return {"validation": None}
+        self.report("validating", 0.0, f"{len(frames)} scenes")
+        calibration = figures.judge_calibration(weights, frames, self.request.flags.seed)
+        return {**figures.judge_reading(weights, frames), CALIBRATION: calibration}
 
     def _trained(
         self,
@@ -338,12 +342,11 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
 
 
 def check_counts(flags: TrainFlags) -> None:
-    """Raise SettingsError for a count or size that is not positive, or an exposure beyond the reference."""
-    counts = ("steps", "minutes", "learning_rate", "batch", "crop", "scenes", "patch", "dim", "layers", "heads")
-    for name in (*counts, "validation", "seed"):
+    """Raise SettingsError for a count that is not positive, or an exposure beyond the reference."""
+    least = dict.fromkeys(("steps", "minutes", "learning_rate", "scenes"), "above 0")
+    for name, limit in (least | dict.fromkeys(("validation", "seed"), "0 or more")).items():
         value = getattr(flags, name)
-        if value is not None and not (value > 0 if name in counts else value >= 0):
-            limit = "above 0" if name in counts else "0 or more"
+        if value is not None and not (value > 0 or (value == 0 and name not in least)):
             raise SettingsError(f"--{name.replace('_', '-')} must be {limit}, got {value}")
     if not 0 < flags.min_exposure_ms <= REFERENCE_MS:
         limits = f"above 0 and at most {REFERENCE_MS:g}, the reference exposure"

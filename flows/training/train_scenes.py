@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from spectralzoom.flows.settings.model_flags import NO_TRAIN_FLAGS, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
-from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, alike_note, filled, trained_pixels
+from spectralzoom.flows.training.data import Report, SceneNotes, TrainingData, check_taught, trained_pixels
 from spectralzoom.models.network.sizes import SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis
 from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
 from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
-from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
+from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
@@ -159,11 +159,7 @@ def _imaged(
 
 
 def _common(request: TrainRequest, scene: RasterScene, scenes: int) -> Common:
-    if not scene.class_names:
-        raise SceneError(f"{scene.name} has no pixel with a class; correct its labels, or 'unlabelled' in scene.toml")
-    if len(scene.class_names) < 2:
-        note = filled(alike_note(scene.class_names[0]), [scene.name])
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {note}")
+    check_taught(request.dataset, scene.class_names, [scene.name])
     built_in = bool(built_in_laws(request.dataset))
     most = (
         COLUMNS
@@ -171,29 +167,22 @@ def _common(request: TrainRequest, scene: RasterScene, scenes: int) -> Common:
         else int(np.clip(COLUMN_BYTES / (2 * scenes * scene.planes[..., 0].size), *COLUMNS_OF_FILES))
     )
     basis = SpectralBasis.spanning(scene.wavelength_nm, most)
-    patch = request.flags.patch or suggested_patch(scene.shape, built_in=built_in)
-    common = Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
-    network_config(request.flags, common)  # raises for invalid sizes before the first scene is imaged
-    return common
+    patch = patch_of(scene.shape, built_in=built_in)
+    return Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
 
 
-def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
+def patch_of(shape: tuple[int, int], *, built_in: bool) -> int:
     """Return the patch size for scenes of this shape: 16 for the farm, 32 for frames, less for small scenes."""
-    return 16 if built_in or 256 <= min(shape) < 512 else 32 if min(shape) >= 512 else 8
+    return 16 if built_in or 256 <= min(shape) < 512 else DEEP_PATCH_PX if min(shape) >= 512 else 8
 
 
-def network_config(flags: TrainFlags, common: Common) -> SegmenterConfig:
-    """Return the sizes of the network. Raises SettingsError where they do not fit each other."""
+def network_config(common: Common) -> SegmenterConfig:
+    """Return the sizes of the network."""
     deep = common.patch >= DEEP_PATCH_PX
-    try:
-        return SegmenterConfig(
-            classes=len(common.names),
-            columns=common.basis.columns,
-            patch=common.patch,
-            deep=deep,
-            dim=flags.dim,
-            heads=flags.heads,
-            layers=flags.layers or (1 if deep else SegmenterConfig.layers),
-        )
-    except ValueError as error:
-        raise SettingsError(f"{error}; choose another --patch, --dim or --heads") from error
+    return SegmenterConfig(
+        classes=len(common.names),
+        columns=common.basis.columns,
+        patch=common.patch,
+        deep=deep,
+        layers=1 if deep else SegmenterConfig.layers,
+    )

@@ -68,14 +68,9 @@ class Example:
     noise: ColumnNoise | None = None
 
 
-def labelled_classes(examples: Sequence[Example]) -> set[int]:
-    """Return the classes with a labelled pixel."""
-    return {number for one in examples for number in np.unique(one.labels).tolist()} - {UNLABELLED}
-
-
 def untaught_classes(examples: Sequence[Example], classes: int) -> tuple[int, ...]:
     """Return the classes without a labelled pixel, ascending."""
-    return tuple(sorted({*range(classes)} - labelled_classes(examples)))
+    return tuple(sorted({*range(classes)} - {number for one in examples for number in np.unique(one.labels).tolist()}))
 
 
 def observe_scene(

@@ -195,14 +195,8 @@ def fit_mixture(
     apart = _apart(taught, config.classes, report)
     weights, mixed = _chosen(apart, taught)
     plain = max((one for one in CANDIDATES if one.kind == VALUES), key=lambda one: apart[one.name][1].miou)
-    total = sum(weights.values())
     parts = [one for one in CANDIDATES if one.name in weights or one is plain]
-    sizes = tuple((one.kind, one.hidden, weights.get(one.name, 0) / total) for one in parts)
-    segmenter = Segmenter(replace(config, parts=sizes, components=components, corrected=False)).eval()
-    same = {name: one for name, one in measured.state_dict().items() if not name.startswith("parts")}
-    segmenter.mixture.load_state_dict(same, strict=False)
-    for part, one in zip(segmenter.mixture.each_part, parts, strict=True):
-        Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
+    segmenter = _fitted(config, measured, parts, weights, taught)
     own = _judged("mixture", mixed, taught.labels, config.classes, time.process_time() - began)
     began = time.process_time()
     if (context := _in_context(segmenter.mixture, parts, taught, examples)) is not None:
@@ -217,8 +211,22 @@ def fit_mixture(
     prior = np.where(fraction > 0, -power * np.log(np.maximum(fraction, 1e-12)), 0)
     with torch.no_grad():
         segmenter.mixture.prior.copy_(torch.from_numpy(prior.astype(np.float32)))
-    shown = [replace(judged, weight=weights.get(name, 0) / total) for name, (_, judged) in apart.items()]
+    shown = [replace(judged, weight=weights.get(name, 0.0)) for name, (_, judged) in apart.items()]
     return Mixed(segmenter, parts.index(plain), (*shown, own))
+
+
+def _fitted(
+    config: SegmenterConfig, measured: Mixture, parts: Sequence[Candidate], weights: Mapping[str, float], taught: Taught
+) -> Segmenter:
+    """Fit the parts of a mixture to all pixels, on the components that were ``measured``."""
+    sizes = tuple((one.kind, one.hidden, weights.get(one.name, 0.0)) for one in parts)
+    own = replace(config, parts=sizes, components=measured.config.components, corrected=False)
+    segmenter = Segmenter(own).eval()
+    same = {name: one for name, one in measured.state_dict().items() if not name.startswith("parts")}
+    segmenter.mixture.load_state_dict(same, strict=False)
+    for part, one in zip(segmenter.mixture.each_part, parts, strict=True):
+        Fit.of(one, taught.features[one.kind], taught.labels).store(part, config.classes)
+    return segmenter
 
 
 def _measure(mixture: Mixture, examples: Sequence[Example], normalisation: Normalisation) -> None:
@@ -364,8 +372,8 @@ def _likelihood(total: Floats, labels: Labels) -> float:
     return float((pixel_weights(labels) * np.log(np.maximum(of_labels, LEAST_CHANCE))).mean())
 
 
-def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught) -> tuple[dict[str, int], Floats]:
-    """Return how often each candidate is in the mixture, and its probabilities (Caruana et al. 2004).
+def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught) -> tuple[dict[str, float], Floats]:
+    """Return the weights of candidates in the mixture, and its probabilities (Caruana et al. 2004).
 
     The score is the mean logarithm of the probability of a pixel's own class: of 16 classes most are missing in a fold,
     where mIoU misled by 5 points.
@@ -384,7 +392,8 @@ def _chosen(apart: Mapping[str, tuple[Floats, Judged]], taught: Taught) -> tuple
             break
         weights[name] = weights.get(name, 0) + 1
         total = total + apart[name][0]
-    return weights, total / sum(weights.values())
+    times = sum(weights.values())
+    return {name: often / times for name, often in weights.items()}, total / times
 
 
 def _prior_power(mixed: Floats, taught: Taught, classes: int) -> float:

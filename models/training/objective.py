@@ -55,7 +55,7 @@ def batch_loss(
     overview = model.read_overview(batch.image, batch.origin)
 
     def loss_of(logits: Tensor) -> Tensor:
-        return map_loss(logits, pixel_losses(logits, batch.labels), batch.labels, weight, soft_dice=soft_dice)
+        return map_loss(logits, batch.labels, weight, soft_dice=soft_dice)
 
     if model.config.deep and rng.random() >= PATCHED:
         return loss_of(overview.logits)
@@ -77,16 +77,13 @@ def draw_patches(overview: Tensor, config: SegmenterConfig, rng: np.random.Gener
     return placed.argsort(dim=1, descending=True, stable=True)[:, :count]
 
 
-def pixel_losses(logits: Tensor, labels: Tensor) -> Tensor:
-    """Return the cross-entropy of each pixel, (B, classes, y, x) -> (B, y, x) float32; 0 where unlabelled."""
-    return F.cross_entropy(logits.float(), labels, ignore_index=UNLABELLED, reduction="none")
+def map_loss(logits: Tensor, labels: Tensor, weight: Tensor, *, soft_dice: bool) -> Tensor:
+    """Return the class-weighted mean cross-entropy of labelled pixels, plus half the soft Dice loss on request.
 
-
-def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, soft_dice: bool) -> Tensor:
-    """Return the class-weighted mean of the ``losses`` of labelled pixels, plus half the soft Dice loss on request.
-
-    0, with a gradient of 0, where no pixel is labelled or every label has weight 0.
+    ``logits`` are (B, classes, y, x) of any precision, ``labels`` (B, y, x). The loss is 0, with a gradient of 0, where
+    no pixel is labelled or every label has weight 0.
     """
+    losses = F.cross_entropy(logits.float(), labels, ignore_index=UNLABELLED, reduction="none")
     labelled = labels != UNLABELLED
     weights = torch.where(labelled, weight[labels.where(labelled, 0)], 0.0)
     total = weights.sum()

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +22,6 @@ from spectralzoom.models.network.temporal_reader import TemporalReader
 from spectralzoom.models.reading.prior_map import FAINTEST, LIGHT_FADES_DAYS, season_of
 from spectralzoom.models.training.objective import class_weights, map_loss
 from spectralzoom.models.training.train import Progress
-from spectralzoom.pipeline.geometry.grid import UNLABELLED
 
 FAINT = 1e-5  # least probability of a pass
 PARTLY_SEEN = 0.3  # fraction of later visits that capture a part of the land
@@ -120,7 +118,7 @@ def train_reader(
             for slow, quick in zip(averaged.parameters(), reader.parameters(), strict=True):
                 slow.lerp_(quick, 1 - keep)
         loss = value if math.isnan(loss) else 0.98 * loss + 0.02 * value
-        report(Progress(step, settings.steps, done, loss))
+        report(Progress(step, done, loss))
     return averaged, step
 
 
@@ -137,8 +135,7 @@ def _learn(reader: TemporalReader, visits: Sequence[_Batch], weight: Tensor) -> 
         small = now.seen[:, :, CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
         images = state, now.observation, now.seen, age, rests_on
         found = reader(*images, now.light, now.step, now.season, coarse, now.coarse, small * now.comparable)
-        losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
-        loss = map_loss(found, losses, now.labels, weight, soft_dice=True)
+        loss = map_loss(found, now.labels, weight, soft_dice=True)
         torch.autograd.backward(loss)
         total += float(loss.detach()) / (len(visits) - 1)
         state = found.detach().clamp(min=FAINTEST)

@@ -65,7 +65,6 @@ class Progress:
     """Progress after a step."""
 
     step: int
-    steps: int
     done: float  # 0..1, by steps or by time, whichever is further
     loss: float
 
@@ -320,7 +319,7 @@ def train(
         trainer.step(done if trainer.course.step else 0.0)  # the first learning rate does not depend on the clock
         if trainer.course.step % FREED_EVERY == 0:
             give_back_freed_memory()
-        report(Progress(trainer.course.step, settings.steps, done, trainer.course.loss))
+        report(Progress(trainer.course.step, done, trainer.course.loss))
         if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
             trainer.keep(checkpoint, identity)
             kept = time.monotonic()

@@ -14,7 +14,6 @@ import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 # One thread, set before numpy and torch are loaded, as all figures are for one thread.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -66,11 +65,11 @@ def _cells_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:
 
 def _machine() -> str:
     """Return processor, cores, load and versions in one line."""
-    from spectralzoom.flows.tradeoff import describe_machine, mean_load
+    from spectralzoom.flows.tradeoff import describe_machine
 
-    it: dict[str, Any] = describe_machine()
+    it = describe_machine()
     versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())
-    return f"{it['processor']}, {it['cores']} cores, load {mean_load()}, one thread; python {it['python']}, {versions}"
+    return f"{it['processor']}, {it['cores']} cores, load {it['load']}, one thread; {versions}"
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from measure import ROOT
 from numpy.typing import NDArray
 from torch import Tensor
 
-from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.tasks.scene import scene_of_file
 from spectralzoom.flows.training.data import FARM_SHAPE, FARM_TRAIN_SEED, farm_days, load_data_set, read_farm_name
 from spectralzoom.flows.training.train_scenes import Common, network_config
@@ -79,7 +78,7 @@ def trained(name: str, scenes: Mapping[str, Callable[[], RasterScene]], patch: i
     normalisation = measured_normalisation(seen)
     examples = [normalised(one, normalisation, np.ones(basis.columns, np.bool_)) for one in seen]
     common = Common(basis, first.class_names, first.class_colours, patch, first.wavelength_nm)
-    config = network_config(TrainFlags(patch=patch), common)
+    config = network_config(common)
     start = linear_classifier(LabelledPixels.drawn(examples, rng), config.classes)
     if config.deep:
         start |= load_encoder()

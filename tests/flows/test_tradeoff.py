@@ -5,23 +5,14 @@ from __future__ import annotations
 import io
 import json
 import math
-from dataclasses import asdict, replace
+from typing import Any
 
 import pytest
 import torch
 from rich.console import Console
 
 from spectralzoom.flows import tradeoff as tradeoff_module
-from spectralzoom.flows.tradeoff import (
-    TRADEOFFS,
-    Figures,
-    Point,
-    Result,
-    Tradeoff,
-    measure_tradeoff,
-    print_tradeoff,
-    tradeoff,
-)
+from spectralzoom.flows.tradeoff import TRADEOFFS, Figures, Tradeoff, measure_tradeoff, print_tradeoff, tradeoff
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.storage.whole_files import to_json
 
@@ -89,9 +80,9 @@ def spend(clock, seconds):
 
 def test_every_setting_is_judged_and_runs_in_turn():
     """A truncated series has the error of its remainder; each round starts at another setting."""
-    for point in measure_tradeoff(SERIES, repeats=1).points:
-        assert point.error == pytest.approx(1 / float(point.setting), rel=1e-3)
-        assert point.bytes == point.setting
+    for point in measure_tradeoff(SERIES, repeats=1)["points"]:
+        assert point["error"] == pytest.approx(1 / float(point["setting"]), rel=1e-3)
+        assert point["bytes"] == point["setting"]
     seen: list[float] = []
     watched = make_series(lambda terms: seen.append(float(terms)) or 0.0, settings=(1.0, 2.0, 3.0))
     measure_tradeoff(watched, repeats=2)
@@ -102,8 +93,8 @@ def test_the_shortest_run_counts(clock):
     """A machine that pauses for a while raises neither time."""
     turns = iter((1.0, 4.0, 2.0, 2.0, 3.0, 9.0))  # the second round begins with the second setting
     halting = make_series(lambda terms: spend(clock, next(turns)), lambda *_: Figures(0.0, 1), (1.0, 2.0))
-    second = measure_tradeoff(halting, repeats=3).points[1]
-    assert (second.time_s, second.processor_s) == (4, 2)
+    second = measure_tradeoff(halting, repeats=3)["points"][1]
+    assert (second["time_s"], second["processor_s"]) == (4, 2)
 
 
 def test_settings_run_on_one_thread():
@@ -112,7 +103,7 @@ def test_settings_run_on_one_thread():
     torch.set_num_threads(2)
     try:
         counted = make_series(lambda terms: torch.get_num_threads(), lambda terms, out: Figures(out, 1))
-        assert {point.error for point in measure_tradeoff(counted, repeats=1).points} == {1}
+        assert {point["error"] for point in measure_tradeoff(counted, repeats=1)["points"]} == {1}
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
@@ -122,21 +113,21 @@ def test_only_the_run_is_timed(clock):
     """Preparation and judging do not count; the camera's seconds replace the wall time."""
     given = {"settings": (1.0, 4.0), "prepare": lambda: spend(clock, 100)}
     timed = make_series(lambda terms: spend(clock, terms), lambda terms, out: spend(clock, 100), **given)
-    assert [one.processor_s for one in measure_tradeoff(timed, repeats=2).points] == [1, 4]
+    assert [one["processor_s"] for one in measure_tradeoff(timed, repeats=2)["points"]] == [1, 4]
     scanned = make_series(lambda terms: spend(clock, terms), lambda terms, out: Figures(0.0, 1, 60 * terms), **given)
-    point = measure_tradeoff(scanned, repeats=1).points[1]
-    assert (point.time_s, point.processor_s) == (240, 4)
+    point = measure_tradeoff(scanned, repeats=1)["points"][1]
+    assert (point["time_s"], point["processor_s"]) == (240, 4)
 
 
 def test_result_is_json_and_names_the_machine():
-    """It has load, threads and versions; NaN and infinity become null."""
-    points = tuple(Point(1.0, error, 1.0, 1.0, 1) for error in (math.nan, math.inf, 0.5))
-    found = json.loads(to_json(asdict(replace(measure_tradeoff(SERIES, repeats=1), points=points))))
-    assert {"processor", "cores", "threads", "versions", "load_before"} <= set(found["machine"])
+    """It has load and versions; NaN and infinity become null."""
+    points = [{"error": error} for error in (math.nan, math.inf, 0.5)]
+    found = json.loads(to_json({**measure_tradeoff(SERIES, repeats=1), "points": points}))
+    assert {"processor", "cores", "load", "versions"} == set(found["machine"])
     assert [point["error"] for point in found["points"]] == [None, None, 0.5]
 
 
-def printed(result: Result, width: int = 140) -> str:
+def printed(result: dict[str, Any], width: int = 140) -> str:
     """Return the table as a terminal shows it."""
     console = Console(file=io.StringIO(), width=width)
     print_tradeoff(result, console)
@@ -145,9 +136,10 @@ def printed(result: Result, width: int = 140) -> str:
 
 def test_the_table_has_four_measures_and_begins_with_the_smallest_error():
     """80 columns cut neither the name of a setting nor a measure; the default is marked."""
-    points = tuple(Point(f"a-setting-of-20-lett{one}", one, 2.5, 1.25, 3_000_000) for one in (2, 1))
-    result = replace(measure_tradeoff(SERIES, repeats=1), points=points)
-    words = printed(replace(result, default=points[0].setting), width=80)
+    measures = {"time_s": 2.5, "processor_s": 1.25, "bytes": 3_000_000}
+    points = [{"setting": f"a-setting-of-20-lett{one}", "error": one, **measures} for one in (2, 1)]
+    result = {**measure_tradeoff(SERIES, repeats=1), "points": points}
+    words = printed({**result, "default": points[0]["setting"]}, width=80)
     assert words.index("20-lett1") < words.index("20-lett2 (default)")
     assert all(one in words for one in ("2.5 s", "1.25 s", "3 MB", "1 repeat in turn"))
     assert words.count("(default)") == 1

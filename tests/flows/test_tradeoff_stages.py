@@ -26,7 +26,7 @@ def errors(entry: Tradeoff) -> dict[object, float]:
 
 def test_kernels_differ_by_their_taps():
     """Interpolation errs less than nearest neighbour (erratum E10)."""
-    nearest, bilinear, cubic = (point.error for point in measure_tradeoff(stages.RECTIFY, repeats=1).points)
+    nearest, bilinear, cubic = (point["error"] for point in measure_tradeoff(stages.RECTIFY, repeats=1)["points"])
     assert 0.03 < nearest < 0.05
     assert cubic < 0.7 * bilinear < 0.7 * 0.5 * nearest
 
@@ -34,13 +34,13 @@ def test_kernels_differ_by_their_taps():
 def test_coarser_steps_take_fewer_bytes_and_err_more(monkeypatch):
     """Raw lines err by one deviation of their noise; components hold a fraction of it in a tenth of the bytes."""
     monkeypatch.setattr(stages, "FIELD_SHAPE", (64, 200))
-    raw, *condensed = measure_tradeoff(stages.CONDENSE, repeats=1).points
-    assert raw.error == pytest.approx(1, abs=0.01)
-    sizes, errors = [point.bytes for point in condensed], [point.error for point in condensed]
+    raw, *condensed = measure_tradeoff(stages.CONDENSE, repeats=1)["points"]
+    assert raw["error"] == pytest.approx(1, abs=0.01)
+    sizes, errors = ([point[name] for point in condensed] for name in ("bytes", "error"))
     assert sizes == sorted(sizes, reverse=True)
     assert errors == sorted(errors)
-    assert condensed[0].error < 0.3
-    assert condensed[0].bytes < raw.bytes / 10
+    assert errors[0] < 0.3
+    assert sizes[0] < raw["bytes"] / 10
 
 
 def test_chosen_effects_keep_bound_and_tolerance(monkeypatch):

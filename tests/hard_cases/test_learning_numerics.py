@@ -14,7 +14,7 @@ from spectralzoom.models.network.segmenter import ChannelNorm, Segmenter, TokenA
 from spectralzoom.models.network.sizes import PLANES, SegmenterConfig
 from spectralzoom.models.network.spectral import Normalisation
 from spectralzoom.models.training.examples import Example
-from spectralzoom.models.training.objective import map_loss, pixel_losses
+from spectralzoom.models.training.objective import map_loss
 from spectralzoom.models.training.train import Trainer, TrainingSettings
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
 from tests.models.conftest import SMALL, read_both
@@ -66,7 +66,7 @@ def test_14_segmenter_with_two_classes_has_gradients():
     labels = (image[:, 0] > 0).long()
     none = torch.zeros(1, 0, dtype=torch.int64)
     logits = model.composite(*read_both(model, image, image, none, torch.zeros(1, 2)), none)
-    loss = map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(2), soft_dice=True)
+    loss = map_loss(logits, labels, torch.ones(2), soft_dice=True)
     loss.backward()  # type: ignore[no-untyped-call]
     for learned in (model.overview_classes.weight.grad, model.spectral.weight.grad):
         assert learned is not None
@@ -91,12 +91,10 @@ def test_26_loss_of_half_precision_logits_sums_in_float32(kind: torch.dtype):
     logits = torch.randn(1, 3, 250, 400, generator=generator).to(kind)
     labels = torch.randint(0, 3, (1, 250, 400), generator=generator)
     weight = torch.tensor([1.0, 2.0, 0.5])
-    losses = pixel_losses(logits, labels)
-    assert losses.dtype == torch.float32
     exact = nn.functional.cross_entropy(logits.double(), labels, weight.double())
-    assert float(map_loss(logits, losses, labels, weight, soft_dice=False)) == pytest.approx(float(exact), rel=1e-5)
-    rough = map_loss(logits, losses, labels, weight, soft_dice=True)
-    fine = map_loss(logits.double(), losses.double(), labels, weight.double(), soft_dice=True)
+    assert float(map_loss(logits, labels, weight, soft_dice=False)) == pytest.approx(float(exact), rel=1e-5)
+    rough = map_loss(logits, labels, weight, soft_dice=True)
+    fine = map_loss(logits.double(), labels, weight.double(), soft_dice=True)
     assert float(rough) == pytest.approx(float(fine), rel=1e-4)
 
 

@@ -34,7 +34,7 @@ from spectralzoom.models.reading.inference import (
 )
 from spectralzoom.models.training import train as training
 from spectralzoom.models.training.examples import Example
-from spectralzoom.models.training.objective import map_loss, pixel_losses
+from spectralzoom.models.training.objective import map_loss
 from spectralzoom.models.training.train import TrainingSettings, train
 from spectralzoom.models.weights.files import load_weights, save_weights
 from spectralzoom.pipeline.geometry.grid import SceneGrid
@@ -111,7 +111,7 @@ def test_4_batch_without_labels_has_zero_loss(images: int, soft_dice: bool):
     logits = noise(0, images, 3, 4, 4).requires_grad_()
     for value, weight in ((255, torch.ones(3)), (1, torch.zeros(3)), (1, torch.tensor([1.0, 0.0, 1.0]))):
         labels = torch.full((images, 4, 4), value)
-        loss = map_loss(logits, pixel_losses(logits, labels), labels, weight, soft_dice=soft_dice)
+        loss = map_loss(logits, labels, weight, soft_dice=soft_dice)
         assert loss.item() == 0
         (gradient,) = torch.autograd.grad(loss, logits)
         assert not gradient.any()
@@ -348,7 +348,7 @@ def test_27_zero_and_huge_corrections_keep_gradients_finite(size: float):
     labels = torch.full((1, 32, 32), 2)
     drawn = model.composite(logits, patches, numbers)
     assert drawn.softmax(dim=1).isfinite().all()
-    map_loss(drawn, pixel_losses(drawn, labels), labels, torch.ones(3), soft_dice=True).backward()
+    map_loss(drawn, labels, torch.ones(3), soft_dice=True).backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
     assert model.full_classes.bias.grad.any()
 

@@ -26,7 +26,7 @@ from tests.storage.readers.test_label_grids import write
 
 __all__ = ["command_line"]
 
-SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
+SMALL = ["--steps", "1"]
 RNG = np.random.default_rng(4)
 CLASSES = np.kron(RNG.integers(0, 2, (4, 4)), np.ones((8, 8))).astype(np.uint8)
 

@@ -19,7 +19,7 @@ from tests.users.mistaken_files import NM, write_files
 __all__ = ["command_line"]
 
 SURVEY = "survey --engine plain --no-accuracy --out never --weights w.safetensors --source sim --scene "
-TRAIN = "train --steps 1 --dim 16 --layers 1 --heads 2 -o new.safetensors "
+TRAIN = "train --steps 1 -o new.safetensors "
 BANDS = f" --wavelengths {NM}"
 
 
@@ -91,7 +91,7 @@ CASES = {
     "several label files": (1, TRAIN + "several", "001_labels.png and .*001_mask.png; keep one"),
     "two files of one stem": (1, TRAIN + "one_stem", "001.png and .*001.tif would both have the labels"),
     "labels of one class": (1, TRAIN + "soil", "two or more classes.* unlabelled = "),
-    "no labelled pixel": (1, TRAIN + "unlabelled", "has no pixel with a class; correct its labels, or 'unlabelled'"),
+    "no labelled pixel": (1, TRAIN + "unlabelled", "no pixel of 001 has a class; correct the labels, or 'unlabelled'"),
     "soft labels": (1, TRAIN + "soft", "at most 64.* hard edges"),
     "scenes of other bands": (1, TRAIN + "other_bands", "other bands"),
     "unknown key of scene.toml": (1, TRAIN + "bad_key", "unknown key label; known are"),
@@ -104,7 +104,6 @@ CASES = {
     ),
     "no steps": (2, TRAIN.replace("--steps 1", "--steps 0") + "apart", "--steps must be above 0"),
     "scenes of files": (2, TRAIN + "apart --scenes 3", "--scenes is for built-in scenes"),
-    "no patch": (2, TRAIN + "apart --patch 0", "--patch must be above 0, got 0"),
     "too many for validation": (1, TRAIN + "apart --validation 3", "leaves none of 2 scenes to train on"),
     "band that is no number": (2, TRAIN + "apart --bands a", "whole numbers with commas, got 'a'"),
     "no -o": (2, "train apart", "--out requires an argument"),

@@ -25,7 +25,7 @@ from tests.users.mistaken_files import write_files
 
 __all__ = ["command_line"]
 
-SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
+SMALL = ["--steps", "1"]
 
 
 @pytest.fixture(scope="module")

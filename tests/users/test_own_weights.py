@@ -27,7 +27,7 @@ __all__ = ["command_line"]
 SENTINEL_NM = (443, 490, 560, 665, 705, 740, 783, 842, 865, 945, 1375, 1610, 2190)  # none between 1610 and 2190
 SIDE = 32
 NUMBERS = np.array([3, 7, 200], np.uint8)  # of the classes in the label files
-SMALL = ["--steps", "2", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
+SMALL = ["--steps", "2"]
 PLAIN = ["--engine", "plain"]
 
 

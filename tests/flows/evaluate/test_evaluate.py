@@ -15,7 +15,7 @@ from rich.console import Console
 from spectralzoom.flows.cli.main import main
 from spectralzoom.flows.evaluate.command import evaluate_weights, print_evaluation, run_evaluate
 from spectralzoom.flows.evaluate.frames import observe_frame, open_candidates
-from spectralzoom.flows.evaluate.judge import ALL, NONE, Choice, Row, counts_of, judge_frame, seeds_of, summarise
+from spectralzoom.flows.evaluate.judge import ALL, NONE, Choice, Row, judge_frame, summarise
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.tasks.scene import pack_mask
 from spectralzoom.flows.training.data import farm_test_data
@@ -38,27 +38,26 @@ def _row(content: dict[str, Any], policy: str, fraction: float) -> dict[str, Any
 
 
 def test_evaluation_has_a_row_per_policy_and_fraction(judged: Judged):
-    """Rows hold the mean over the seeds, its spread and costs; the folder holds evaluation.json alone."""
+    """Rows hold the mean over the weights, its spread and costs; the folder holds evaluation.json alone."""
     request, content = judged
     keys = [(row["policy"], row["fraction"]) for row in content["rows"]]
     policies = [(policy, fraction) for policy in ("gain", "random") for fraction in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
-    assert [one["frames"] for one in content["weights"]] == [3, 3]
+    assert [one["frames"] for one in content["weights"]] == [[*FRAMES]] * 2
     assert {path.name for path in request.out.iterdir()} == {"evaluation.json"}
     assert json.loads((request.out / "evaluation.json").read_text())["rows"][1]["miou"] == content["rows"][1]["miou"]
     row = _row(content, "gain", 0.25)
-    assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
-    assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
-    assert len(row["by_seed"]) == 2
+    assert row["miou"] == pytest.approx(np.mean(row["by_weights"]))
+    assert row["spread"] == pytest.approx(np.std(row["by_weights"], ddof=1))
+    assert len(row["by_weights"]) == 2
     for column in ("patches", "multiply_adds"):  # more patches cost more
-        assert row["cost"][column]["done"] < _row(content, "gain", 0.5)["cost"][column]["done"]
-    assert _row(content, "all", 1.0)["cost"]["patches"]["ratio"] == 1.0
+        assert row[column] < _row(content, "gain", 0.5)[column] < _row(content, "all", 1.0)[column]
 
 
 def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     """Trained weights are judged on the frames held out; those of validation taught them in the end."""
-    quick = TrainFlags(hold_out=("003",), validation=1, patch=8, dim=16, steps=1, batch=1, crop=16)
+    quick = TrainFlags(hold_out=("003",), validation=1, steps=1)
     out = tmp_path / "w.safetensors"
     train_weights(TrainRequest(str(data), out, quick))
     split = load_weights(out).record["split"]
@@ -67,8 +66,7 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     assert brief["weights"]["miou"] == _row(content, "all", 1.0)["miou"]
     assert 0 < brief["plain"]["miou"] <= 1
     assert 0 < brief["plain"]["multiply_adds_a_pixel"] < brief["weights"]["multiply_adds_a_pixel"]
-    assert content["weights"][0]["left_out"] == sorted(split["train"])
-    assert content["frames"] == ["003"]
+    assert content["frames"] == content["weights"][0]["frames"] == ["003"]
     assert set(split["validation"]) <= set(split["train"])
     assert content["left_out"] == sorted(split["train"])
     with pytest.raises(SceneError, match="frames trained on are refused"):
@@ -83,48 +81,36 @@ def _content(scene: RasterScene, trained: np.ndarray) -> dict[str, str]:
 
 
 def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
-    """In cross-validation, the fold that did not train on a frame judges it."""
+    """In cross-validation, the fold that did not train on a frame judges it; figures are means over the folds."""
     scenes = {name: scene_at(data, name).key for name in FRAMES}
     first = write_weights(tmp_path / "a.safetensors", 0, split={"train": {"001": scenes["001"]}})
     second = write_weights(tmp_path / "b.safetensors", 1, split={"train": {n: scenes[n] for n in ("002", "003")}})
     content = evaluate_weights(str(data), EvaluateFlags(weights=(first, second), **QUICK))
-    assert [(one["frames"], one["left_out"]) for one in content["weights"]] == [(2, ["001"]), (1, ["002", "003"])]
+    assert [one["frames"] for one in content["weights"]] == [["002", "003"], ["001"]]
     assert content["frames"] == list(FRAMES)
     assert sum(content["support"].values()) == 3 * 24 * 40
-    assert content["seeds"] == [["a.safetensors", "b.safetensors"]]
-    assert content["rows"][0]["spread"] is None
+    folds = [evaluate_weights(str(data), EvaluateFlags(weights=(one,), **QUICK)) for one in (first, second)]
+    row, *own = (one["rows"][0] for one in (content, *folds))
+    assert row["by_weights"] == [one["miou"] for one in own]
+    assert row["miou"] == pytest.approx(np.mean(row["by_weights"]))
     alone = evaluate_weights(str(data), EvaluateFlags(weights=(first, second), frames=("001",), **QUICK))
-    assert [weights["covers"] for weights in alone["weights"]] == [[], ["001"]]
+    assert [weights["frames"] for weights in alone["weights"]] == [[], ["001"]]
 
 
-def test_folds_that_kept_frames_for_validation_are_one_seed(data: Path, tmp_path: Path):
-    """One fold held out the frame on which the other validated; a single fold is judged on both frames."""
-    keys = {name: scene_at(data, name).key for name in FRAMES}
-    paths = []
-    for number, (kept, validated, trained) in enumerate((("001", "002", "003"), ("002", "001", "003"))):
-        split = {"train": {trained: keys[trained]}, "held_out": [kept], "validation": {validated: keys[validated]}}
-        paths.append(write_weights(tmp_path / f"{number}.safetensors", number, data="field", split=split))
-    content = evaluate_weights(str(data), EvaluateFlags(weights=tuple(paths), **QUICK))
-    assert [one["covers"] for one in content["weights"]] == [["001"], ["002"]]
-    assert content["seeds"] == [["0.safetensors", "1.safetensors"]]
-    alone = evaluate_weights(str(data), EvaluateFlags(weights=(paths[0],), **QUICK))
-    assert alone["frames"] == ["001", "002"]
-    assert "thresholds by 002: scores of these" in " ".join(alone["data_notes"])
+def test_scores_of_validation_frames_have_a_note(data: Path, tmp_path: Path):
+    """The training chose by them, so that their scores may be too good."""
+    split = {"validation": {"002": scene_at(data, "002").key}}
+    weights = (write_weights(tmp_path / "w.safetensors", split=split),)
+    content = evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))
+    assert "thresholds by 002: scores of these" in " ".join(content["data_notes"])
 
 
-def test_weights_with_different_training_pixels_of_a_frame_are_refused(data: Path, tmp_path: Path):
-    """They would be judged on different pixels of one frame; weights of the same pixels are judged on the others."""
+def test_trained_pixels_of_a_frame_are_left_out(data: Path, tmp_path: Path):
+    """Weights are judged on the other pixels."""
     scene = scene_at(data)
-    halves = [np.zeros(scene.shape, bool) for _ in range(2)]
-    halves[0][:12] = True
-    halves[1][12:] = True
-    paths = [
-        write_weights(tmp_path / f"{number}.safetensors", number, split={"taught": _content(scene, half)})
-        for number, half in enumerate((halves[0], halves[1], halves[0]))
-    ]
-    with pytest.raises(SettingsError, match=r"were trained on different pixels of 001"):
-        evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[1]), frames=("001",), **QUICK))
-    content = evaluate_weights(str(data), EvaluateFlags(weights=(paths[0], paths[2]), frames=("001",), **QUICK))
+    half = np.arange(scene.shape[0])[:, None] < np.full(scene.shape, 12)
+    weights = (write_weights(tmp_path / "w.safetensors", split={"taught": _content(scene, half)}),)
+    content = evaluate_weights(str(data), EvaluateFlags(weights=weights, frames=("001",), **QUICK))
     assert sum(content["support"].values()) == 12 * 40
     assert any(note.startswith("trained pixels are left out of 001: ") for note in content["data_notes"])
 
@@ -157,7 +143,7 @@ def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
     with pytest.raises(SettingsError, match="the same weights are given twice"):
         open_candidates((first, again))
     save_weights(make_weights(1, classes=3, columns=3), again)
-    with pytest.raises(SettingsError, match=r"differs from .* in camera, sizes or classes"):
+    with pytest.raises(SettingsError, match=r"differs from .* in camera, patch or classes"):
         open_candidates((first, again))
 
 
@@ -168,7 +154,7 @@ def test_folds_with_and_without_context_are_judged_together(data: Path, tmp_path
     for context, path in enumerate(paths):
         made = make_weights(classes=2, columns=3, context=bool(context), **parts)
         save_weights(replace(made, class_names=NAMES, record={"plain": 0}), path)
-    assert len(evaluate_weights(str(data), EvaluateFlags(weights=paths, **QUICK))["seeds"]) == 2
+    assert len(evaluate_weights(str(data), EvaluateFlags(weights=paths, **QUICK))["rows"][0]["by_weights"]) == 2
     briefs = [evaluate_weights(str(data), EvaluateFlags(weights=(path,), **QUICK))["brief"] for path in paths]
     bare, with_context = ({name: one["multiply_adds_a_pixel"] for name, one in brief.items()} for brief in briefs)
     assert with_context["plain"] == bare["plain"] == bare["weights"] < with_context["weights"]
@@ -199,7 +185,7 @@ def test_miou_of_frames_comes_from_their_summed_counts():
     run = _judged("abcd", np.random.default_rng(0))
     there, back = (summarise([dict(order)], ("a", "b"), (0.5,), 8) for order in (run.items(), [*run.items()][::-1]))
     assert json.dumps(there["rows"][0], sort_keys=True) == json.dumps(back["rows"][0], sort_keys=True)
-    assert there["rows"][0]["miou"] == mean_iou(counts_of([run], NONE).sum(axis=(0, 1, 2)))
+    assert there["rows"][0]["miou"] == mean_iou(np.sum([rows[NONE].counts[0] for rows in run.values()], axis=0))
 
 
 def test_a_class_without_labels_has_false_pixels_and_no_iou(judged: Judged, capsys: pytest.CaptureFixture[str]):
@@ -220,17 +206,6 @@ CHOICES: tuple[Choice, ...] = (NONE, ("gain", 0.5), ("random", 0.5), ALL)
 
 def _judged(names: str, rng: np.random.Generator) -> dict[str, dict[Choice, Row]]:
     return {name: {choice: Row(rng.integers(1, 9, (1, 2, 2)), 2, 3) for choice in CHOICES} for name in names}
-
-
-def test_weights_without_a_common_frame_are_one_seed() -> None:
-    """Folds of one training are joined and weights that share a frame are seeds; frames not judged have zero counts."""
-    rng = np.random.default_rng(0)
-    assert seeds_of(["ab", "c", "abc", ""]) == [[0, 1], [2]]
-    joined, part = _judged("abc", rng), _judged("ab", rng)
-    row, less = counts_of([joined], NONE), counts_of([joined, part], NONE)
-    assert less.shape == (2, 1, 3, 2, 2)
-    assert not less[1, 0, 2].any()
-    assert (row[0] == less[0]).all()
 
 
 def test_the_farm_is_judged_on_test_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -265,7 +240,7 @@ def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureF
     """Rows, classes and notes are printed from the stored evaluation; --json prints one object on stdout."""
     run_evaluate(str(data), judged[0], Console(stderr=True))
     shown = capsys.readouterr()
-    for words in ("gain", "MACs", "crop", "standard deviation over seeds"):
+    for words in ("gain", "MACs", "crop", "standard deviation over weights"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
     weights = write_weights(tmp_path / "w.safetensors")

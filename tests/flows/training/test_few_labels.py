@@ -12,11 +12,13 @@ import xarray as xr
 from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
+from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.weights.files import describe_weights
 from spectralzoom.pipeline.errors import BudgetError
 from tests.conftest import QUIET
+from tests.flows.small_fields import write_field
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +67,25 @@ def test_fewer_multiply_adds_are_refused(trained: Path, tmp_path: Path, macs: st
     """There is nothing to leave out."""
     with pytest.raises(BudgetError, match=rf"--macs {macs}.*no full network to leave out.*; leave out --macs"):
         _survey(trained, tmp_path, macs=macs, source="raster")
+
+
+def test_classifiers_that_take_the_time_are_fitted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without time for a network they do not learn from the validation scenes, which the record leaves out."""
+    fits: list[int] = []
+    fit = flow.fit_mixture
+
+    def counted(examples: list[Any], *given: Any) -> Any:
+        fits.append(len(examples))
+        return fit(examples, *given)
+
+    monkeypatch.setattr(flow, "fit_mixture", counted)
+    field = write_field(tmp_path / "field", (16, 16), ("001", "002", "003", "004"))
+    notes: list[str] = []
+    flags = TrainFlags(minutes=1e-6, validation=1)
+    record = train_weights(TrainRequest(str(field), tmp_path / "w.safetensors", flags), tell=notes.append)
+    assert fits == [3]
+    assert (list(record["split"]["train"]), list(record["split"]["validation"])) == (["002", "003", "004"], ["001"])
+    assert record["trained_on"]["scenes"] == 3
+    assert notes == [
+        "the classifiers took half of --minutes or more: none learns from 1 validation scene, and there is no network"
+    ]

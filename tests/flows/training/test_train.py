@@ -22,11 +22,11 @@ from spectralzoom.flows.evaluate.command import evaluate_weights
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.settings.model_flags import EvaluateFlags, TrainFlags
 from spectralzoom.flows.settings.settings import load_settings
-from spectralzoom.flows.training import figures, train_scenes
+from spectralzoom.flows.training import figures
 from spectralzoom.flows.training import train as flow
 from spectralzoom.flows.training.data import TrainingData
 from spectralzoom.flows.training.train import run_train, train_weights
-from spectralzoom.flows.training.train_scenes import Common, Imaged, TrainRequest, network_config, suggested_patch
+from spectralzoom.flows.training.train_scenes import Common, Imaged, TrainRequest, network_config, patch_of
 from spectralzoom.models.evaluation.metrics import mean_iou
 from spectralzoom.models.network.spectral import SpectralBasis
 from spectralzoom.models.policies.placement import ReadTwice
@@ -39,7 +39,6 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from tests.conftest import QUIET
 from tests.flows.small_fields import write_field
 
-QUICK: dict[str, Any] = {"steps": 1, "batch": 1, "crop": 16, "patch": 8, "dim": 16}
 NUMBERS = ("001", "002", "003", "004")  # of frames
 
 
@@ -56,7 +55,7 @@ def out(tmp_path: Path) -> Path:
 
 
 def _request(folder: Path | str, out: Path, command: str = "", **flags: Any) -> TrainRequest:
-    return TrainRequest(str(folder), out, TrainFlags(**QUICK | flags), command)
+    return TrainRequest(str(folder), out, TrainFlags(**{"steps": 1} | flags), command)
 
 
 def test_new_weights_have_a_training_record(out: Path, tmp_path: Path):
@@ -94,16 +93,6 @@ def test_two_of_eight_scenes_judge_a_network(out: Path, tmp_path: Path):
     assert parts == [(kind, weight) for kind, _, weight in config.parts if weight]  # of both scenes
 
 
-@pytest.mark.parametrize("sizes", [{"patch": 24}, {"dim": 18}])
-def test_impossible_network_sizes_are_refused_before_imaging(
-    folder: Path, out: Path, sizes: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-):
-    """No scene is imaged for sizes that do not fit together."""
-    monkeypatch.setattr(train_scenes, "observe_scene", lambda *given, **named: pytest.fail("a scene was looked at"))
-    with pytest.raises(SettingsError, match="choose another --patch, --dim or --heads"):
-        train_weights(_request(folder, out, **sizes))
-
-
 def test_a_folder_as_output_file_is_refused(out: Path, capsys: pytest.CaptureFixture[str]):
     """One message comes before any scene is read, with the exit code of a usage error."""
     out.mkdir()
@@ -136,8 +125,8 @@ def test_patch_size_follows_the_scene_size(shape: tuple[int, int], built_in: boo
     """Small scenes get small patches, to have enough to choose from; large frames get the deep network."""
     nm = np.linspace(500, 800, 4)
     common = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), patch, nm)
-    assert suggested_patch(shape, built_in=built_in) == patch
-    assert network_config(TrainFlags(), common).deep == (min(shape) >= 512 and not built_in)
+    assert patch_of(shape, built_in=built_in) == patch
+    assert network_config(common).deep == (min(shape) >= 512 and not built_in)
 
 
 def test_training_shows_the_figures_of_validation(folder: Path, out: Path):
@@ -162,7 +151,6 @@ def test_counts_of_validation_scenes_add_up() -> None:
     maps = np.array([[[0, 1, 1, 0]], [[0, 0, 1, 0]]], np.uint8)  # by the overview, and in full
     scenes = [ReadTwice(*maps, gain, labels, SceneGrid(1, 4, 1)) for gain in (np.eye(4)[1], np.eye(4)[2])]
     found = figures.validate(scenes, 2)
-    assert found is not None
     assert found["none"]["miou"] == mean_iou(np.array([[2, 2], [2, 2]]))
     assert found["gain"]["miou"] == mean_iou(np.array([[3, 1], [2, 2]]))  # one patch of four, by the highest gain
     assert found["all"]["miou"] == mean_iou(np.array([[4, 0], [2, 2]]))
@@ -313,30 +301,30 @@ def test_training_continues_on_built_in_scenes(out: Path, tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize(
-    ("what", "common", "scenes", "flags"),
+    ("what", "common", "scenes", "dim"),
     [
-        ("classes", {"names": ("a", "c")}, {}, {}),
-        ("classes", {}, {"untaught": (0,)}, {}),
-        ("training scenes", {}, {"train": Imaged(keys={"2": "other"})}, {}),
-        ("bands", {"basis": SpectralBasis.spanning(np.linspace(500, 700, 4))}, {}, {}),
-        ("sizes of the network", {}, {}, {"dim": 8}),
-        (None, {}, {"train": Imaged(keys={"1": "one", "2": "other"})}, {}),
+        ("classes", {"names": ("a", "c")}, {}, 64),
+        ("classes", {}, {"untaught": (0,)}, 64),
+        ("training scenes", {}, {"train": Imaged(keys={"2": "other"})}, 64),
+        ("bands", {"basis": SpectralBasis.spanning(np.linspace(500, 700, 4))}, {}, 64),
+        ("sizes of the network", {}, {}, 32),
+        (None, {}, {"train": Imaged(keys={"1": "one", "2": "other"})}, 64),
     ],
 )
 def test_continued_training_names_what_differs(
-    what: str | None, common: dict[str, Any], scenes: dict[str, Any], flags: dict[str, Any]
+    what: str | None, common: dict[str, Any], scenes: dict[str, Any], dim: int
 ) -> None:
     """Classes, scenes, bands and sizes are those of the first training; more scenes are allowed."""
     nm = np.linspace(500, 800, 4)
     known = Common(SpectralBasis.spanning(nm), ("a", "b"), np.zeros((2, 3), np.uint8), 8, nm)
     begun: Any = SimpleNamespace(
         class_names=known.names,
-        config=network_config(TrainFlags(dim=16), known),
+        config=replace(network_config(known), dim=dim),
         basis=known.basis,
         record={"split": {"train": {"1": "one"}}},
     )
     usual = {"common": replace(known, **common), "untaught": (), "train": Imaged(keys={"1": "one"})}
-    request = _request("farm", Path("w.safetensors"), start=Path("first"), **flags)
+    request = _request("farm", Path("w.safetensors"), start=Path("first"))
     with nullcontext() if what is None else pytest.raises(SettingsError, match=f"its training had other {what}; give"):
         flow.check_start(request, begun, SimpleNamespace(**usual | scenes))
 

@@ -44,7 +44,7 @@ def _folder(root: Path, weeds: dict[str, np.ndarray] | None = None) -> Path:
 
 
 def _request(folder: Path, out: Path, **more: Any) -> TrainRequest:
-    quick: dict[str, Any] = {"steps": 2, "batch": 1, "crop": 16, "validation": 1, "patch": 8, "dim": 16}
+    quick: dict[str, Any] = {"steps": 2, "validation": 1}
     return TrainRequest(str(folder), out, TrainFlags(**quick | more))
 
 

@@ -15,15 +15,7 @@ from spectralzoom.models.reading.inference import map_of_columns
 from spectralzoom.models.training import train as training
 from spectralzoom.models.training.capture_augmentation import CaptureAugmentation, ColumnNoise
 from spectralzoom.models.training.examples import CropSampler
-from spectralzoom.models.training.objective import (
-    PHASES,
-    Phase,
-    batch_loss,
-    class_weights,
-    draw_patches,
-    map_loss,
-    pixel_losses,
-)
+from spectralzoom.models.training.objective import PHASES, Phase, batch_loss, class_weights, draw_patches, map_loss
 from spectralzoom.models.training.train import LabelledPixels, TrainingSettings, linear_classifier, train
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import block_example, make_weights
@@ -195,12 +187,12 @@ def test_unlabelled_pixels_do_not_change_the_loss():
     labels = torch.randint(0, 3, (1, 8, 8), generator=torch.Generator().manual_seed(0))
     labels[:, 2:5] = 255
     logits = torch.randn(1, 3, 8, 8, generator=torch.Generator().manual_seed(1)).requires_grad_()
-    loss = map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(3), soft_dice=True)
+    loss = map_loss(logits, labels, torch.ones(3), soft_dice=True)
     loss.backward()
     assert not logits.grad[:, :, 2:5].any()
     other = logits.detach().clone()
     other[:, :, 2:5] += 9
-    same = map_loss(other, pixel_losses(other, labels), labels, torch.ones(3), soft_dice=True)
+    same = map_loss(other, labels, torch.ones(3), soft_dice=True)
     assert same.item() == pytest.approx(loss.item(), abs=1e-6)
 
 
