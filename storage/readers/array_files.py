@@ -12,8 +12,6 @@ import math
 import mmap
 import os
 import struct
-import warnings
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -28,7 +26,7 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.checked_chunks import WIDEST, CheckedStore, outside_links, read_hdf5, unpack
+from spectralzoom.storage.readers.allowed_codecs import CheckedStore, outside_links
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
 from spectralzoom.storage.readers.own_files import within
 
@@ -46,8 +44,6 @@ _SIZES = (
     *(("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("lines", "samples"), ("height", "width")),
     *(("row", "col"), ("nr", "nc"), ("h", "w")),
 )
-_MAT_MATRIX, _MAT_PACKED = 14, 15  # kinds of elements
-_MAT_HEAD = 4096  # bytes for sizes and name of an array
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -128,63 +124,21 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str, number: int, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
-        most = 2 * WIDEST * math.prod(shape) + _MAT_HEAD  # complex numbers are two
+    def load(name: str, kind: str) -> NDArray[Any]:
         with _mapped(path) as content:
-            values = np.asarray(scipy_io.loadmat(_plain_mat(content, most, number), variable_names=[name])[name])
+            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
         if np.iscomplexobj(values):
             raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
         return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
-    with warnings.catch_warnings(), _mapped(path) as content:
-        warnings.simplefilter("ignore")  # of repeated names
-        listed = scipy_io.whosmat(_plain_mat(content, _MAT_HEAD))
+    with _mapped(path) as content:
+        listed = scipy_io.whosmat(content)
     size, most = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
-        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, at, shape, kind), size, most)
-        for at, (name, shape, kind) in enumerate(listed)
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, most)
+        for name, shape, kind in listed
         if kind in _MATLAB
     }
-
-
-def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> mmap.mmap:
-    """Return a .mat file without packing: the first ``most`` bytes of each element, or all of the ``wanted`` one.
-
-    ValueError: the wanted element has more of them.
-    """
-    if 0 in content[:4]:  # version 4 packs nothing
-        return content
-    parts = [content[:128]]
-    order = "<II" if content[126:128] == b"IM" else ">II"
-    at, number = 128, 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack(order, content[at : at + 8])
-        if wanted in (None, number):
-            body = content[at + 8 : at + 8 + (size if kind == _MAT_PACKED else min(size, most))]
-            if kind == _MAT_PACKED:
-                plain = zlib.decompressobj().decompress(body, most) if wanted is None else unpack("zlib", body, most)
-                kind, body = _MAT_MATRIX, plain[8:]
-            _check_parts(body, order, 3 if wanted is None else 5)  # flags, sizes and name, and numbers
-            parts += [struct.pack(order, kind, len(body)), body]
-        at += 8 + size
-        number += 1
-    whole = b"".join(parts)
-    plain_file = mmap.mmap(-1, len(whole))
-    plain_file.write(whole)
-    plain_file.seek(0)
-    return plain_file
-
-
-def _check_parts(body: bytes, order: str, count: int) -> None:
-    """Refuse an element of which one of the first parts claims more bytes than it has (ValueError)."""
-    at = 0
-    for _ in range(count):
-        if at + 8 <= len(body):
-            kind, size = struct.unpack(order, body[at : at + 8])
-            size = 0 if kind >> 16 else size  # up to four bytes lie within the eight
-            if size > len(body) - at - 8:
-                raise ValueError(f"a part of an array claims {size} bytes, and {len(body) - at - 8} are there")
-            at += 8 + -(-size // 8) * 8
 
 
 @contextmanager
@@ -262,7 +216,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     def read(name: str, part: Any) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
-            return read_hdf5(file[name], part)
+            return np.asarray(file[name][part])
 
     def visit(name: str, item: Any) -> None:
         """Add an array of numbers, a single text such as GDAL's grid mapping, or a list of texts such as band names."""
