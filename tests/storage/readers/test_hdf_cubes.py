@@ -224,11 +224,10 @@ TEXTS = [f"{one:g}" for one in NM]
         IMAGE.assign(cube=IMAGE["cube"].assign_attrs(long_name=[f"{one} nm" for one in TEXTS])),
         IMAGE.assign_coords(wavelength=("band", TEXTS)),
         IMAGE.assign_coords(wavelength=("band", (NM * 10).astype("i2"), {"units": "nm", "scale_factor": 0.1})),
-        IMAGE.assign_attrs({f"wavelength_{at}": one for at, one in enumerate(NM, 1)}),
     ],
 )
 def test_wavelengths_are_attributes_or_texts(tmp_path: Path, data: xr.Dataset, ending: str) -> None:
-    """Of the file or of the array, in one text, in a list, one a band, or packed."""
+    """Of the file or of the array, in one text, in a list, or packed."""
     path = tmp_path / f"a.{ending}"
     _ = data.to_netcdf(path, engine="h5netcdf") if ending == "nc" else data.to_zarr(path, zarr_format=2)
     np.testing.assert_allclose(load_scene_file(path).wavelength_nm, NM)
