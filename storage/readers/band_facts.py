@@ -42,9 +42,8 @@ WIDTHS = re.compile(
 GOOD_BANDS = ("bbl", "good", "goodband", "goodbands", "goodwavelength", "goodwavelengths", "goodbandlist")  # 0 is bad
 
 MOST_NAME = 200  # characters of a band name that are read
-_BAND_NUMBER = re.compile(
-    r"((?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*|^\W*)(\d+)(?![.,]?\d)"
-)
+_COUNTED = r"(?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*"  # words before a band's number
+_BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)")
 _LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({'|'.join(list(_LENGTHS)[:3])})(?![a-z])")
 _BARE = re.compile(r"(?<![\d.])(?:\d{3,4}|\d?\.\d+)(?!\d)")  # may be a length in nm or um
 # words of a colour: its usual wavelength [nm]; the first that fits counts
