@@ -160,7 +160,6 @@ def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
 _CODED = ("scale_factor", "add_offset", "_Unsigned")
 _FILLS = ("_FillValue", "missing_value")
 _ENDS = ("valid_range", "valid_min", "valid_max")
-_SIGNS = {"true": "true", "1": "true", "false": "false", "0": "false"}
 
 
 def _packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) -> dict[str, Any]:
@@ -168,10 +167,11 @@ def _packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) ->
 
     Raises SceneError: scale, offset or _Unsigned is something else.
     """
-    stated = {name: _number(attributes[name]) for name in (*_CODED, *_FILLS, *_ENDS) if name in attributes}
+    stated = {name: attributes[name] for name in (*_CODED, *_FILLS, *_ENDS) if name in attributes}
     known = {name: value for name, value in stated.items() if np.asarray(value).dtype.kind in "iuf"}
     if "_Unsigned" in stated:
-        known["_Unsigned"] = _SIGNS.get(str(np.ravel(stated["_Unsigned"])[0]).lower())
+        sign = str(stated["_Unsigned"]).lower()
+        known["_Unsigned"] = sign if sign in ("true", "false") else None
     for name in set(_CODED) & set(stated):
         if known.get(name) is None or np.size(known[name]) not in (1, count):
             allowed = (
@@ -186,14 +186,6 @@ def _packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) ->
 
 def _shown(value: object) -> str:
     return " ".join(str(value).split())[:80]
-
-
-def _number(value: Any) -> Any:
-    """Return the number in a text; other values as they are."""
-    try:
-        return json.loads(value) if isinstance(value, str | bytes) else value
-    except ValueError:
-        return value
 
 
 def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
@@ -349,14 +341,6 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], bool]
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
         )
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS) or dim in arrays for dim in named):
-        counts = {
-            math.prod(one.shape) for key, one in arrays.items() if one.ndim and CENTRES.fullmatch(letters(_word(key)))
-        }
-        if array.ndim == 3 and counts & set(array.shape[:2]) and array.shape[2] not in counts:
-            raise SceneError(
-                f"{path} holds shape {array.shape} without names of its axes and {max(counts)} wavelengths; expected"
-                " (y, x, band): store it in this order, or name the axes"
-            )
         return tuple(range(array.ndim)), False
     words = [_word(dim) for dim in named]
     found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
