@@ -273,16 +273,14 @@ def _bands_of(
     notes: list[str] = []
     for name, one in arrays.items():
         word = _word(name)
-        is_centre, is_width = (kind.fullmatch(letters(word)) is not None for kind in (CENTRES, WIDTHS))
-        if name == axis and not is_centre and is_spectral(one.attrs):
-            word, is_centre = "wavelength", True
-        texts = _names_of(arrays, (name,), count) if is_centre else []
-        if any(texts):
-            fields |= {word: texts, f"{word} units": _unit(one.attrs)} if word not in fields else {}
-        elif is_centre and not _is_line(arrays, name, count):
-            notes.append(f"the array {name} is left out: it has shape {one.shape} for {count} bands")
-        elif (is_centre or is_width or letters(word) in GOOD_BANDS) and _is_line(arrays, name, count):
-            fields |= {word: _values(one), f"{word} units": _unit(one.attrs)} if word not in fields else {}
+        if name == axis and is_spectral(one.attrs) and not CENTRES.fullmatch(letters(word)):
+            word = "wavelength"
+        is_centre = CENTRES.fullmatch(letters(word)) is not None
+        of_bands = is_centre or WIDTHS.fullmatch(letters(word)) or letters(word) in GOOD_BANDS
+        if of_bands and _is_line(arrays, name, count):
+            fields = {word: _values(one), f"{word} units": _unit(one.attrs)} | fields
+        elif is_centre:
+            notes.append(f"the array {name} is left out: it has {one.dtype} of shape {one.shape} for {count} bands")
     if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
         values = _values(arrays[axis]).astype(np.float64).ravel()
         if are_wavelengths(values):
