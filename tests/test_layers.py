@@ -26,7 +26,7 @@ OWNERS = {
 }
 DISTRIBUTIONS = {
     **{"PIL": "pillow", "sklearn": "scikit-learn", "serial": "pyserial", "skimage": "scikit-image"},
-    **{"odc": "odc-geo", "rio_stac": "rio-stac", "mpl_toolkits": "matplotlib", "dateutil": "python-dateutil"},
+    **{"odc": "odc-geo", "rio_stac": "rio-stac", "mpl_toolkits": "matplotlib"},
 }
 
 

@@ -8,7 +8,6 @@ from datetime import UTC, date, datetime, time, timedelta
 from typing import NamedTuple
 
 import numpy as np
-from dateutil.parser import parse
 
 # in order of trust, without case, signs and prefix; the first with a day counts, and any of them may add the time
 NAMES = (
@@ -20,9 +19,8 @@ NAMES = (
     *("tifftagdatetime", "exifdatetime"),  # of the image, or of its last change
 )
 _PREFIX = re.compile(r"^(ncglobal|exif(?=datetime[od])|emit|datatake1|spacecraft)")
-_LABEL = re.compile(r"(?P<words>[A-Za-z ]+)(?P<form>\([a-z/. -]+\))?:\s*(?=\d)")  # DATE(yyyy-mm-dd): or UTC TIME:
+_LABEL = re.compile(r"([A-Za-z ]+)(\([a-z/. -]+\))?:\s*(?=\d)")  # DATE(yyyy-mm-dd): or UTC TIME:
 _FIRST_YEAR = 1971  # a clock that was never set says 1970 or 0
-_DEFAULTS = (datetime(2000, 1, 1), datetime(2001, 2, 2, 1))  # what differs with them is not in a text
 
 
 class Acquired(NamedTuple):
@@ -35,8 +33,8 @@ class Acquired(NamedTuple):
 def acquired_of(fields: Mapping[str, object], now: datetime | None = None) -> Acquired:
     """Return the day or moment of acquisition that ``fields`` state. The creation of a file or product is none.
 
-    A value is text, bytes, a number or an array with one element. ``05/06/2019`` is not guessed, and neither are days
-    before 1971 or after ``now`` (None: the clock); a note names them. A time without a zone is taken as UTC.
+    A value is text, bytes, a number or an array with one element, as ISO 8601 or Exif write it. Others, and days before
+    1971 or after ``now`` (None: the clock), are left out with a note. A time without a zone is taken as UTC.
     """
     latest = (now or datetime.now(UTC)).date() + timedelta(days=1)
     known = {_PREFIX.sub("", re.sub(r"[\W_]", "", key.lower())): key for key in fields}
@@ -48,7 +46,7 @@ def acquired_of(fields: Mapping[str, object], now: datetime | None = None) -> Ac
         zone = fields.get(key.replace("DateTime", "OffsetTime"), "") if "DateTimeO" in key else ""
         try:
             found, at = _read(text, f"{zone}".strip(" \0"), latest)
-        except (ValueError, OverflowError) as error:
+        except ValueError as error:
             notes.append(f"{key} = {text[:40]!r} is not used as the day of acquisition: {error}; state it with --visit")
             continue
         if day is None and found is not None:
@@ -69,31 +67,22 @@ def _text_of(value: object) -> str:
     if one.size != 1 or (one.dtype.kind in "iufb" and not re.fullmatch(r"(19|20)\d{6}", f"{one[0]}")):
         return ""
     text = one[0].decode("utf-8", "replace") if isinstance(one[0], bytes) else f"{one[0]}"
-    text = re.sub(r"^(\d{4}):(\d\d):(\d\d)", r"\1-\2-\3", text.strip(" \0\"'{}"))
+    text = re.sub(r"^(\d{4})[:/](\d\d)[:/](\d\d)", r"\1-\2-\3", text.strip(" \0\"'{}"))
     return f"{text}Z" if one.dtype.kind == "M" and text != "NaT" else text  # CF counts in UTC
 
 
 def _read(text: str, zone: str, latest: date) -> tuple[date | None, time | None]:
     """Return day and time of day in a text, None for the one that it lacks. Raises ValueError: it cannot be read."""
     label = _LABEL.match(text)
-    form = "" if label is None else label["form"] or ""
-    body = text if label is None else text[label.end() :] + "Z" * label["words"].lower().startswith("utc")
-    orders = [form.startswith("(d")] if form or re.match(r"\d{4}", body) else [False, True]
-    first, other = (
-        [parse(f"{body}{zone}", default=usual, dayfirst=one, tzinfos=_offset) for one in orders] for usual in _DEFAULTS
-    )
-    day = first[0].date() if first[0].date() == other[0].date() else None
-    clock = first[0].timetz() if first[0].hour == other[0].hour else None
-    if day is None and clock is None:
-        raise ValueError("it is no whole date")
-    if len({one.date() for one in first}) > 1 or (day and not re.search(r"\d{4}", body)):
-        raise ValueError("it does not say which number is the year, month or day")
-    if day and not (day.year >= _FIRST_YEAR and day <= latest):
+    words, form = ("", "") if label is None else (label[1], label[2] or "")
+    body = re.sub(r"\s*(UTC|GMT)$", "Z", text if label is None else text[label.end() :])
+    if form.startswith("(dd-mm"):
+        body = re.sub(r"^(\d\d)-(\d\d)-(\d{4})", r"\3-\2-\1", body)
+    if re.match(r"\d\d:", body):
+        return None, time.fromisoformat(f"{body}{'Z' * words.startswith('UTC')}{zone}")
+    has_clock = ":" in body or "T" in body
+    moment = datetime.fromisoformat(f"{body}{zone if has_clock else ''}")
+    day = moment.date()
+    if not (day.year >= _FIRST_YEAR and day <= latest):
         raise ValueError("it lies in the future" if day > latest else f"it lies before {_FIRST_YEAR}")
-    return day, clock
-
-
-def _offset(name: str | None, seconds: int | None) -> int | None:
-    if name and seconds is None:
-        raise ValueError(f"the time zone {name} is not known")
-    return seconds
+    return day, moment.timetz() if has_clock else None

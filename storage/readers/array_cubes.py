@@ -1,7 +1,6 @@
 """Build cubes from named arrays: Zarr stores, NetCDF and HDF5 files, .npy and .mat.
 
-Axes are found by their names; without names they are y, x and band. Scale, offset, sign, fill values and valid range
-are applied by CF's rules; scale and offset may be one a band, which xarray does not decode.
+Axes are found by their names; without names they are y, x and band.
 """
 
 from __future__ import annotations
@@ -43,6 +42,7 @@ from spectralzoom.storage.readers.cube_sources import (
     read_by_chunks,
     reading,
 )
+from spectralzoom.storage.readers.packing import CODED, ENDS, FILLS, Turn, packing_of, shown, unpacking, values_of
 from spectralzoom.storage.readers.places import Place, place_of_dataset
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", *_AL
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
 BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel", "channels", "spectral")
 
-Turn = Callable[[NDArray[Any]], NDArray[Any]]
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 MOST_UNEVEN = 16  # times that a picture is longer than wide
 _SHOWN = 5  # arrays in a note
@@ -86,8 +85,8 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         geobox, of_place = _place_of(name, dims, order, near, stated)
         time, of_time = _time_of(near)
         acquired = acquired_of({**stated, **time})
-        packing = _packing_of(array.attrs, array.where, count)
-        unpack, nodata = _unpacking(packing, array.dtype.newbyteorder("="))
+        packing = packing_of(array.attrs, array.where, count)
+        unpack, nodata = unpacking(packing, array.dtype.newbyteorder("="))
         taken = taken_with(path.name, about, array.attrs)
         files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
     unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
@@ -134,9 +133,9 @@ def _value_notes(array: FileArray) -> list[str]:
     unit = str(array.attrs.get("units", "")).strip()
     values = {key: value for key, value in array.attrs.items() if re.search("scale|offset", key.lower())}
     return ([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]) + [
-        f"its {key} = {_shown(value)} is not applied: only scale_factor and add_offset are"
+        f"its {key} = {shown(value)} is not applied: only scale_factor and add_offset are"
         for key, value in values.items()
-        if key not in _CODED
+        if key not in CODED
     ]
 
 
@@ -157,97 +156,6 @@ def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
         return {}, [f"time in {words!r} is not used as the day of acquisition ({type(error).__name__}); use --visit"]
 
 
-_CODED = ("scale_factor", "add_offset", "_Unsigned")
-_FILLS = ("_FillValue", "missing_value")
-_ENDS = ("valid_range", "valid_min", "valid_max")
-_SIGNS = {"true": "true", "1": "true", "false": "false", "0": "false"}
-
-
-def _packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) -> dict[str, Any]:
-    """Return the attributes of packing: numbers, of scale and offset one or ``count``, and _Unsigned.
-
-    Raises SceneError: scale, offset or _Unsigned is something else.
-    """
-    stated = {name: _number(attributes[name]) for name in (*_CODED, *_FILLS, *_ENDS) if name in attributes}
-    known = {name: value for name, value in stated.items() if np.asarray(value).dtype.kind in "iuf"}
-    if "_Unsigned" in stated:
-        known["_Unsigned"] = _SIGNS.get(str(np.ravel(stated["_Unsigned"])[0]).lower())
-    for name in set(_CODED) & set(stated):
-        if known.get(name) is None or np.size(known[name]) not in (1, count):
-            allowed = (
-                "true or false" if name == "_Unsigned" else "one number" + (", or one a band" if count > 1 else "")
-            )
-            raise SceneError(f"{where} has {name} = {_shown(attributes[name])}, expected {allowed}; correct it")
-        if name != "_Unsigned":
-            numbers = np.ravel(known[name]).astype(np.float64)
-            known[name] = numbers if numbers.size > 1 else numbers[0]
-    return known
-
-
-def _shown(value: object) -> str:
-    return " ".join(str(value).split())[:80]
-
-
-def _number(value: Any) -> Any:
-    """Return the number in a text; other values as they are."""
-    try:
-        return json.loads(value) if isinstance(value, str | bytes) else value
-    except ValueError:
-        return value
-
-
-def _unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
-    """Return the function from numbers of a file to values, NaN where there is none, and the no-data value.
-
-    The function is None where the numbers are the values, with one no-data value at most.
-    """
-    kind = stored
-    if "_Unsigned" in about and stored.kind in "iu":
-        kind = np.dtype(f"{stored.byteorder}{'u' if about['_Unsigned'] == 'true' else 'i'}{stored.itemsize}")
-    scale, offset = about.get("scale_factor", 1.0), about.get("add_offset", 0.0)
-    scaled = bool(np.any(scale != 1) or np.any(offset != 0))
-    listed = [_held(number, stored, kind) for name in _FILLS for number in np.ravel(about.get(name, ()))]
-    fills = list(dict.fromkeys(one for one in listed if one is not None))
-    pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
-    pair = pair if np.size(pair) == 2 else (None, None)
-    # floating ends of whole numbers with a scale are values, others are packed (NetCDF Users Guide, conventions)
-    are_values = [scaled and stored.kind in "biu" and np.asarray(end).dtype.kind == "f" for end in pair]
-    low, high = (
-        None if end is None else float(end) if is_value else _held(end, stored, kind)
-        for end, is_value in zip(pair, are_values, strict=True)
-    )
-    if not scaled and "_Unsigned" not in about and len(fills) < 2 and (low, high) == (None, None):
-        return None, fills[0] if fills else None
-
-    def unpack(numbers: NDArray[Any]) -> NDArray[Any]:
-        packed = numbers.view(kind)
-        values = packed * scale + offset if scaled else packed
-        out = np.isin(packed, fills)
-        out |= False if low is None else (values if are_values[0] else packed) < low
-        out |= False if high is None else (values if are_values[1] else packed) > high
-        return np.where(out, np.float32(np.nan), values)
-
-    return unpack, None
-
-
-def _held(number: Any, stored: np.dtype[Any], kind: np.dtype[Any]) -> float | None:
-    """Return a number of an attribute as the ``kind`` of number in the file; None where the file cannot hold it."""
-    if stored.kind == "f":
-        return float(number)
-    if np.isfinite(number) and int(number) == number:
-        for one in (stored, kind):  # _Unsigned may be written with either sign
-            if np.iinfo(one).min <= number <= np.iinfo(one).max:
-                return int(np.array(int(number), one).view(kind))
-    return None
-
-
-def _values(one: FileArray) -> NDArray[Any]:
-    """Return an array whole, with its scale and offset (SceneError: as `_packing_of`)."""
-    packing = _packing_of(one.attrs, one.where)
-    unpack, _ = _unpacking({name: packing[name] for name in _CODED if name in packing}, one.dtype)
-    return one[...] if unpack is None else unpack(one[...])
-
-
 def _place_of(
     name: str, dims: Sequence[str], order: Sequence[int], arrays: Arrays, attributes: Mapping[str, Any]
 ) -> Place:
@@ -262,8 +170,8 @@ def _place_of(
         own = one.dims or (by_name,) * one.ndim  # a scale of HDF5 is its own axis
         fits = all(sizes.get(dim) == size for dim, size in zip(own, one.shape, strict=True))
         if one.ndim < 2 and fits and one.dtype.kind in "iuf":
-            plain = {text: value for text, value in one.attrs.items() if text not in (*_CODED, *_FILLS, *_ENDS)}
-            found[key] = xr.Variable(own, _values(one), plain)
+            plain = {text: value for text, value in one.attrs.items() if text not in (*CODED, *FILLS, *ENDS)}
+            found[key] = xr.Variable(own, values_of(one), plain)
         else:
             own = tuple(dims) if key == name else tuple(f"{key} {axis}" for axis in range(one.ndim))
             found[key] = xr.Variable(own, np.broadcast_to(np.int8(0), one.shape), dict(one.attrs))
@@ -281,18 +189,16 @@ def _bands_of(
     notes: list[str] = []
     for name, one in arrays.items():
         word = _word(name)
-        is_centre, is_width = (kind.fullmatch(letters(word)) is not None for kind in (CENTRES, WIDTHS))
-        if name == axis and not is_centre and is_spectral(one.attrs):
-            word, is_centre = "wavelength", True
-        texts = _names_of(arrays, (name,), count) if is_centre else []
-        if any(texts):
-            fields |= {word: texts, f"{word} units": _unit(one.attrs)} if word not in fields else {}
-        elif is_centre and not _is_line(arrays, name, count):
-            notes.append(f"the array {name} is left out: it has shape {one.shape} for {count} bands")
-        elif (is_centre or is_width or letters(word) in GOOD_BANDS) and _is_line(arrays, name, count):
-            fields |= {word: _values(one), f"{word} units": _unit(one.attrs)} if word not in fields else {}
+        if name == axis and is_spectral(one.attrs) and not CENTRES.fullmatch(letters(word)):
+            word = "wavelength"
+        is_centre = CENTRES.fullmatch(letters(word)) is not None
+        of_bands = is_centre or WIDTHS.fullmatch(letters(word)) or letters(word) in GOOD_BANDS
+        if of_bands and _is_line(arrays, name, count):
+            fields = {word: values_of(one), f"{word} units": _unit(one.attrs)} | fields
+        elif is_centre:
+            notes.append(f"the array {name} is left out: it has {one.dtype} of shape {one.shape} for {count} bands")
     if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
-        values = _values(arrays[axis]).astype(np.float64).ravel()
+        values = values_of(arrays[axis]).astype(np.float64).ravel()
         if are_wavelengths(values):
             fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
     usable = {
@@ -337,7 +243,9 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int
             return fitting[0], (note,) if others else ()
         if fitting:
             raise SceneError(f"{path} has several arrays with {count} axes; {listing}; name one: {path.name}:ARRAY")
-    raise SceneError(f"{path} has no array of numbers with the axes y, x and band; {listing}")
+    raise SceneError(
+        f"{path} has no array of numbers with the axes y, x and band; {listing}; links to other files are not followed"
+    )
 
 
 def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], bool]:
@@ -349,14 +257,6 @@ def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], bool]
             f"{path} holds shape {array.shape}; expected (y, x, band), or (y, x) for one band; store one time or level"
         )
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS) or dim in arrays for dim in named):
-        counts = {
-            math.prod(one.shape) for key, one in arrays.items() if one.ndim and CENTRES.fullmatch(letters(_word(key)))
-        }
-        if array.ndim == 3 and counts & set(array.shape[:2]) and array.shape[2] not in counts:
-            raise SceneError(
-                f"{path} holds shape {array.shape} without names of its axes and {max(counts)} wavelengths; expected"
-                " (y, x, band): store it in this order, or name the axes"
-            )
         return tuple(range(array.ndim)), False
     words = [_word(dim) for dim in named]
     found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
@@ -394,10 +294,8 @@ def _check_picture(shape: tuple[int, ...], where: object) -> None:
 
 def _in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
     """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
-    group = f"/{name}".rpartition("/")[0]
-    near: dict[str, FileArray] = {}
-    for path, array in sorted(arrays.items(), key=lambda one: one[0].count("/")):
-        home, _, own = f"/{path}".rpartition("/")
-        if f"{group}/".startswith(f"{home}/"):
-            near[own] = array
-    return near | {path: array for path, array in arrays.items() if "/" in path}
+    homes = {path: f"/{path}".rpartition("/")[0] for path in arrays}
+    above = sorted((path for path in arrays if f"{homes[name]}/".startswith(f"{homes[path]}/")), key=homes.__getitem__)
+    return {path.rpartition("/")[2]: arrays[path] for path in above} | {
+        key: arrays[key] for key in arrays if "/" in key
+    }

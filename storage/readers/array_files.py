@@ -1,7 +1,7 @@
 """List the arrays of .npy, .mat, NetCDF, HDF5 and Zarr by their headers; only the array wanted is read.
 
-Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file. A
-Zarr store is checked before it is opened: links out of it and codecs other than those of numbers are refused.
+Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file.
+Codecs of Zarr other than those of numbers are refused.
 """
 
 from __future__ import annotations
@@ -10,10 +10,7 @@ import base64
 import importlib
 import math
 import mmap
-import os
 import struct
-import warnings
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -28,7 +25,7 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.checked_chunks import WIDEST, CheckedStore, outside_links, read_hdf5, unpack
+from spectralzoom.storage.readers.allowed_codecs import CheckedStore
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
 from spectralzoom.storage.readers.own_files import within
 
@@ -46,8 +43,6 @@ _SIZES = (
     *(("nrow", "ncol"), ("nrows", "ncols"), ("rows", "cols"), ("lines", "samples"), ("height", "width")),
     *(("row", "col"), ("nr", "nc"), ("h", "w")),
 )
-_MAT_MATRIX, _MAT_PACKED = 14, 15  # kinds of elements
-_MAT_HEAD = 4096  # bytes for sizes and name of an array
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
 
 
@@ -128,63 +123,21 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     """List the arrays of numbers of a .mat file of versions 4 to 7."""
     scipy_io = importlib.import_module("scipy.io")
 
-    def load(name: str, number: int, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
-        most = 2 * WIDEST * math.prod(shape) + _MAT_HEAD  # complex numbers are two
+    def load(name: str, kind: str) -> NDArray[Any]:
         with _mapped(path) as content:
-            values = np.asarray(scipy_io.loadmat(_plain_mat(content, most, number), variable_names=[name])[name])
+            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
         if np.iscomplexobj(values):
             raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
         return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
-    with warnings.catch_warnings(), _mapped(path) as content:
-        warnings.simplefilter("ignore")  # of repeated names
-        listed = scipy_io.whosmat(_plain_mat(content, _MAT_HEAD))
+    with _mapped(path) as content:
+        listed = scipy_io.whosmat(content)
     size, most = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
-        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, at, shape, kind), size, most)
-        for at, (name, shape, kind) in enumerate(listed)
+        name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, most)
+        for name, shape, kind in listed
         if kind in _MATLAB
     }
-
-
-def _plain_mat(content: mmap.mmap, most: int, wanted: int | None = None) -> mmap.mmap:
-    """Return a .mat file without packing: the first ``most`` bytes of each element, or all of the ``wanted`` one.
-
-    ValueError: the wanted element has more of them.
-    """
-    if 0 in content[:4]:  # version 4 packs nothing
-        return content
-    parts = [content[:128]]
-    order = "<II" if content[126:128] == b"IM" else ">II"
-    at, number = 128, 0
-    while at + 8 <= len(content):
-        kind, size = struct.unpack(order, content[at : at + 8])
-        if wanted in (None, number):
-            body = content[at + 8 : at + 8 + (size if kind == _MAT_PACKED else min(size, most))]
-            if kind == _MAT_PACKED:
-                plain = zlib.decompressobj().decompress(body, most) if wanted is None else unpack("zlib", body, most)
-                kind, body = _MAT_MATRIX, plain[8:]
-            _check_parts(body, order, 3 if wanted is None else 5)  # flags, sizes and name, and numbers
-            parts += [struct.pack(order, kind, len(body)), body]
-        at += 8 + size
-        number += 1
-    whole = b"".join(parts)
-    plain_file = mmap.mmap(-1, len(whole))
-    plain_file.write(whole)
-    plain_file.seek(0)
-    return plain_file
-
-
-def _check_parts(body: bytes, order: str, count: int) -> None:
-    """Refuse an element of which one of the first parts claims more bytes than it has (ValueError)."""
-    at = 0
-    for _ in range(count):
-        if at + 8 <= len(body):
-            kind, size = struct.unpack(order, body[at : at + 8])
-            size = 0 if kind >> 16 else size  # up to four bytes lie within the eight
-            if size > len(body) - at - 8:
-                raise ValueError(f"a part of an array claims {size} bytes, and {len(body) - at - 8} are there")
-            at += 8 + -(-size // 8) * 8
 
 
 @contextmanager
@@ -262,7 +215,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     def read(name: str, part: Any) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
-            return read_hdf5(file[name], part)
+            return np.asarray(file[name][part])
 
     def visit(name: str, item: Any) -> None:
         """Add an array of numbers, a single text such as GDAL's grid mapping, or a list of texts such as band names."""
@@ -279,8 +232,6 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone
-        if not any(one.ndim > 1 for one in arrays.values()) and (led := outside_links(file)):
-            raise SceneError(f"{path}: {led[0]}, which is not followed; copy what it leads to into the file (h5copy)")
         return arrays, _plain(file.attrs)
 
 
@@ -309,8 +260,7 @@ def find_zarr_store(path: Path) -> Path | None:
 
 
 def _zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """List the arrays of a store (SceneError: a codec is not allowed, a link leads out, or it is a survey's own)."""
-    _check_store(path)
+    """List the arrays of a store (SceneError: a codec is not allowed, or it is a survey's own)."""
     node = zarr.open(CheckedStore(LocalStore(path, read_only=True)), mode="r")
     if not isinstance(node, zarr.Group):
         return {"": _zarr_array(path, node)}, {}
@@ -356,13 +306,3 @@ def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
         dims,
         notes=(note,) if lost else (),
     )
-
-
-def _check_store(path: Path) -> None:
-    """Refuse links out of the store and special files (SceneError)."""
-    for place, folders, files in os.walk(path):
-        for entry in (Path(place, name) for name in (*folders, *files)):
-            if entry.is_symlink():
-                within(path, entry)
-            if entry.name in files and not entry.is_file():  # reading a pipe may never end
-                raise SceneError(f"{entry} is no file; take it out of the store")

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -19,26 +17,19 @@ from numpy.typing import NDArray
 RANGE_NM = (200.0, 3000.0)
 THERMAL_NM = 20_000.0  # end of the longest wavelengths in cameras' files
 LEAST_WIDTH_NM = 0.02
-RGB_NM = (640.0, 550.0, 460.0)
 NEAR_INFRARED_NM = 800.0
 YEARS = (1900, 2100)
-GREY_NM = 550.0
 # spelling of a unit: its length [nm]; the first ones may stand behind a number in the name of a band
 _LENGTHS: Mapping[str, float] = {
     r"nm|nano ?-?met(?:er|re)s?": 1.0,
     r"[uμ]m|microns?|micro ?-?met(?:er|re)s?": 1000.0,
     r"å|[aå]ngstr(?:o|ö|oe)ms?": 0.1,
-    r"a": 0.1,
     r"m|met(?:er|re)s?": 1e9,
-    r"cm|centimet(?:er|re)s?": 1e7,
-    r"mm|millimet(?:er|re)s?": 1e6,
 }
 _BY_SIZE = {"nm": 1.0, "micrometres": 1000.0, "metres": 1e9}
 _UNSAID = ("", "unknown", "none", "unspecified", "-", "1")
 _MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
 _NUMBER = r"(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[+-]?\d+)?"
-_UNIT = rf"(?:{'|'.join(list(_LENGTHS)[:3])})(?![a-z])"
-_ITEM = re.compile(rf"([+-]?{_NUMBER})\s*(?![\d.,])(.*)")
 _BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE)  # also of np.float64(450.0)
 _KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
 CENTRES = re.compile(
@@ -49,44 +40,34 @@ WIDTHS = re.compile(
     rf"(?:(?:band|wavelength)?fwhms?|fullwidth(?:at)?halfmax(?:imum)?|bandwidths?|spectralwidths?){_KEY_UNIT}"
 )
 GOOD_BANDS = ("bbl", "good", "goodband", "goodbands", "goodwavelength", "goodwavelengths", "goodbandlist")  # 0 is bad
-_BAD_BAND = ("bad", "badband", "isbad")  # of one band: 1 is bad
-_TRUTH = {"true": 1.0, "yes": 1.0, "good": 1.0, "false": 0.0, "no": 0.0, "bad": 0.0}
 
 MOST_NAME = 200  # characters of a band name that are read
 _COUNTED = r"(?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*"  # words before a band's number
-_BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)(?!\s*{_UNIT})[\s_:.)-]*")
-_DASH = r"\s*(?:[-~\u2010-\u2015\u2212]|\.{2,3}|to|bis|and|through)\s*"
-_SPAN = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})?{_DASH}({_NUMBER})\s*({_UNIT})")
-_LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({_UNIT})")
-# a number beside the length that may be another length, a width or the number of a band
-_DOUBTFUL = re.compile(
-    rf"(?<![a-z\d.])[\d.]+\s*(?:[,/;&+*|@±]|at)\s*{_NUMBER}\s*{_UNIT}|fwhm|width"
-    rf"|{_COUNTED}\d+{_DASH}{_NUMBER}\s*{_UNIT}"
-)
-_BARE = re.compile(r"(?<![a-z\d.])(\d{3,4}(?:\.\d*)?|\d?\.\d+)(?![\d.]*\d)")  # may be a length in nm or um
-# words of a colour: its usual wavelength [nm]; the first that fits counts
+_BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)")
+_LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({'|'.join(list(_LENGTHS)[:3])})(?![a-z])")
+# colour: its usual wavelength [nm]; a name that has more words is no colour
 _COLOURS: Mapping[str, float] = {
-    "coastal(?: aerosol| blue)?|aerosol": 443.0,
-    "red ?edge ?(?:1|071)": 705.0,
-    "red ?edge ?(?:2|075)": 740.0,
-    "red ?edge ?(?:3|078)": 783.0,
-    "red ?edge": 717.0,
-    "near ?(?:infra ?red|ir)|nir": NEAR_INFRARED_NM,
-    "infra ?red": np.nan,  # short, middle or thermal
-    "swir ?(?:16|1)": 1610.0,
-    "swir ?(?:22|2)": 2200.0,
-    "blue": RGB_NM[2],
-    "green": RGB_NM[1],
-    "yellow": 590.0,
-    "orange": 620.0,
-    "red": RGB_NM[0],
-    "gr[ae]y|pan(?:chromatic)?": GREY_NM,
+    **{"coastal": 443.0, "coastal aerosol": 443.0, "coastal blue": 443.0, "aerosol": 443.0},
+    **{
+        "b": 460.0,
+        "blue": 460.0,
+        "g": 550.0,
+        "green": 550.0,
+        "yellow": 590.0,
+        "orange": 620.0,
+        "r": 640.0,
+        "red": 640.0,
+    },
+    **{"red edge 1": 705.0, "red edge 071": 705.0, "red edge": 717.0, "red edge 2": 740.0, "red edge 075": 740.0},
+    **{"red edge 3": 783.0, "red edge 078": 783.0, "n": NEAR_INFRARED_NM, "nir": NEAR_INFRARED_NM},
+    **dict.fromkeys(("near ir", "near infrared", "near infra red"), NEAR_INFRARED_NM),
+    **{"swir 1": 1610.0, "swir 16": 1610.0, "swir 2": 2200.0, "swir 22": 2200.0},
+    **dict.fromkeys(("gray", "grey", "pan", "panchromatic"), 550.0),
 }
-_LETTERS = dict(zip("rgbn", (*RGB_NM, NEAR_INFRARED_NM), strict=True))
-_COLOUR = re.compile("|".join(f"(?<![a-z])({words})(?![a-z])" for words in _COLOURS))
-_PLAIN = re.compile(
-    rf"(?:(?:{'|'.join(_COLOURS)}|r|x|wl|w|λ|lambda|wavelength|refl|reflectance|rho|rrs|radiance)[\s_-]*)*({_NUMBER})"
+_BEFORE = "|".join(
+    (*_COLOURS, "x", "wl", "w", "λ", "lambda", "wavelength", "refl", "reflectance", "rho", "rrs", "radiance")
 )
+_PLAIN = re.compile(rf"(?:(?:{_BEFORE.replace(' ', ' ?')})[\s_-]*)*({_NUMBER})")
 
 
 @dataclass(frozen=True)
@@ -108,6 +89,9 @@ def why_unknown(bands: Bands) -> str:
     """Return why there are no wavelengths, with every reason that was found."""
     reasons = "; ".join(bands.notes)
     return f"their wavelengths cannot be read ({reasons})" if reasons else "nothing says their wavelengths"
+
+
+# --- numbers and their unit -------------------------------------------------------------------------------------------
 
 
 def scale_nm(unit: object) -> float | None:
@@ -166,23 +150,31 @@ def _scale(unit: object, numbers: NDArray[np.float64]) -> tuple[float | None, st
     for name, scale in _BY_SIZE.items():
         if RANGE_NM[0] <= low * scale <= RANGE_NM[1] and high * scale <= THERMAL_NM:
             return scale, f"the wavelengths have no unit, read as {name} by their size"
-    fits = "may be Angstrom or nm" if low > RANGE_NM[1] and high <= 10 * RANGE_NM[1] else "fit no unit of wavelengths"
-    return None, f"they have no unit, and {low:g} to {high:g} {fits}"
+    return None, f"they have no unit, and {low:g} to {high:g} fit no unit of wavelengths"
+
+
+def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
+    """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
+    if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
+        return False
+    years = (numbers % 1 == 0) & (numbers >= YEARS[0]) & (numbers <= YEARS[1])
+    return not years.all() and not (len(numbers) > 1 and (np.diff(numbers) == 1).all())
+
+
+# --- fields of a file -------------------------------------------------------------------------------------------------
 
 
 def split_list(text: str, count: int) -> list[str] | None:
     """Return the ``count`` numbers of a list as texts; None if it is no such list.
 
-    They are separated by semicolons, commas or spaces, and may be missing, or have decimal commas and units.
+    They are separated by semicolons, commas or spaces, and may be missing, or have decimal commas between semicolons.
     """
     bare = _BRACKET.sub(" ", text).strip()
-    for between in (";", ",", r"[,\s]+", r",?\s+") if bare else ():
+    for between in (";",) if ";" in bare else (",", r"[,\s]+") if bare else ():
         words = [word.strip() for word in re.split(between, bare)]
         words = words[:-1] if len(words) == count + 1 and not words[-1] else words
-        if len(words) == count and all(map(_item, words)):
-            pairs = [_to_number(part) for word in words for part in word.split(",")]
-            doubled = len(pairs) == 2 * count and all(RANGE_NM[0] <= one <= RANGE_NM[1] for one in pairs)
-            return None if doubled and ";" not in bare else words  # 450,550 650,750
+        if len(words) == count and all(map(_is_number, words)):
+            return words
     return None
 
 
@@ -199,12 +191,9 @@ def _words(value: object) -> list[Any]:
     return list(np.asarray(value).ravel().tolist())
 
 
-def _item(word: object) -> tuple[float, str] | None:
-    """Return number, NaN if it is missing, and unit, "" without one, of an item of a list; None for other texts."""
-    if _plain_text(word) in _MISSING:
-        return np.nan, ""
-    found = _ITEM.fullmatch(_plain_text(word))
-    return None if found is None or (found[2] and scale_nm(found[2]) is None) else (_to_number(found[1]), found[2])
+def _is_number(word: object) -> bool:
+    """Return whether an item of a list is a number, or a word for a missing one."""
+    return _plain_text(word) in _MISSING or re.fullmatch(rf"[+-]?{_NUMBER}", _plain_text(word)) is not None
 
 
 def _to_number(text: object) -> float:
@@ -232,7 +221,6 @@ def bands_of_fields(
     ``colours`` are GDAL's colour interpretations.
     """
     count = len(names)
-    fields = _gathered(fields, count)
     notes: list[str] = []
     for key, numbers, unit in _lists(fields, CENTRES, count, notes):
         _, *widths = next(_lists(fields, WIDTHS, count, notes), ("",))
@@ -245,27 +233,13 @@ def bands_of_fields(
     return replace(found, notes=(*notes, *found.notes))
 
 
-def _gathered(fields: Mapping[str, object], count: int) -> dict[str, object]:
-    """Return fields with those such as ``Band_1``, ``Band_2``, one a band, as one list."""
-    groups: dict[str, dict[int, object]] = defaultdict(dict)
-    for key, value in fields.items():
-        if isinstance(value, str | float | int | np.number) and (found := re.fullmatch(r"(.*?\D)[ _]*(\d{1,5})", key)):
-            groups[found[1]][int(found[2])] = value
-    whole = {base: one for base, one in groups.items() if len(one) == count and min(one) in (0, 1)}
-    counted = {base: one for base, one in whole.items() if max(one) - min(one) + 1 == count}
-    parts = {f"{base}{at}" for base, one in counted.items() for at in one}
-    others = {key: value for key, value in fields.items() if re.sub(r"[ _]*(?=\d+$)", "", key) not in parts}
-    return others | {base: [one[at] for at in sorted(one)] for base, one in counted.items()}
-
-
 def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
     """Return the names that a field lists, one a band; None each without such a list."""
     for key, value in fields.items():
-        if letters(key) in ("band", "bandname", "bandnames", "longname"):
-            by = (",", r",(?!\d)", ";") if isinstance(value, str) else ()
-            ways = [re.split(one, str(value)) for one in by] or [_words(value)]
-            if found := [way for way in ways if len(way) == count]:
-                return list(map(str, found[0]))
+        if letters(key) in ("bandname", "bandnames", "longname"):
+            words = value.split(",") if isinstance(value, str) else _words(value)
+            if len(words) == count:
+                return list(map(str, words))
     return [None] * count
 
 
@@ -273,58 +247,76 @@ def _lists(
     fields: Mapping[str, object], kind: re.Pattern[str], count: int, notes: list[str]
 ) -> Iterator[tuple[str, NDArray[np.float64], object]]:
     """Yield key, (band,) numbers and unit of each list of a kind; ``notes`` say why others are left out."""
-    units_of = {letters(key): value for key, value in fields.items()}
-    stated = {
-        key[: found.end(1)]: value
-        for key, value in units_of.items()
-        if (found := re.fullmatch("(.+?)units?", key)) and kind.fullmatch(found[1])
-    }
+    units = {letters(key).removesuffix("s"): value for key, value in fields.items() if "unit" in key.lower()}
+    of_kind = [value for key, value in units.items() if kind.fullmatch(key.removesuffix("unit"))]
     for key in sorted(fields, key=len):
         if (known := kind.fullmatch(letters(key))) is None:
             continue
-        value, unit = fields[key], stated.get(letters(key), next(iter(stated.values()), ""))
-        said = repeat(unit) if isinstance(unit, str) else _words(unit)
+        value, unit = fields[key], units.get(f"{letters(key)}unit", of_kind[0] if of_kind else "")
         words = (split_list(value, count) if isinstance(value, str) else None) or _words(value)
-        items = [item for word in words if (item := _item(word)) is not None]
-        if len(items) < len(words) or len(words) != count:
-            wrong = next((word for word in words if _item(word) is None), None)
-            why = f"{len(words)} for {count} bands" if wrong is None else f"{str(wrong)!r} is no number"
-            notes.append(f"{key} is left out: {why}")
+        wrong = [word for word in words if not _is_number(word)]
+        several = set() if isinstance(unit, str) else {str(one) for one in _words(unit)}
+        if wrong or len(words) != count or len(several) > 1:
+            why = f"{str(wrong[0])!r} is no number" if wrong else f"{len(words)} for {count} bands"
+            notes.append(f"{key} is left out: {'it has several units' if len(several) > 1 else why}")
             continue
-        units = [str(own or known[1] or of_band) for (_, own), of_band in zip(items, said, strict=False)]
-        numbers = np.array([number for number, _ in items], np.float64)
-        if len(different := set(filter(None, units))) > 1:
-            numbers, different = numbers * [scale_nm(unit) or np.nan for unit in units], {"nm"}
-        yield key, numbers, "".join(different)
+        yield key, np.array([_to_number(word) for word in words]), known[1] or "".join(several) or unit
+
+
+def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the bands (from 0) that a file's fields mark as bad, such as ``bbl``, and notes.
+
+    A field is a list in one text, or has one text or number a band, "" where a band has none.
+    """
+    bad: set[int] = set()
+    notes: list[str] = []
+    for name, value in fields.items():
+        if letters(name) in GOOD_BANDS:
+            flags = [float(word) if isinstance(word, bool) else _to_number(word) for word in _words(value)]
+            if len(flags) == count:
+                bad |= {band for band, flag in enumerate(flags) if flag == 0}
+            else:
+                notes.append(f"{name} is left out: {len(flags)} flags for {count} bands")
+        elif re.fullmatch("badbands?(?:list|multiplier)?s?", letters(name)):
+            notes.append(f"{name} is not read: 1 may mean good or bad there; name the good bands in a scene.toml")
+    return tuple(sorted(bad)), tuple(notes)
+
+
+def bands_text(bands: Sequence[int]) -> str:
+    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
+    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
+    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+
+
+# --- names of bands ---------------------------------------------------------------------------------------------------
 
 
 def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[str] = ()) -> Bands:
-    """Return (band,) facts by the lengths, numbers or colours in band names, else by the file's own colours.
+    """Return (band,) facts by the one length, number or colour in each band's name, else by the file's own colours.
 
-    A range is its mean, with its width. A name with several lengths, and colours that contradict the file's, give a
-    note alone.
+    A name with a length and another number, and colours that contradict the file's, give a note alone.
     """
     texts = [_without_number(name, place) for place, name in enumerate(names)]
-    found = [_lengths(text) for text in texts]
+    found = [_LENGTH.search(text) for text in texts]
     origin = f"wavelengths from the band names of {where}"
     if any(found):
-        for name, lengths in zip(names, found, strict=True):
-            if len(lengths) > 1:
-                return Bands(notes=(f"the band name {name!r} may give several lengths",))
-            if lengths and not RANGE_NM[0] <= lengths[0][0] <= THERMAL_NM:
-                return Bands(notes=(f"the band name {name!r} gives {lengths[0][0]:g} nm, which is no wavelength",))
-        centres, widths = np.array([one[0] if one else (np.nan, np.nan) for one in found]).T
-        for centre in centres[np.isfinite(centres)]:
-            if (centres == centre).sum() > 1:
-                return Bands(notes=(f"the band names give several bands the same length, {centre:g} nm",))
-        return bands_of_numbers(centres, "nm", origin, None if np.isnan(widths).all() else widths)
+        centres = np.full(len(names), np.nan)
+        for at, length in enumerate(found):
+            if length is None:
+                continue
+            if len(re.findall(r"\d+(?:\.\d+)?", texts[at])) > 1:
+                return Bands(notes=(f"the band name {names[at]!r} may give several lengths",))
+            centres[at] = _to_number(length[1]) * (scale_nm(length[2]) or np.nan)
+            if not RANGE_NM[0] <= centres[at] <= THERMAL_NM:
+                return Bands(notes=(f"the band name {names[at]!r} gives {centres[at]:g} nm, which is no wavelength",))
+        known = centres[np.isfinite(centres)]
+        if len(set(known)) < len(known):
+            return Bands(notes=("the band names give several bands the same length",))
+        return bands_of_numbers(centres, "nm", origin)
     plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
     numbers = np.array([np.nan if one is None else _to_number(one[1]) for one in plain])
     if are_wavelengths(numbers):
         return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
-    for name, text in zip(names, texts, strict=True):
-        if any(not YEARS[0] <= one <= YEARS[1] for one in _bare_lengths(text)):
-            return Bands(notes=(f"the band name {name!r} may give a length without its unit",))
     return _bands_of_colours(names, texts, where, colours)
 
 
@@ -332,9 +324,9 @@ def _without_number(name: str | None, place: int) -> str:
     """Return the text of a name without the number of its band: after such a word, or its ``place`` (from 0 or 1)."""
 
     def shortened(found: re.Match[str]) -> str:
-        number = int(found[2])
-        of_band = number in (place, place + 1) or (found[1].strip() and number < RANGE_NM[0])
-        return " " if of_band else found[0]
+        number, behind = int(found[2]), found.string[found.end() :].lstrip()
+        said = bool(found[1].strip()) and (number < RANGE_NM[0] or behind.startswith("("))
+        return " " if said or number in (place, place + 1) else found[0]
 
     text = re.sub(r"(?<!\d)(\d{1,2}),(?=\d)|(?<=\d),(?=\d{1,2}(?!\d))", r"\1.", _plain_text(name)[:MOST_NAME])
     return _BAND_NUMBER.sub(shortened, text)
@@ -346,96 +338,28 @@ def is_named(name: str | None, place: int) -> bool:
     return bool(_without_number(name, place).strip()) or not {int(one) for one in numbers} <= {place, place + 1}
 
 
-def _lengths(text: str) -> list[tuple[float, float]]:
-    """Return centre and width [nm] (NaN: none) of each different length in a name; two if the only one is doubtful."""
-    found: list[tuple[float, float]] = []
-    for first, unit, second, last in _SPAN.findall(text):
-        low, high = _to_number(first) * (scale_nm(unit or last) or 1), _to_number(second) * (scale_nm(last) or 1)
-        plausible = RANGE_NM[0] <= low < high <= THERMAL_NM
-        found += [((low + high) / 2, high - low)] if plausible else [(low, np.nan), (high, np.nan)]
-    rest = _SPAN.sub(" ", text)
-    beside = [_to_number(number) * (scale_nm(unit) or 1) for number, unit in _LENGTH.findall(rest)]
-    if found or beside:
-        beside += _bare_lengths(re.sub(rf"{_COUNTED}\d+", " ", _LENGTH.sub(" ", rest)))
-    for centre in beside:
-        if not any(abs(centre - known) <= 1e-3 * known for known, _ in found):
-            found.append((centre, np.nan))
-    return found * 2 if len(found) == 1 and _DOUBTFUL.search(text) else found
-
-
-def _bare_lengths(text: str) -> list[float]:
-    """Return the numbers without a unit that may be lengths, in nm."""
-    found = [_to_number(number) for number in _BARE.findall(text)]
-    return [nm for one in found if RANGE_NM[0] <= (nm := one if one >= 100 else one * 1000) <= RANGE_NM[1]]
-
-
-def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
-    """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
-    if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
-        return False
-    years = (numbers % 1 == 0) & (numbers >= YEARS[0]) & (numbers <= YEARS[1])
-    return not years.all() and not (len(numbers) > 1 and (np.diff(numbers) == 1).all())
-
-
-def _colour(text: str) -> set[float]:
-    """Return the usual wavelengths of the colours in a text, NaN for infrared without a range."""
-    words = re.sub(r"[\W_]+", " ", text).strip()
-    if words in _LETTERS:
-        return {_LETTERS[words]}
-    values = list(_COLOURS.values())
-    return {values[(found.lastindex or 1) - 1] for found in _COLOUR.finditer(words)}
+def _colour(text: str) -> float:
+    """Return the usual wavelength of a colour [nm], NaN for other texts."""
+    words = re.sub(r"[\W_]+", " ", text).strip().replace("rededge", "red edge")
+    return _COLOURS.get(re.sub(r"(?<=[a-z])(?=\d)", " ", words), np.nan)
 
 
 def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
     """Return bands by the colours in their names, else by the file's own flags.
 
-    A band without a name has the flag of the file; flags that GDAL writes by itself say nothing on a named one.
+    Flags that GDAL writes by itself say nothing on bands with names.
     """
     default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
-    flags = [_colour(colour) for colour in colours] or [set() for _ in names]
-    bare = [not is_named(name, place) for place, name in enumerate(names)]
-    if default and tuple(colours[3:]) == ("undefined",) and bare[3]:
-        flags[3] = {NEAR_INFRARED_NM}
-    named = [_colour(text) for text in texts]
-    by_flag = not default and not any(named)
-    nm = [one or (flag if by_flag or no_name else set()) for one, no_name, flag in zip(named, bare, flags, strict=True)]
-    centres = [min(one) if len(one) == 1 else np.nan for one in nm]
-    if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
+    bare = not any(is_named(name, place) for place, name in enumerate(names))
+    centres = np.array([_colour(text) for text in texts])
+    source = f"the colours in the band names of {where}"
+    if np.isnan(centres).all() and len(colours) == len(names) and (bare or not default):
+        centres, source = np.array([_colour(colour) for colour in colours]), "the file's colours"
+        if default and tuple(colours[3:]) == ("undefined",):
+            centres[3] = NEAR_INFRARED_NM
+    if not len(centres) or np.isnan(centres).any() or len(set(centres)) < len(centres):
         shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
         doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
-        return Bands(notes=() if all(bare) else (doubt,))
-    others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
-    if others and not default:
-        said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
-        return Bands(notes=(said,))
-    notes = ("the band names say other colours than the file's flags of red, green and blue: the names count",)
-    source = f"the colours in the band names of {where}" if any(named) else "the file's colours"
+        return Bands(notes=() if bare else (doubt,))
     listed = ", ".join(f"{one:g}" for one in centres)
-    origin = f"wavelengths assumed from {source}: {listed} nm"
-    return Bands(np.array(centres), None, origin, notes if others else ())
-
-
-def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the bands (from 0) that a file's fields mark as bad, such as ``bbl``, and notes.
-
-    A field is a list in one text, or has one text or number a band, "" where a band has none.
-    """
-    bad: set[int] = set()
-    notes: list[str] = []
-    for name, value in _gathered(fields, count).items():
-        key = letters(name)
-        if key in GOOD_BANDS or (key in _BAD_BAND and not isinstance(value, str)):
-            flags = [_TRUTH.get(_plain_text(word), _to_number(word)) for word in _words(value)]
-            if len(flags) == count:
-                bad |= {band for band, flag in enumerate(flags) if (flag == 0 if key in GOOD_BANDS else flag > 0)}
-            else:
-                notes.append(f"{name} is left out: {len(flags)} flags for {count} bands")
-        elif re.fullmatch("badbands?(?:list|multiplier)?s?", key):
-            notes.append(f"{name} is not read: 1 may mean good or bad there; name the good bands in a scene.toml")
-    return tuple(sorted(bad)), tuple(notes)
-
-
-def bands_text(bands: Sequence[int]) -> str:
-    """Return the band numbers as ``--bands`` takes them: ``0-3,7``."""
-    runs = np.split(np.array(bands, int), np.flatnonzero(np.diff(bands) != 1) + 1) if bands else []
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+    return Bands(centres, None, f"wavelengths assumed from {source}: {listed} nm")

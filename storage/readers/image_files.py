@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
@@ -214,17 +213,11 @@ _TURNS: Mapping[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
 def _exif_of(path: Path) -> tuple[int, dict[str, Any]]:
     """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP, else 1 (upright); and tags of Exif."""
     try:
-        more: dict[int, Any] = {}  # GDAL reads those of a JPEG, but not of a PNG
-        if path.suffix.lower() in (".tif", ".tiff"):  # of any number of bands, which Pillow does not open
-            with tifffile.TiffFile(path) as file:
-                tag = file.pages.first.tags.get(_ORIENTATION)
-                found = 1 if tag is None else tag.value
-        else:
-            with warnings.catch_warnings(), Image.open(path) as image:
-                warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
-                found = image.getexif().get(_ORIENTATION, 1)
-                more = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    except Exception:  # of a kind without such tags; a damaged file is refused where it is read
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
+            found = image.getexif().get(_ORIENTATION, 1)
+            more = image.getexif().get_ifd(ExifTags.IFD.Exif)  # GDAL reads those of a JPEG, but not of a PNG
+    except Exception:  # of a kind that Pillow does not open; a damaged file is refused where it is read
         return 1, {}
     return int(found) if found in _TURNS else 1, {f"EXIF_{ExifTags.TAGS.get(tag, tag)}": more[tag] for tag in more}
 

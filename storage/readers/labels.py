@@ -112,21 +112,18 @@ def load_labels(
 
 def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None = None) -> dict[str, ClassValue]:
     """Return every value of several label files as one class each (SceneError as `load_labels`)."""
-    codes: dict[bool, set[int]] = {}  # by whether they are colours
+    found: dict[bool, set[int]] = {}  # by whether they are colours
     files = list(addresses)
     for address in files:
         read = load_codes(address)
-        found = np.unique(read.values)
-        found_codes(found, None, read.of_colours, str(address))  # raises for mixed values
-        codes.setdefault(read.of_colours, set()).update(found.tolist())
-    if len(codes) > 1:
+        values = np.unique(read.values)
+        found_codes(values, None, read.of_colours, str(address))  # raises for mixed values
+        found.setdefault(read.of_colours, set()).update(values.tolist())
+    if len(found) > 1:
         raise SceneError(f"some of {len(files)} label files have colours, some have numbers; save all in one form")
     none = None if unlabelled is None else _code(unlabelled)
-    return {
-        name: value
-        for is_colour, values in codes.items()
-        for name, value in found_codes(np.array(list(values)), none, is_colour, f"of {len(files)} files").items()
-    }
+    (of_colours, codes), *_ = found.items()
+    return found_codes(np.array(list(codes)), none, of_colours, f"of {len(files)} files")
 
 
 def load_codes(

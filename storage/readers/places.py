@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 from odc.geo.math import affine_from_axis
 from pyproj import CRS, Transformer
-from pyproj.database import get_units_map
 from pyproj.exceptions import ProjError
 
 from spectralzoom.pipeline.errors import SceneError
@@ -36,14 +35,18 @@ if TYPE_CHECKING:
 Place = tuple[GeoBox | None, tuple[str, ...]]
 
 _WKT = ("crs_wkt", "spatial_ref")  # of a grid mapping, before CF's parameters
-_CRS_TEXTS = ("esri_pe_string", "proj4_params", "proj4text", "proj4", "epsg_code", "epsg", "code")  # behind them
-_CRS_ATTRIBUTES = (  # image, then dataset
-    *("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg", "crs_wkt", "crs", "CRS", "epsg", "EPSG", "projection"),
-)
+_CRS_ATTRIBUTES = ("proj:wkt2", "proj:code", "crs")  # of the image or dataset: GeoZarr's, and that of older xarray
 _NAMES = {"y": ("lat", "latitude"), "x": ("lon", "longitude")}
 _DIRECTIONS = {"y": r"degrees?_?n(orth)?", "x": r"degrees?_?e(ast)?"}
-_DEGREES = r"deg(ree)?s?( ?([nsew]|north|south|east|west))?|°"
-_ALLOWED = "m, km, ft or us-ft on a projected CRS, degrees or rad on a geographic one, rad on a geostationary one"
+_UNITS = {  # spelling: kind, and metres or radians
+    r"m|met(er|re)s?": ("linear", 1.0),
+    r"km|kilomet(er|re)s?": ("linear", 1000.0),
+    r"ft|foot|feet": ("linear", 0.3048),
+    r"us[- ]?(ft|foot|feet|survey (foot|feet))|survey (foot|feet)": ("linear", 1200 / 3937),
+    r"deg(ree)?s?( ?([nsew]|north|south|east|west))?|°": ("angular", math.radians(1)),
+    r"rad(ian)?s?": ("angular", 1.0),
+}
+_ALLOWED = "m, km, ft or us-ft on a projected CRS, degrees or rad on a geographic one"
 _ENVI_PLACES = ("map info", "geo points", "rpc info", "coordinate system string")
 _WGS84 = r"(?i)wgs[- _]*(19)?84|world geodetic system 1984"
 
@@ -79,7 +82,7 @@ def place_of_dataset(dataset: xr.Dataset, name: str, dims: tuple[str, str]) -> P
     axes = [_axis(dataset, dim, kind) for dim, kind in zip(dims, "yx", strict=True)]
     known = [axis for axis in axes if axis is not None]
     notes: list[str] = []
-    mapping = _grid_mapping(dataset, cube, known, notes)
+    mapping = _grid_mapping(dataset, cube, notes)
     attributes = {**_plain(dataset.attrs), **_plain(cube.attrs)}
     crs = _crs(mapping, attributes, known, notes)
     stated = _stated_transform(mapping, attributes, shape, notes)
@@ -132,19 +135,15 @@ def _plain(attributes: Mapping[Any, Any]) -> dict[str, Any]:
     return found
 
 
-def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, axes: list[_Axis], notes: list[str]) -> dict[str, Any]:
-    """Return the attributes of the grid mapping that the cube names for its axes, else of the only one there is."""
+def _grid_mapping(dataset: xr.Dataset, cube: xr.Variable, notes: list[str]) -> dict[str, Any]:
+    """Return the attributes of the grid mapping that the cube names, else of the only one there is."""
     text = str(cube.encoding.get("grid_mapping", cube.attrs.get("grid_mapping", ""))).strip()
-    several = re.findall(r"(\S+):((?:\s+[^\s:]+(?!\S))+)", text)  # "crs: x y other: lat lon"
-    names = {axis.name for axis in axes}
-    several.sort(key=lambda pair: not names & set(pair[1].split()))
-    for key in [pair[0] for pair in several] or text.split():
+    for key in re.findall(r"[^\s:]+", text)[:1]:  # of "crs: x y other: lat lon" the first
         if key.removeprefix("/") in dataset.variables:
             return _plain(dataset.variables[key.removeprefix("/")].attrs)
         notes.append(f"its grid mapping {key} is not in the file")
     scalars = {str(key): _plain(one.attrs) for key, one in dataset.variables.items() if not one.ndim}
-    marks = {"grid_mapping_name", *_WKT, *_CRS_TEXTS} - {"code"}  # which may be of anything
-    single = {key: about for key, about in scalars.items() if marks & set(about)}
+    single = {key: about for key, about in scalars.items() if {"grid_mapping_name", *_WKT} & set(about)}
     if len(single) > 1:
         notes.append(f"the file has several grid mappings ({', '.join(single)}), and the cube names none of them")
         return {}
@@ -156,11 +155,9 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
     given = [(f"{key} of its grid mapping", mapping[key]) for key in _WKT if mapping.get(key)]
     if mapping.get("grid_mapping_name"):
         given.append(("its grid mapping", mapping))
-    given += [(f"{key} of its grid mapping", mapping[key]) for key in _CRS_TEXTS if mapping.get(key)]
     given += [(key, attributes[key]) for key in _CRS_ATTRIBUTES if attributes.get(key)]
     if isinstance(attributes.get("_CRS"), dict):  # GDAL's in Zarr
-        given += [("_CRS", attributes["_CRS"][key]) for key in ("wkt", "projjson") if key in attributes["_CRS"]]
-    unclear = bool(notes) or any(where != "projection" for where, _ in given)  # which is often words
+        given.append(("_CRS", attributes["_CRS"].get("wkt")))
     for where, value in given:
         try:
             with warnings.catch_warnings():
@@ -171,7 +168,7 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
         except Exception as error:  # of PROJ; KeyError of a parameter that is missing
             lacks = f"it lacks {error}" if isinstance(error, KeyError) else error
             notes.append(f"the CRS cannot be read from {where}: {lacks}")
-    if not unclear and len(axes) == 2 and all(axis.geographic for axis in axes):
+    if not given and not notes and len(axes) == 2 and all(axis.geographic for axis in axes):
         notes.append("its latitudes and longitudes have no grid mapping, and are read as WGS 84")
         return CRS.from_epsg(4326)
     return None
@@ -180,9 +177,9 @@ def _crs(mapping: Mapping[str, Any], attributes: Mapping[str, Any], axes: list[_
 def _crs_of_cf(mapping: Mapping[str, Any], axes: list[_Axis]) -> CRS:
     """Return the CRS by CF's parameters, whose false easting and northing are in the unit of the axes."""
     shifted = any(mapping.get(key) for key in ("false_easting", "false_northing"))
-    for unit in [axis.unit for axis in axes if shifted and (_unit(axis.unit) or ("", 1.0))[1] != 1]:
+    for unit in [axis.unit for axis in axes if shifted and _unit(axis.unit)[1] not in (0, 1)]:
         raise ValueError(f"false easting and northing may be in {unit} or m; add crs_wkt")
-    parameters = {key: value for key, value in mapping.items() if key not in (*_WKT, *_CRS_TEXTS)}
+    parameters = {key: value for key, value in mapping.items() if key not in _WKT}
     parameters.setdefault("projected_crs_name", str(mapping["grid_mapping_name"]).replace("_", " "))
     return CRS(CRS.from_cf(parameters).to_wkt())
 
@@ -192,7 +189,7 @@ def _stated_transform(
 ) -> Affine | None:
     """Return the transform of pixel corners by a GeoTransform or GeoZarr's attributes; None without one."""
     of_gdal = mapping.get("GeoTransform")
-    numbers = of_gdal or attributes.get("spatial:transform") or (attributes.get("crs") and attributes.get("transform"))
+    numbers = of_gdal or attributes.get("spatial:transform")
     if not numbers:
         return None
     of_centres = attributes.get("spatial:registration") == "node"
@@ -229,9 +226,6 @@ def _transform(
     if along_x is None or along_y is None:
         return None
     (left, width, x_px), (top, height, y_px) = along_x, along_y
-    turn = 2 * math.pi / float(crs.axis_info[0].unit_conversion_factor)
-    if crs.is_geographic and left >= turn / 2:  # 0 to 360 degrees east
-        left -= turn
     found = Affine(width, 0.0, left, 0.0, height, top)
     flipped = Affine(1, 0, 0, 0, -1, shape[0])  # GDAL stores NetCDF from the bottom up
     for other in () if stated is None else (stated, stated * flipped):
@@ -265,19 +259,14 @@ def _per_unit(axis: _Axis, crs: CRS, notes: list[str]) -> float:
     """Return how many units of the CRS one unit of an axis is (SceneError: as `_in_crs`)."""
     if axis.unit:
         return _in_crs(axis.name, axis.unit, crs)
-    of_angles = _satellite_m(crs) is not None and np.abs(axis.values).max() < 1
-    assumed = "rad" if of_angles else str(crs.axis_info[0].unit_name)
-    notes.append(f"{axis.name} states no unit; it is read in {assumed}")
-    return _in_crs(axis.name, assumed, crs) if of_angles else 1.0
+    notes.append(f"{axis.name} states no unit; it is read in {crs.axis_info[0].unit_name}")
+    return 1.0
 
 
 def _in_crs(what: str, unit: str, crs: CRS) -> float:
     """Return how many units of the CRS one unit is (SceneError: it is not known, or does not fit the CRS)."""
     own = crs.axis_info[0]
-    category, factor = _unit(unit) or ("", 0.0)
-    satellite_m = _satellite_m(crs)
-    if category == "angular" and satellite_m is not None:  # scanning angles
-        return factor * satellite_m / float(own.unit_conversion_factor)
+    category, factor = _unit(unit)
     if category != ("angular" if crs.is_geographic else "linear"):
         raise SceneError(
             f"{what} is in {unit!r}, and its CRS, {crs.name!r}, in {own.unit_name}; allowed are {_ALLOWED}. Correct the"
@@ -287,25 +276,10 @@ def _in_crs(what: str, unit: str, crs: CRS) -> float:
     return 1.0 if math.isclose(ratio, 1, rel_tol=1e-12) else ratio
 
 
-def _satellite_m(crs: CRS) -> float | None:
-    """Return the height of a geostationary satellite [m]; None for other CRS."""
-    operation = crs.coordinate_operation
-    if operation is None or "geostationary" not in operation.method_name.lower():
-        return None
-    return next((float(one.value) for one in operation.params if "height" in one.name.lower()), None)
-
-
-def _unit(text: str) -> tuple[str, float] | None:
-    """Return linear or angular, and the metres or radians of one unit by PROJ's table; None if it is not there."""
-    text = re.sub(r"[\s_]+", " ", text.strip().lower()).replace("meter", "metre").replace("feet", "foot")
-    many = re.match(r"\d[\d.]*(?:e[+-]?\d+)? ", text)  # such as 0.3048 metre, of pyproj
-    word = text[many.end() :] if many else text
-    word = re.sub(r"^(us )?survey foot$|^us foot$", "us-ft", re.sub(f"^({_DEGREES})$", "degree", word))
-    for category in ("linear", "angular"):
-        for unit in get_units_map(category=category).values():
-            if unit.conv_factor and {unit.name.lower(), unit.proj_short_name} & {word, word.removesuffix("s")}:
-                return category, float(unit.conv_factor) * float(many[0] if many else 1)
-    return None
+def _unit(text: str) -> tuple[str, float]:
+    """Return linear or angular, and the metres or radians of one unit; empty and 0 for one that is not known."""
+    plain = re.sub(r"[\s_]+", " ", text.strip().lower())
+    return next((found for words, found in _UNITS.items() if re.fullmatch(words, plain)), ("", 0.0))
 
 
 def place_of_file(file: Any) -> Place:
@@ -341,8 +315,8 @@ def _placed(shape: tuple[int, int], transform: Affine, crs: CRS, notes: Sequence
         lon, lat = Transformer.from_crs(flat, geodetic, always_xy=True).transform(x, y)
     except ProjError as error:
         return None, (*notes, f"its CRS, {crs.name!r}, cannot be used: {error}")
-    turns = np.abs([lon, 2 * lat]) * geodetic.axis_info[0].unit_conversion_factor / (2 * math.pi)
-    if not (turns <= (1, 0.5)).all():  # inf and NaN, too
+    half_turns = np.abs([lon, 2 * lat]) * geodetic.axis_info[0].unit_conversion_factor / math.pi
+    if not (half_turns <= 1).all():  # inf and NaN, too
         return None, (*notes, f"its middle, {x:g}, {y:g}, is no place in its CRS, {crs.name!r}; correct one of them")
     code = 4326 if flat.equals(CRS.from_epsg(4326), ignore_axis_order=True) else flat.to_epsg()
     return odc_geobox.GeoBox(shape, transform, odc_crs.CRS(flat.to_wkt() if code is None else code)), tuple(notes)

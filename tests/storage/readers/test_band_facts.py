@@ -15,7 +15,6 @@ import spectral
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
-from rasterio.enums import ColorInterp
 from rich.console import Console
 
 from spectralzoom.flows.training.init_command import run_init
@@ -46,29 +45,22 @@ def centres(bands: Bands) -> list[float] | None:
 
 
 @pytest.mark.parametrize(
-    ("name", "nm", "width"),
+    ("name", "nm"),
     [
-        ("Blue: 455 - 515 nm", 485, 60),
-        ("455nm–515nm", 485, 60),  # noqa: RUF001 - as word processors write ranges
-        ("ch1: from 0.45 to 0.52 µm", 485, 70),
-        ("Blue: 455 - 515 nm (485 nm)", 485, 60),
-        ("660.5 Nanometers", 660.5, None),
-        ("Band 12 (660,5 nm)", 660.5, None),
-        ("0.665 um", 665, None),
-        ("6605 Ångström", 660.5, None),
-        ("450 nm (0.45 um)", 450, None),
-        ("Band 7 - 455 nm", 455, None),
-        ("Band 300 (900 nm)", 900, None),
-        ("nir 842.5", 842.5, None),
-        ("R_550", 550, None),
-        ("RedEdge-705", 705, None),
+        ("660.5 Nanometers", 660.5),
+        ("Band 12 (660,5 nm)", 660.5),
+        ("0.665 um", 665),
+        ("6605 Ångström", 660.5),
+        ("Band 7 - 455 nm", 455),
+        ("Band 300 (900 nm)", 900),
+        ("nir 842.5", 842.5),
+        ("R_550", 550),
+        ("RedEdge-705", 705),
     ],
 )
-def test_a_band_name_gives_one_length_or_a_range(name: str, nm: float, width: float | None) -> None:
-    """A range is its mean and its width; the number of a band is no length; numbers alone follow a known word."""
-    bands = bands_of_names([name], "a.tif")
-    assert centres(bands) == pytest.approx([nm])
-    assert bands.fwhm_nm is None if width is None else bands.fwhm_nm == pytest.approx([width])
+def test_a_band_name_gives_one_length(name: str, nm: float) -> None:
+    """The number of a band is no length; numbers alone follow a known word."""
+    assert centres(bands_of_names([name], "a.tif")) == pytest.approx([nm])
 
 
 @pytest.mark.parametrize(
@@ -77,11 +69,12 @@ def test_a_band_name_gives_one_length_or_a_range(name: str, nm: float, width: fl
         *("20 nm at 450 nm", "450, 550 nm", "560/20 nm", "560±10 nm", "450,550 nm", "NDVI 842nm/660nm", "455_515nm"),
         *("490 nm (455-515 nm)", "Band 300 - 455 nm", "B2 (490 nm, 65 nm)", "Green 560 (27 nm)", "FWHM 20, 450 nm"),
         *("S2A_B04_665", "Band 560", "2019", "short wave infrared", "red minus nir"),
-        *("455:515 nm", "min 455 max 515 nm", "455 -> 515 nm", "0.455 < 0.515 um", "Blue 455-515"),
+        *("Blue: 455 - 515 nm", "450 nm (0.45 um)", "455:515 nm", "min 455 max 515 nm"),
+        *("0.455 < 0.515 um", "Blue 455-515"),
     ],
 )
 def test_a_doubtful_band_name_is_named(name: str) -> None:
-    """Several lengths, widths, counted bands, years and two colours are not guessed."""
+    """Ranges, several lengths, widths, counted bands, years and two colours are not guessed."""
     bands = bands_of_names([name], "a.tif")
     assert centres(bands) is None
     assert repr(name) in bands.notes[0]
@@ -119,8 +112,7 @@ RGB = ("red", "green", "blue")
         (("", "", "", ""), (*RGB, "undefined"), [640, 550, 460, 800]),
         ((None,) * 4, COLOURS, [460, 550, 640, 800]),
         (("a", "b", "c", "thermal"), (*RGB, "undefined"), "'thermal' do not give each band"),
-        (("blue", "green", "red"), ("blue", "red", "green"), "'green' contradicts its colour in the file, red"),
-        (COLOURS, (*RGB, "nir"), "'blue' contradicts its colour in the file, red"),
+        (COLOURS, (*RGB, "nir"), [460, 550, 640, 800]),
         (("nir", "red", "foo"), RGB, "'foo' do not give each band"),
         (("B02", "B03", "B04", "B08"), (*RGB, "undefined"), "'B08' do not give each band"),
         (("SR_B2", "SR_B3", "SR_B4"), RGB, "'SR_B4' do not give each band"),
@@ -128,10 +120,7 @@ RGB = ("red", "green", "blue")
     ],
 )
 def test_names_of_colours_win_over_flags(names: Any, flags: tuple[str, ...], nm: Any) -> None:
-    """Red, green and blue are flags that GDAL writes by itself; a band with another name is not read by them.
-
-    Other flags that contradict the names are refused.
-    """
+    """Red, green and blue are flags that GDAL writes by itself; a band with another name is not read by them."""
     bands = bands_of_names(names, "a.tif", flags)
     if isinstance(nm, str):
         assert centres(bands) is None
@@ -155,7 +144,7 @@ def test_names_of_colours_win_over_flags(names: Any, flags: tuple[str, ...], nm:
         ("nm", [400, np.nan, 500, -9999], [400, np.nan, 500, np.nan]),
         ("Wavenumber", [400, 500], "unit 'Wavenumber' is no length"),
         ("GHz", [400, 500], "unit 'GHz' is no length"),
-        ("", [4000, 5000], "may be Angstrom or nm"),
+        ("", [4000, 5000], "4000 to 5000 fit no unit"),
         ("", [1, 2, 3], "may count the bands"),
         ("", [1, 500], "fit no unit"),
         ("nm", [400, 0, 0], "1 of 3 bands have one"),
@@ -178,19 +167,18 @@ def test_wavelengths_are_converted_to_nm(unit: str | None, values: list[float], 
     [
         ("450, 550\n650", 3, [450, 550, 650]),
         ("{450,5; 550,5}", 2, [450.5, 550.5]),
-        ("450,5 550,5", 2, [450.5, 550.5]),
-        ("450,5, 550,5", 2, [450.5, 550.5]),
         ("450,,650", 3, [450, np.nan, 650]),
         ("450 nan 650", 3, [450, np.nan, 650]),
         ("450, 550,", 2, [450, 550]),
         ("(np.float64(450.0), np.float64(550.0))", 2, [450, 550]),
         ("450,550 650,750", 2, None),
         ("450,550", 1, None),
+        ("450,5 550,5", 2, None),
         ("450, x", 2, None),
     ],
 )
 def test_lists_are_split_in_one_way(text: str, count: int, found: list[float] | None) -> None:
-    """Commas separate or are decimal, by the number of bands; what may be both is no list."""
+    """Commas separate, or are decimal between semicolons; what may be both is no list."""
     numbers = numbers_of_list(text, count)
     assert numbers is None if found is None else numbers == pytest.approx(found, nan_ok=True)
 
@@ -198,20 +186,17 @@ def test_lists_are_split_in_one_way(text: str, count: int, found: list[float] | 
 @pytest.mark.parametrize(
     "fields",
     [
-        {"Wavelengths": "450 nm, 550 nm"},
+        {"Wavelengths": "450, 550"},
         {"center wavelength": "0.45 0.55", "Center Wavelength Units": "um"},
         {"centre_wavelength": "4500; 5500", "wavelength units": "Angstrom", "centre_wavelength_unit": "Angstrom"},
         {"band centers (um)": "[0.45, 0.55]"},
         {"wavelengths_nm": ["450", "550"], "fwhm": "10 10"},
-        {"wavelength": ["450", "0.55"], "wavelength_units": ["nm", "um"]},
-        {"wavelength": "450", "CentralWavelength": "450,0 550,0"},
-        {"wavelength_1": "0.45 um", "wavelength_2": "0.55 um"},
-        {"wavelength": "1 2", "Band_1": "blue (450 nm)", "Band_2": "green (550 nm)"},
+        {"wavelength": "450", "CentralWavelength": "450,0; 550,0"},
         {"long_name": "('450 nm', '550 nm')"},
     ],
 )
 def test_fields_have_several_names(fields: dict[str, Any]) -> None:
-    """Singular and plural, both spellings, a unit in the name, beside it or behind each number."""
+    """Singular and plural, both spellings, a unit in the name or beside it."""
     bands = bands_of_fields(fields, ["", ""], "a.hdr")
     assert centres(bands) == pytest.approx([450, 550])
     assert (bands.fwhm_nm is not None) == ("fwhm" in fields)
@@ -250,14 +235,10 @@ def test_a_geotiff_states_wavelengths_in_several_ways(tmp_path: Path, say: Any, 
 
 @pytest.mark.parametrize("photometric", ["MINISBLACK", "RGB", None])
 def test_a_geotiff_named_by_colours_is_read_by_its_names(tmp_path: Path, photometric: str | None) -> None:
-    """Whatever colour flags GDAL wrote; flags of a user that contradict the names are named in the refusal."""
+    """The colour flags that GDAL or a user wrote do not matter."""
     with write(tmp_path / "a.tif", photometric=photometric) as file:
         file.descriptions = COLOURS
     assert load_scene_file(tmp_path / "a.tif").wavelength_nm.tolist() == [460, 550, 640, 800]
-    with rasterio.open(tmp_path / "a.tif", "r+") as file:
-        file.colorinterp = [ColorInterp.blue, ColorInterp.red, ColorInterp.green, ColorInterp.undefined]
-    with pytest.raises(WavelengthError, match=r"'green' contradicts its colour in the file, red\); write"):
-        load_scene_file(tmp_path / "a.tif")
     assert load_scene_file(tmp_path / "a.tif", wavelengths=NM).wavelength_nm.tolist() == NM
 
 
@@ -274,8 +255,7 @@ def test_a_fourth_band_with_a_name_is_no_alpha(tmp_path: Path, name: str, count:
     [
         ({"bbl": "{1, 0, 1, 1}"}, []),
         ({}, [{"bbl": "1"}, {"BBL": "0"}, {}, {"bbl": "1.0"}]),
-        ({}, [{}, {"bad_band": "true"}, {"bad_band": "0"}, {}]),
-        ({"good bands": "1 0 1 1"}, [{"good": "yes"}]),
+        ({"good bands": "1 0 1 1"}, [{"good": "1"}]),
     ],
 )
 def test_bands_marked_as_bad_are_left_out(tmp_path: Path, of_file: dict[str, str], of_bands: list[Any]) -> None:
@@ -298,7 +278,6 @@ def test_bad_bands_round_trip_as_text(good: list[bool]) -> None:
     assert (
         list(bad) == [band for band, one in enumerate(good) if not one] == list(bad_bands({"bbl": good}, len(good))[0])
     )
-    assert list(bad_bands({f"bbl_{at}": int(one) for at, one in enumerate(good)}, len(good))[0]) == list(bad)
     if bad:
         assert [int(str(one)) for part in bands_text(bad).split(",") for one in numbers_of(part)] == list(bad)
         assert SceneSettings.model_validate({"bands": bands_text(bad)}).bands == bad
@@ -390,7 +369,7 @@ COORDINATES: dict[str, Any] = {
     "Angstrom": {"wavelength": ("band", [4500.0, 5500], {"units": "Angstrom"})},
     "a name with a unit": {"center_wavelength_um": ("band", [0.45, 0.55])},
     "the axis": {"band": ("band", [450.0, 550.0])},
-    "names": {"band": ("band", ["430 - 470 nm", "550 nm"])},
+    "names": {"band": ("band", ["450 nm", "550 nm"])},
 }
 
 
@@ -417,7 +396,9 @@ def test_attributes_of_an_array_list_wavelengths_and_bad_bands(tmp_path: Path) -
     xr.Dataset({"r": (*axes, about)}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
     assert load_scene_file(tmp_path / "a.nc").wavelength_nm.tolist() == pytest.approx([450])
     xr.Dataset({"r": axes, "wavelength": ("all", [1.0, 2, 3])}).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
-    with pytest.raises(WavelengthError, match=r"array wavelength is left out: it has shape \(3,\) for 2 bands"):
+    with pytest.raises(
+        WavelengthError, match=r"array wavelength is left out: it has float64 of shape \(3,\) for 2 bands"
+    ):
         load_scene_file(tmp_path / "b.nc")
 
 

@@ -1,0 +1,56 @@
+"""Refuse codecs of Zarr stores that may run code."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import WrapperStore
+
+from spectralzoom.pipeline.errors import SceneError
+
+PACKERS = ("blosc", "zstd", "gzip", "zlib", "bz2", "lz4")
+PLAIN_CODECS = {
+    *("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3"),  # checksums
+    *("bytes", "transpose", "sharding_indexed", "shuffle"),  # orders
+    *("delta", "fixedscaleoffset", "quantize", "bitround", "astype", "cast_value", "scale_offset"),  # of numbers
+}
+
+
+class CheckedStore(WrapperStore[Store]):
+    """A store of any kind whose arrays use codecs of numbers alone.
+
+    Raises SceneError on others, such as pickle. Consolidated metadata are left out: each array's own are read.
+    """
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        """Return the bytes of a key; metadata are checked first."""
+        name = key.rpartition("/")[2]
+        found = None if name == ".zmetadata" else await super().get(key, prototype, byte_range)
+        if found is None or name not in ("zarr.json", ".zarray"):
+            return found
+        about = json.loads(found.to_bytes())
+        where = f"{str(self).partition('://')[2]}/{key}"
+        if not isinstance(about, dict):
+            raise SceneError(f"{where} holds no table; copy the store again")
+        about.pop("consolidated_metadata", None)
+        for listed in ("compressor", "filters", "codecs"):
+            _check_codecs(about.get(listed) or [], where)
+        return prototype.buffer.from_bytes(json.dumps(about).encode())
+
+
+def _check_codecs(codecs: Any, where: str) -> None:
+    """Refuse codecs of metadata, also those within shards (SceneError: one is not allowed)."""
+    for one in codecs if isinstance(codecs, list) else [codecs]:
+        given = one if isinstance(one, dict) else {"name": one}
+        name = str(given.get("name", given.get("id")))
+        kind = name.lower().removeprefix("numcodecs.")
+        if kind not in PLAIN_CODECS.union(PACKERS):
+            raise SceneError(
+                f"{where} asks for the codec {name!r}, which is not read; store plain numbers with {', '.join(PACKERS)}"
+            )
+        inner = given.get("configuration")
+        if kind == "sharding_indexed" and isinstance(inner, dict):
+            _check_codecs([*inner.get("codecs", ()), *inner.get("index_codecs", ())], where)

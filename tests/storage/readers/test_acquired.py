@@ -1,0 +1,36 @@
+"""Days and moments of acquisition in the fields of files."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+
+from spectralzoom.storage.readers.acquired import acquired_of
+
+
+@pytest.mark.parametrize(
+    ("fields", "found"),
+    [
+        ({"acquisition time": "2022-07-01T10:11:12.5+02:00"}, "2022-07-01T08:11:12Z"),
+        ({"TIFFTAG_DATETIME": "2022:07:01 10:11:12"}, "2022-07-01T10:11:12Z"),
+        ({"date": 20220701}, "2022-07-01"),
+        ({"date": "2022/07/01", "time": "10:11:12 UTC"}, "2022-07-01T10:11:12Z"),
+        ({"acquisition date": "DATE(dd-mm-yyyy): 01-07-2022", "date": "2020-01-01"}, "2022-07-01"),
+        ({"date_created": "2022-07-01"}, None),
+    ],
+)
+def test_a_day_or_moment_is_read(fields: dict[str, object], found: str | None) -> None:
+    """Fields are tried in the order of trust; the creation of a file is no acquisition."""
+    assert acquired_of(fields).text == found
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("05/06/2019", "isoformat"), ("1970-01-01", "before 1971"), ("2022-07-03", "in the future")]
+)
+def test_a_doubtful_day_is_left_out_with_a_note(text: str, words: str) -> None:
+    """The note names field and text."""
+    text_of, notes = acquired_of({"date": text}, datetime(2022, 7, 1, tzinfo=UTC))
+    assert text_of is None
+    assert f"date = {text!r} is not used" in notes[0]
+    assert words in notes[0]
