@@ -1,10 +1,11 @@
-"""Refuse codecs of Zarr stores that may run code."""
+"""Refuse codecs of Zarr stores that may run code, and name what an HDF5 file keeps in other files."""
 
 from __future__ import annotations
 
 import json
 from typing import Any
 
+import h5py
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
@@ -54,3 +55,19 @@ def _check_codecs(codecs: Any, where: str) -> None:
         inner = given.get("configuration")
         if kind == "sharding_indexed" and isinstance(inner, dict):
             _check_codecs([*inner.get("codecs", ()), *inner.get("index_codecs", ())], where)
+
+
+def outside_links(file: h5py.File) -> list[str]:
+    """Return a sentence for each link, external array and virtual array of a file, which may lead to any other file."""
+    found: list[str] = []
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.ExternalLink):
+            found.append(f"{name} is a link to {item.filename}:{item.path}")
+        elif isinstance(item, h5py.Dataset) and (item.external or item.is_virtual):
+            others = [one[0] for one in item.external or ()] or [one.file_name for one in item.virtual_sources()]
+            found.append(f"{name} takes its numbers from {', '.join(others[:1]) or 'no file'}")
+
+    file.visititems_links(visit)
+    file.visititems(visit)
+    return found

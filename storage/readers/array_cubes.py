@@ -243,9 +243,7 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int
             return fitting[0], (note,) if others else ()
         if fitting:
             raise SceneError(f"{path} has several arrays with {count} axes; {listing}; name one: {path.name}:ARRAY")
-    raise SceneError(
-        f"{path} has no array of numbers with the axes y, x and band; {listing}; links to other files are not followed"
-    )
+    raise SceneError(f"{path} has no array of numbers with the axes y, x and band; {listing}")
 
 
 def _axes(arrays: Arrays, name: str, path: Path) -> tuple[tuple[int, ...], bool]:
@@ -294,8 +292,10 @@ def _check_picture(shape: tuple[int, ...], where: object) -> None:
 
 def _in_scope(arrays: Arrays, name: str) -> dict[str, FileArray]:
     """Return all arrays by their paths; those of the array's group, and of groups above it, by their names alone."""
-    homes = {path: f"/{path}".rpartition("/")[0] for path in arrays}
-    above = sorted((path for path in arrays if f"{homes[name]}/".startswith(f"{homes[path]}/")), key=homes.__getitem__)
-    return {path.rpartition("/")[2]: arrays[path] for path in above} | {
-        key: arrays[key] for key in arrays if "/" in key
-    }
+    group = f"/{name}".rpartition("/")[0]
+    near: dict[str, FileArray] = {}
+    for path, array in sorted(arrays.items(), key=lambda one: one[0].count("/")):
+        home, _, own = f"/{path}".rpartition("/")
+        if f"{group}/".startswith(f"{home}/"):
+            near[own] = array
+    return near | {path: array for path, array in arrays.items() if "/" in path}

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.allowed_codecs import CheckedStore
+from spectralzoom.storage.readers.allowed_codecs import CheckedStore, outside_links
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
 from spectralzoom.storage.readers.own_files import within
 
@@ -232,6 +232,8 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     with h5py.File(path, "r") as file:
         file.visititems(visit)  # follows hard links alone
+        if not any(one.ndim > 1 for one in arrays.values()) and (led := outside_links(file)):
+            raise SceneError(f"{path}: {led[0]}, which is not followed; copy what it leads to into the file (h5copy)")
         return arrays, _plain(file.attrs)
 
 

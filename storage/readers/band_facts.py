@@ -45,29 +45,30 @@ MOST_NAME = 200  # characters of a band name that are read
 _COUNTED = r"(?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*"  # words before a band's number
 _BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)")
 _LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({'|'.join(list(_LENGTHS)[:3])})(?![a-z])")
-# colour: its usual wavelength [nm]; a name that has more words is no colour
+_BARE = re.compile(r"(?<![\d.])(?:\d{3,4}|\d?\.\d+)(?!\d)")  # may be a length in nm or um
+# words of a colour: its usual wavelength [nm]; the first that fits counts
 _COLOURS: Mapping[str, float] = {
-    **{"coastal": 443.0, "coastal aerosol": 443.0, "coastal blue": 443.0, "aerosol": 443.0},
-    **{
-        "b": 460.0,
-        "blue": 460.0,
-        "g": 550.0,
-        "green": 550.0,
-        "yellow": 590.0,
-        "orange": 620.0,
-        "r": 640.0,
-        "red": 640.0,
-    },
-    **{"red edge 1": 705.0, "red edge 071": 705.0, "red edge": 717.0, "red edge 2": 740.0, "red edge 075": 740.0},
-    **{"red edge 3": 783.0, "red edge 078": 783.0, "n": NEAR_INFRARED_NM, "nir": NEAR_INFRARED_NM},
-    **dict.fromkeys(("near ir", "near infrared", "near infra red"), NEAR_INFRARED_NM),
-    **{"swir 1": 1610.0, "swir 16": 1610.0, "swir 2": 2200.0, "swir 22": 2200.0},
-    **dict.fromkeys(("gray", "grey", "pan", "panchromatic"), 550.0),
+    "coastal(?: aerosol| blue)?|aerosol": 443.0,
+    "red ?edge ?(?:1|071)": 705.0,
+    "red ?edge ?(?:2|075)": 740.0,
+    "red ?edge ?(?:3|078)": 783.0,
+    "red ?edge": 717.0,
+    "near ?(?:infra ?red|ir)|nir": NEAR_INFRARED_NM,
+    "infra ?red": np.nan,  # short, middle or thermal
+    "swir ?(?:16|1)": 1610.0,
+    "swir ?(?:22|2)": 2200.0,
+    "blue": 460.0,
+    "green": 550.0,
+    "yellow": 590.0,
+    "orange": 620.0,
+    "red": 640.0,
+    "gr[ae]y|pan(?:chromatic)?": 550.0,
 }
-_BEFORE = "|".join(
-    (*_COLOURS, "x", "wl", "w", "λ", "lambda", "wavelength", "refl", "reflectance", "rho", "rrs", "radiance")
+_LETTERS = {"r": "red", "g": "green", "b": "blue", "n": "nir"}
+_COLOUR = re.compile("|".join(f"(?<![a-z])({words})(?![a-z])" for words in _COLOURS))
+_PLAIN = re.compile(
+    rf"(?:(?:{'|'.join(_COLOURS)}|r|x|wl|w|λ|lambda|wavelength|refl|reflectance|rho|rrs|radiance)[\s_-]*)*({_NUMBER})"
 )
-_PLAIN = re.compile(rf"(?:(?:{_BEFORE.replace(' ', ' ?')})[\s_-]*)*({_NUMBER})")
 
 
 @dataclass(frozen=True)
@@ -338,28 +339,39 @@ def is_named(name: str | None, place: int) -> bool:
     return bool(_without_number(name, place).strip()) or not {int(one) for one in numbers} <= {place, place + 1}
 
 
-def _colour(text: str) -> float:
-    """Return the usual wavelength of a colour [nm], NaN for other texts."""
-    words = re.sub(r"[\W_]+", " ", text).strip().replace("rededge", "red edge")
-    return _COLOURS.get(re.sub(r"(?<=[a-z])(?=\d)", " ", words), np.nan)
+def _colour(text: str) -> set[float]:
+    """Return the usual wavelengths of the colours in a text, NaN for infrared without a range."""
+    words = re.sub(r"[\W_]+", " ", text).strip()
+    values = list(_COLOURS.values())
+    found = _COLOUR.finditer(_LETTERS.get(words, words))
+    return {values[(one.lastindex or 1) - 1] for one in found}
 
 
 def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
     """Return bands by the colours in their names, else by the file's own flags.
 
-    Flags that GDAL writes by itself say nothing on bands with names.
+    A band without a name has the flag of the file; flags that GDAL writes by itself say nothing on a named one. A
+    name with a number that may be a length has no colour.
     """
     default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
-    bare = not any(is_named(name, place) for place, name in enumerate(names))
-    centres = np.array([_colour(text) for text in texts])
-    source = f"the colours in the band names of {where}"
-    if np.isnan(centres).all() and len(colours) == len(names) and (bare or not default):
-        centres, source = np.array([_colour(colour) for colour in colours]), "the file's colours"
-        if default and tuple(colours[3:]) == ("undefined",):
-            centres[3] = NEAR_INFRARED_NM
-    if not len(centres) or np.isnan(centres).any() or len(set(centres)) < len(centres):
+    flags = [_colour(colour) for colour in colours] or [set() for _ in names]
+    bare = [not is_named(name, place) for place, name in enumerate(names)]
+    if default and tuple(colours[3:]) == ("undefined",) and bare[3]:
+        flags[3] = {NEAR_INFRARED_NM}
+    named = [set() if _BARE.search(text) else _colour(text) for text in texts]
+    by_flag = not default and not any(named)
+    nm = [one or (flag if by_flag or no_name else set()) for one, no_name, flag in zip(named, bare, flags, strict=True)]
+    centres = [min(one) if len(one) == 1 else np.nan for one in nm]
+    if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
         shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
         doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
-        return Bands(notes=() if bare else (doubt,))
+        return Bands(notes=() if all(bare) else (doubt,))
+    others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
+    if others and not default:
+        said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
+        return Bands(notes=(said,))
+    notes = ("the band names say other colours than the file's flags of red, green and blue: the names count",)
+    source = f"the colours in the band names of {where}" if any(named) else "the file's colours"
     listed = ", ".join(f"{one:g}" for one in centres)
-    return Bands(centres, None, f"wavelengths assumed from {source}: {listed} nm")
+    origin = f"wavelengths assumed from {source}: {listed} nm"
+    return Bands(np.array(centres), None, origin, notes if others else ())

@@ -15,6 +15,7 @@ import spectral
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from rasterio.enums import ColorInterp
 from rich.console import Console
 
 from spectralzoom.flows.training.init_command import run_init
@@ -112,7 +113,8 @@ RGB = ("red", "green", "blue")
         (("", "", "", ""), (*RGB, "undefined"), [640, 550, 460, 800]),
         ((None,) * 4, COLOURS, [460, 550, 640, 800]),
         (("a", "b", "c", "thermal"), (*RGB, "undefined"), "'thermal' do not give each band"),
-        (COLOURS, (*RGB, "nir"), [460, 550, 640, 800]),
+        (("blue", "green", "red"), ("blue", "red", "green"), "'green' contradicts its colour in the file, red"),
+        (COLOURS, (*RGB, "nir"), "'blue' contradicts its colour in the file, red"),
         (("nir", "red", "foo"), RGB, "'foo' do not give each band"),
         (("B02", "B03", "B04", "B08"), (*RGB, "undefined"), "'B08' do not give each band"),
         (("SR_B2", "SR_B3", "SR_B4"), RGB, "'SR_B4' do not give each band"),
@@ -120,7 +122,10 @@ RGB = ("red", "green", "blue")
     ],
 )
 def test_names_of_colours_win_over_flags(names: Any, flags: tuple[str, ...], nm: Any) -> None:
-    """Red, green and blue are flags that GDAL writes by itself; a band with another name is not read by them."""
+    """Red, green and blue are flags that GDAL writes by itself; a band with another name is not read by them.
+
+    Other flags that contradict the names are refused.
+    """
     bands = bands_of_names(names, "a.tif", flags)
     if isinstance(nm, str):
         assert centres(bands) is None
@@ -235,10 +240,14 @@ def test_a_geotiff_states_wavelengths_in_several_ways(tmp_path: Path, say: Any, 
 
 @pytest.mark.parametrize("photometric", ["MINISBLACK", "RGB", None])
 def test_a_geotiff_named_by_colours_is_read_by_its_names(tmp_path: Path, photometric: str | None) -> None:
-    """The colour flags that GDAL or a user wrote do not matter."""
+    """Whatever colour flags GDAL wrote; flags of a user that contradict the names are named in the refusal."""
     with write(tmp_path / "a.tif", photometric=photometric) as file:
         file.descriptions = COLOURS
     assert load_scene_file(tmp_path / "a.tif").wavelength_nm.tolist() == [460, 550, 640, 800]
+    with rasterio.open(tmp_path / "a.tif", "r+") as file:
+        file.colorinterp = [ColorInterp.blue, ColorInterp.red, ColorInterp.green, ColorInterp.undefined]
+    with pytest.raises(WavelengthError, match=r"'green' contradicts its colour in the file, red\); write"):
+        load_scene_file(tmp_path / "a.tif")
     assert load_scene_file(tmp_path / "a.tif", wavelengths=NM).wavelength_nm.tolist() == NM
 
 

@@ -181,8 +181,12 @@ def test_links_in_a_mat_file_are_not_followed(tmp_path: Path, cube: NDArray[np.u
         file["soft"] = h5py.SoftLink("/link")
         file.create_dataset("outside", cube.shape, cube.dtype, external=[("raw.bin", 0, cube.nbytes)])
         file.create_virtual_dataset("virtual", layout)
-    with pytest.raises(SceneError, match=r"has no array of numbers .*links to other files are not followed"):
+    with pytest.raises(SceneError, match=r"link is a link to secret73\.mat:/cube, which is not followed; copy what"):
         load_scene_file(tmp_path / "a73.mat", wavelengths=NM)
+    with h5py.File(tmp_path / "b73.mat", "w", userblock_size=512) as file:
+        file.create_virtual_dataset("virtual", layout)
+    with pytest.raises(SceneError, match=r"virtual takes its numbers from .*secret73\.mat, which is not followed"):
+        load_scene_file(tmp_path / "b73.mat", wavelengths=NM)
 
 
 @pytest.mark.parametrize("value", ["1e+30", "-3.4028235e+38", "2e+09"])
