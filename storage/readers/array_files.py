@@ -1,7 +1,7 @@
 """List the arrays of .npy, .mat, NetCDF, HDF5 and Zarr by their headers; only the array wanted is read.
 
-Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file.
-Codecs of Zarr other than those of numbers are refused.
+Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file. A
+Zarr store is checked before it is opened: links out of it and codecs other than those of numbers are refused.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import base64
 import importlib
 import math
 import mmap
+import os
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -262,7 +263,8 @@ def find_zarr_store(path: Path) -> Path | None:
 
 
 def _zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """List the arrays of a store (SceneError: a codec is not allowed, or it is a survey's own)."""
+    """List the arrays of a store (SceneError: a codec is not allowed, a link leads out, or it is a survey's own)."""
+    _check_store(path)
     node = zarr.open(CheckedStore(LocalStore(path, read_only=True)), mode="r")
     if not isinstance(node, zarr.Group):
         return {"": _zarr_array(path, node)}, {}
@@ -308,3 +310,13 @@ def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
         dims,
         notes=(note,) if lost else (),
     )
+
+
+def _check_store(path: Path) -> None:
+    """Refuse links out of the store and special files (SceneError)."""
+    for place, folders, files in os.walk(path):
+        for entry in (Path(place, name) for name in (*folders, *files)):
+            if entry.is_symlink():
+                within(path, entry)
+            if entry.name in files and not entry.is_file():  # reading a pipe may never end
+                raise SceneError(f"{entry} is no file; take it out of the store")

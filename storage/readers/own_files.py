@@ -13,6 +13,10 @@ from typing import Any
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.cube_sources import reading
 
+# endings of metadata that GDAL finds by other names than the image's (Landsat, Pleiades, SPOT, ALOS, RapidEye)
+_METADATA = (".txt", ".xml", ".imd", ".rpb", ".rpc", ".pvl", ".dim", ".eph", ".pass")
+_OF_TIFF = (".ovr", ".msk")  # endings of files beside an image, which GDAL opens by their content
+
 
 def within(named: Path, found: Path, also: Path | None = None) -> Path:
     """Return a file or folder that a reader found by the ``named`` file or folder.
@@ -46,14 +50,21 @@ def stated_file(folder: Path, name: str, where: str) -> Path:
 
 
 def check_sidecars(image: Path) -> None:
-    """Check mask and overviews beside an image, which GDAL opens by any driver; a VRT may lead to a server.
+    """Check the files beside an image that GDAL may open: metadata, and those whose names begin as its own.
 
-    Raises SceneError: one is no TIFF, or names a file.
+    Raises SceneError: one is a link out of the folder or no file; or an overview or mask is no TIFF or names a file.
     """
     rasterio = importlib.import_module("rasterio")
-    for ending in (".ovr", ".msk", ".OVR", ".MSK"):
-        path = image.with_name(image.name + ending)
-        if path.is_file():
+    stem = image.stem.casefold()
+    with os.scandir(image.parent) as entries:
+        names = [one.name for one in entries]
+    beside = [image.parent / one for one in names if one.casefold().startswith(stem) or one.lower().endswith(_METADATA)]
+    for path in beside:
+        if path == image or within(image, path).is_dir():
+            continue
+        if not path.is_file():  # reading a pipe may never end
+            raise SceneError(f"{path} is no file; move it elsewhere")
+        if path.suffix.lower() in _OF_TIFF:
             with reading(path, "TIFF", "move it elsewhere"), rasterio.open(path, driver="GTiff") as file:
                 check_overviews(file, path)
 

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 import re
+import sqlite3
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +28,7 @@ from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, N
 from spectralzoom.pipeline.ground.georeference import WGS84
 from spectralzoom.pipeline.ground.zones import on_field
 from spectralzoom.storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
+from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
 
 if TYPE_CHECKING:
@@ -33,9 +36,13 @@ if TYPE_CHECKING:
 
 ZONE_ENDINGS = (".geojson", ".json", ".gpkg", ".shp")
 POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels; a .json file may hold anything
+SHAPEFILE_PARTS = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".sbn", ".idm", ".ind")
 SHAPEFILE_MAGIC, SQLITE_MAGIC = b"\0\0\x27\x0a", b"SQLite format 3\0"
 GEOPACKAGE_ID = b"GP"  # at byte 68
-OF_LIBRARIES = (pyproj.exceptions.ProjError, shapely.errors.GEOSException)
+VIRTUAL = re.compile(r"\s*create\b.*\bvirtual\b", re.IGNORECASE | re.DOTALL)  # tables that a module of SQLite fills
+INDEX = re.compile(r'create virtual table (?:"[^"]+"|\w+) using (?:rtree|fts)\w*\s*\(', re.IGNORECASE)
+OF_LIBRARIES = (sqlite3.Error, pyproj.exceptions.ProjError, shapely.errors.GEOSException)
+GRID_FILE = re.compile(r'(?:PARAMETERFILE\["[^"]*","|grids=|file=)([^" ]*[/\\:][^" ]*)')  # beyond PROJ's own folder
 MOST_DEG, MOST_M = (720.0, 90.1), (1e9, 1e9)  # of x and y
 USUAL_NAMES = ("name", "plot", "plot_name", "plot_id", "plotid", "id", "label")
 _OF_CROPS = ("crop", "crop_type", "species", "category", "land_cover", "landcover", "type", "code", "name")
@@ -113,6 +120,8 @@ def _check_coordinates(table: geopandas.GeoDataFrame) -> None:
         raise ValueError("it has no CRS (a shapefile needs a .prj file)")
     if not (crs.is_geographic or crs.is_projected):
         raise ValueError(f"its CRS {crs.name} is neither geographic nor projected")
+    if named := GRID_FILE.search(crs.to_wkt()):
+        raise ValueError(f"its CRS {crs.name} names the grid file {named[1]}; give one of EPSG")
     pyproj.Transformer.from_crs(crs, WGS84)  # fails where PROJ lacks a grid
     places = shapely.get_coordinates(table.geometry)
     wrong = ~(np.abs(places) <= (MOST_DEG if crs.is_geographic else MOST_M)).all(axis=1)
@@ -129,6 +138,8 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
     with path.open("rb") as file:
         head = file.read(100)
     if head.startswith(SQLITE_MAGIC) and head[68:70] == GEOPACKAGE_ID:
+        _check_parts(path, [f"{path.name}{end}" for end in ("-wal", "-journal", "-shm")])
+        _check_tables(path)
         address = f"GPKG:{path.absolute()}"
         layers = [str(name) for name, kind in pyogrio.list_layers(address) if kind is not None]
         found = layers[0] if layer is None and len(layers) == 1 else layer
@@ -137,6 +148,9 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
             raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{[*layers, 'LAYER'][0]}")
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(address, layer=found))
     if head.startswith(SHAPEFILE_MAGIC) and path.suffix.lower() == ".shp":
+        _check_parts(path, [f"{path.stem}{end}" for part in SHAPEFILE_PARTS for end in (part, part.upper())])
+        if "!" in str(path.absolute()):
+            raise ValueError('a "!" in its path stands for an archive; rename that folder')
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(path.absolute()))
     if not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         raise ValueError("its content is none of GeoJSON, GeoPackage and shapefile")
@@ -144,6 +158,22 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
         return _read_geojson(path.read_text(encoding="utf-8-sig"))
     except (AttributeError, KeyError, TypeError):
         raise ValueError("it is no valid GeoJSON") from None
+
+
+def _check_parts(path: Path, names: Iterable[str]) -> None:
+    """Refuse parts of a file that are no files, or links out of its folder (SceneError, ValueError)."""
+    for part in map(path.with_name, names):
+        if part.exists() and not within(path, part).is_file():
+            raise ValueError(f"{part} is no file")
+
+
+def _check_tables(path: Path) -> None:
+    """Raise ValueError for a table that a module of SQLite fills from another file; rtree and fts are indices."""
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as file:
+        made = file.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+    for name, sql in made:
+        if VIRTUAL.match(sql) and not INDEX.match(sql):
+            raise ValueError(f"its table {name} may read other files")
 
 
 def _read_geojson(text: str) -> geopandas.GeoDataFrame:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -103,6 +104,7 @@ def image(here: Path) -> Opened:
         (here / f"{name}.tif").rename(here / name)
     (here / "a.tfw").write_text("1\n0\n0\n-1\n400000\n5000000\n")
     (here / "a.tif.aux.xml").write_text("<PAMDataset></PAMDataset>")
+    (here / "LC08_MTL.txt").write_text("GROUP = L1_METADATA_FILE\nEND\n")  # as beside LC08_B2.tif
     return lambda: open_cube_source(here / "a.tif")
 
 
@@ -117,8 +119,9 @@ LAYOUTS: dict[Callable[[Path], Opened], tuple[str, ...]] = {
     labelled: ("labels/001.png", "labels", "scene.toml"),
     stated: ("more/a.png", "more", "nm.txt", "scene.toml"),
     named_array: ("gt.mat",),
-    store: ("cube.zarr",),
+    store: ("cube.zarr", "cube.zarr/zarr.json", "cube.zarr/c/0/0"),
     training: ("images/1.png", "images", "labels/1.png", "labels"),
+    image: ("a.tif.msk", "a.tif.ovr", "a.tfw", "a.tif.aux.xml", "LC08_MTL.txt"),
 }
 
 
@@ -159,6 +162,16 @@ def test_scene_toml_names_relative_files(tmp_path: Path) -> None:
         settings.write_text(line)
         with pytest.raises(SceneError, match=r"scene.toml: .* is an absolute path; write it relative to"):
             open_scene_file(tmp_path / "data" / "a.png")
+
+
+@pytest.mark.parametrize("name", ["a.tfw", "LC08_MTL.txt"])
+def test_a_pipe_beside_an_image_is_refused(tmp_path: Path, name: str) -> None:
+    """Reading it would never end."""
+    opened = image(tmp_path)
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(SceneError, match=rf"{name} is no file; move it elsewhere"):
+        opened()
 
 
 @pytest.mark.parametrize("place", ["a.tif", "a.tif.aux.xml", "a.tif.msk", "a.tif.ovr"])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
@@ -125,11 +127,55 @@ def test_a_file_by_another_driver_contacts_no_server(
         read_zones(str(tmp_path / name))
 
 
+@pytest.mark.parametrize(
+    "sql",
+    ["CREATE VIRTUAL TABLE v USING VirtualShape('/data/z', 'UTF-8', 32632)", "create/**/\nvirtual table v using x"],
+)
+def test_a_geopackage_reads_no_other_file(sql: str, tmp_path: Path) -> None:
+    """Tables that a module of SQLite fills are refused; the index of shapes is none of them."""
+    path = written(tmp_path / "z.gpkg", [SQUARE])
+    assert read_zones(path).shapes["1"].area == 100
+    with closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA writable_schema = ON")
+        file.execute("INSERT INTO sqlite_master VALUES ('table', 'v', 'v', 0, ?)", [sql])
+        file.commit()
+    with pytest.raises(ZoneError, match="its table v may read other files"):
+        read_zones(path)
+
+
 def test_a_table_without_shapes_is_no_layer(tmp_path: Path) -> None:
     """GIS programs store styles beside the only layer."""
     path = written(tmp_path / "z.gpkg", [SQUARE])
     pyogrio.write_dataframe(pd.DataFrame({"style": ["red"]}), path, layer="layer_styles")
     assert list(read_zones(path).shapes) == ["1"]
+
+
+@pytest.mark.parametrize("grid", ["/data/a.gsb", "http://127.0.0.1:9/a.gsb", "../a.gsb"])
+def test_a_crs_names_no_file(grid: str, tmp_path: Path) -> None:
+    """The .prj file of a shapefile may name grids of PROJ alone."""
+    path = written(tmp_path / "z.shp", [SQUARE], crs=f"+proj=utm +zone=32 +ellps=bessel +nadgrids={grid}")
+    with pytest.raises(ZoneError, match=f"names the grid file {grid}; give one of EPSG"):
+        read_zones(path)
+    path = written(tmp_path / "y.shp", [SQUARE], crs="+proj=utm +zone=32 +ellps=bessel +nadgrids=none.gsb")
+    with pytest.raises(ZoneError, match="cannot read"):
+        read_zones(path)
+    path = written(tmp_path / "x.shp", [SQUARE], crs="+proj=utm +zone=32 +ellps=bessel +nadgrids=@null")
+    assert len(read_zones(path).shapes) == 1
+
+
+@pytest.mark.parametrize("part", [".dbf", ".shx", ".prj", ".cpg"])
+def test_parts_of_a_shapefile_lie_in_its_folder(part: str, tmp_path: Path) -> None:
+    """A link out of the folder is refused, and one within is followed."""
+    (home := tmp_path / "in").mkdir()
+    path = written(home / "z.shp", [SQUARE])
+    (home / f"z{part}").rename(home / f"kept{part}")
+    (home / f"z{part}").symlink_to(home / f"kept{part}")
+    assert len(read_zones(path).shapes) == 1
+    (home / f"kept{part}").rename(tmp_path / f"kept{part}")
+    (home / f"z{part}").unlink()
+    (home / f"z{part}").symlink_to(tmp_path / f"kept{part}")
+    with pytest.raises(ZoneError, match=f"z{part} is a link out of its folder"):
+        read_zones(path)
 
 
 @pytest.mark.parametrize(
