@@ -43,7 +43,9 @@ def due_runs(api: str, names: dict[Any, str]) -> dict[tuple[str, datetime], Any]
     week = {"start_time": MONDAY.isoformat(), "end_time": (MONDAY + timedelta(days=7)).isoformat(), "min_runs": 100}
     for deployment in names:
         httpx.post(f"{api}/deployments/{deployment}/schedule", json=week, auth=auth).raise_for_status()
-    past = FlowRunFilter.model_validate({"expected_start_time": {"before_": datetime.now(UTC)}})
+    past = FlowRunFilter.model_validate(
+        {"deployment_id": {"any_": list(names)}, "expected_start_time": {"before_": datetime.now(UTC)}}
+    )
     with get_client(sync_client=True) as asked:
         found = asked.read_flow_runs(flow_run_filter=past)
     due = {(names[run.deployment_id], run.expected_start_time): run for run in found}

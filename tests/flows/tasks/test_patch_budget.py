@@ -113,7 +113,11 @@ def test_a_budget_may_be_a_number_of_multiply_adds() -> None:
         ({"macs": "0.25"}, BudgetError, "such as 50%"),
         ({"macs": "a lot"}, BudgetError, "such as 50%"),
         ({"macs": True}, BudgetError, "such as 50%"),
-        ({"macs": "50%", "scan_step": None, "budget": 0.5}, SettingsError, "leave it out, or --budget, --zoom always"),
+        (
+            {"macs": "50%", "scan_step": None, "budget": 0.5},
+            SettingsError,
+            "leave it out, or --budget and --zoom always",
+        ),
         ({"macs": "50%", "extent": "0:1-9"}, SettingsError, "a whole field, 'extent' covers a part"),
     ],
 )
