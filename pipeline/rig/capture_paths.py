@@ -23,6 +23,7 @@ from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 Floats = NDArray[Any]  # float64
 Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]
 STAMP_MS = 1.5e-3  # between a frame's time and its stamp in whole microseconds, counted from that of another frame
+MOST_PERIOD_ERROR = 0.05  # of a frame period: clocks differ by far less
 REFERENCES = "references"  # prefix of a capture for the dark and white frames in its folder
 
 
@@ -139,7 +140,8 @@ class LocatedLines:
 def locate_lines(captured: CapturedLines, path: CapturePath, taken: CaptureRecord, camera: LineCamera) -> LocatedLines:
     """Return the row and position of each line of the path, up to the last complete one.
 
-    Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction.
+    Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction. Raises RigError:
+    their time stamps contradict the frame period.
     """
     number = captured.times.frame
     if (number >= 0).any():
@@ -166,7 +168,7 @@ def positions_by_time(times: LineTimes, middle: Floats, taken: CaptureRecord, ex
     Frames count from the capture's first. ``middle`` (line, 2) are the path's positions at mid exposure, ``exposed``
     has exposure and frame period. The delay between a command and what it starts is unknown, so a constant offset of
     the lines remains; registration corrects it. Before and after its path the mirror holds the first and the last
-    position. Raises UnusableCaptureError: the time stamps go back.
+    position. Raises UnusableCaptureError: the time stamps go back. Raises RigError: they contradict the frame period.
     """
     period_s = exposed.frame_ms * 1e-3
     starts, known = _frame_starts(times, exposed.frame_ms)
@@ -200,6 +202,16 @@ def _frame_starts(times: LineTimes, period_ms: float) -> tuple[Floats, NDArray[n
         return by_period, times.frame >= 0
     if (np.diff(times.stamp_us[known]) < 0).any():
         raise UnusableCaptureError("the time stamps of its frames go back; was the camera's clock set? Capture again")
+    frames = np.diff(times.frame[known])
+    steps_ms = np.diff(times.stamp_us[known])[frames > 0] * 1e-3
+    if len(steps_ms):  # both are off, so that neither dropped frames nor stamps of a computer are the reason
+        found = np.median(steps_ms / frames[frames > 0]), steps_ms.sum() / frames[frames > 0].sum()
+        if min(abs(ms / period_ms - 1) for ms in found) > MOST_PERIOD_ERROR:
+            raise RigError(
+                f"the time stamps of its frames are {found[0]:g} ms apart, the camera was set to a frame period of "
+                f"{period_ms:g} ms; are they in microseconds, and does the camera keep that period? Mend its driver or "
+                "its settings, then run again: the capture is kept"
+            )
     first = int(np.flatnonzero(known)[0])
     by_stamp = by_period[first] + (times.stamp_us - times.stamp_us[first]) * 1e-3 / period_ms
     near = np.abs(by_stamp - by_period) * period_ms <= STAMP_MS
