@@ -72,7 +72,7 @@ def check_mirror(connect: Callable[[], MirrorDriver], *, move: bool = False) -> 
         if isinstance(mirror, MirrorController):
             rows = [CheckRow("mirror", CONNECT, mirror.identity), _ask("mirror", "status", partial(_status, mirror))]
         else:
-            rows = [CheckRow("mirror", CONNECT, f"{type(mirror).__name__} is there")]
+            rows = [CheckRow("mirror", CONNECT, f"{getattr(mirror, 'name', type(mirror).__name__)} is there")]
         if move and works(rows, "mirror"):
             rows += _move(mirror)
         elif move:

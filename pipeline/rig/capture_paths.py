@@ -140,8 +140,7 @@ class LocatedLines:
 def locate_lines(captured: CapturedLines, path: CapturePath, taken: CaptureRecord, camera: LineCamera) -> LocatedLines:
     """Return the row and position of each line of the path, up to the last complete one.
 
-    Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction. Raises RigError:
-    their time stamps contradict the frame period.
+    Raises UnusableCaptureError: frames cannot be assigned to mirror positions without contradiction.
     """
     number = captured.times.frame
     if (number >= 0).any():
@@ -202,16 +201,13 @@ def _frame_starts(times: LineTimes, period_ms: float) -> tuple[Floats, NDArray[n
         return by_period, times.frame >= 0
     if (np.diff(times.stamp_us[known]) < 0).any():
         raise UnusableCaptureError("the time stamps of its frames go back; was the camera's clock set? Capture again")
-    frames = np.diff(times.frame[known])
-    steps_ms = np.diff(times.stamp_us[known])[frames > 0] * 1e-3
-    if len(steps_ms):  # both are off, so that neither dropped frames nor stamps of a computer are the reason
-        found = np.median(steps_ms / frames[frames > 0]), steps_ms.sum() / frames[frames > 0].sum()
-        if min(abs(ms / period_ms - 1) for ms in found) > MOST_PERIOD_ERROR:
-            raise RigError(
-                f"the time stamps of its frames are {found[0]:g} ms apart, the camera was set to a frame period of "
-                f"{period_ms:g} ms; are they in microseconds, and does the camera keep that period? Mend its driver or "
-                "its settings, then run again: the capture is kept"
-            )
+    frames, steps_ms = np.maximum(np.diff(times.frame[known]), 1), np.diff(times.stamp_us[known]) * 1e-3
+    found_ms = (np.median(steps_ms / frames), steps_ms.sum() / frames.sum()) if len(frames) else (period_ms,)
+    if min(abs(ms / period_ms - 1) for ms in found_ms) > MOST_PERIOD_ERROR:  # neither by dropped frames nor by jitter
+        raise RigError(
+            f"the time stamps of its frames are {found_ms[0]:g} ms apart, the camera was set to a frame period of "
+            f"{period_ms:g} ms; are they in microseconds, and does it keep that period? The capture is kept"
+        )
     first = int(np.flatnonzero(known)[0])
     by_stamp = by_period[first] + (times.stamp_us - times.stamp_us[first]) * 1e-3 / period_ms
     near = np.abs(by_stamp - by_period) * period_ms <= STAMP_MS

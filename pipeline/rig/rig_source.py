@@ -53,8 +53,8 @@ class RigSource:
 
     ``open_devices`` connects both; they are closed when a session, or a call outside of one, ends. A fake camera sees
     the lines of ``seen``. ``keep`` opens a folder for the camera's files and the journal; that of an earlier process
-    continues its captures. ``say`` gets the present step while no line comes: upload, capture or transfer; ``note`` what
-    the user has to know of the references.
+    continues its captures. ``say`` gets the present step while no line comes: upload, capture or transfer; ``note``
+    gets what is odd about the references.
     """
 
     camera: LineCamera
