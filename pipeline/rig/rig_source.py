@@ -216,8 +216,8 @@ class RigSource:
         frames = runner.devices.camera.references(folder, self._kept)
         if missing := [kind for kind in ("dark", "white") if kind not in frames]:
             raise RigError(
-                f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
-                "own program, then run again"
+                f"the camera gives no {' and no '.join(missing)} frame of {folder}; take both, by its driver or with "
+                "its own program, then run again"
             )
         exposure_ms = exposing(self.camera, sweep).exposure_ms
         dark, white = frames["dark"], frames["white"]
