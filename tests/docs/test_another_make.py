@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from spectral.io import envi
 
-from spectralzoom.flows.cli.rig_commands import check_camera
+from spectralzoom.flows.cli.rig_commands import check_camera, try_capture
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.pipeline.errors import RigError, SettingsError
 from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.scan import line_positions
@@ -154,6 +155,20 @@ def test_a_camera_program_that_does_not_run_ends_in_one_message(tmp_path: Path) 
 WHOLE = np.zeros((FINE.lines, 48, 3), np.uint16)
 KNOWN = LineTimes(np.arange(FINE.lines), np.arange(FINE.lines) * 100_000)
 MEANS = {"dark": WHOLE[0].astype(np.float32)}
+
+
+@pytest.mark.usefixtures("module")
+def test_the_check_takes_lines_and_references(tmp_path: Path) -> None:
+    """The scene's overexposed white is a warning; lines of another size than the settings' are an error."""
+    _, camera, program = folder_rig(tmp_path / "incoming")
+    wanted = Settings(source="rig", scene="field", size=(48, 40), camera=CAMERA, wavelengths=(460.0, 550.0, 640.0))
+    row = try_capture(lambda: camera, wanted, program.seen.clock)
+    assert (row.verdict, row.came) == ("warn", "20 of 20 lines, dark and white frames")
+    assert row.mend.startswith("references-0: the white frame is at full scale")
+    row = try_capture(lambda: camera, wanted.but(wavelengths=(460.0, 550.0)), program.seen.clock)
+    assert "holds lines of (48, 3) (sample, band), the settings say (48, 2)" in row.came
+
+
 FAULTS: dict[str, tuple[str, object, str]] = {
     "cable": ("fetch", OSError("cable pulled"), "OSError: cable pulled"),
     "key": ("references", KeyError("nope"), "KeyError: 'nope'"),
