@@ -1,7 +1,8 @@
 """The verb `rig check`, a table of questions to both devices and of answers.
 
-Every driver has to connect; with ``move`` the mirror visits the corners of a small square, else nothing moves and
-nothing is set. The shipped drivers are asked for more: identity, status, files.
+Every driver has to connect. With ``move`` the mirror visits the corners of a small square, and with ``capture`` the
+camera takes a few lines; else nothing moves and nothing is set. The shipped drivers are asked for more: identity,
+status, files.
 """
 
 from __future__ import annotations
@@ -13,26 +14,38 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from spectralzoom.flows.settings.flags import AsJson, Switch
-from spectralzoom.flows.settings.settings import load_settings
+from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, stderr
-from spectralzoom.pipeline.errors import PipelineError, RigError
+from spectralzoom.pipeline.errors import PipelineError, RigError, SettingsError
 from spectralzoom.pipeline.rig.camera.camera_files import log_in
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
 from spectralzoom.pipeline.rig.capture_runner import SETTLE_S
-from spectralzoom.pipeline.rig.drivers import CameraDriver, MirrorDriver, open_camera_driver, open_mirror_driver
+from spectralzoom.pipeline.rig.drivers import (
+    CameraDriver,
+    MirrorDriver,
+    RigDevices,
+    open_camera_driver,
+    open_mirror_driver,
+)
+from spectralzoom.pipeline.rig.fakes import FakeMirror
 from spectralzoom.pipeline.rig.mirror_controller import MirrorController
+from spectralzoom.pipeline.rig.rig_source import RigSource
+from spectralzoom.pipeline.rig.transports import SYSTEM_CLOCK, Clock
+from spectralzoom.pipeline.source import AT_REST
 
 Device = Literal["mirror", "camera"]
 
 SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 0.05 of the middle
 CONNECT = "connect"
+TRIED_LINES = 20
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 
@@ -72,7 +85,7 @@ def check_mirror(connect: Callable[[], MirrorDriver], *, move: bool = False) -> 
         if isinstance(mirror, MirrorController):
             rows = [CheckRow("mirror", CONNECT, mirror.identity), _ask("mirror", "status", partial(_status, mirror))]
         else:
-            rows = [CheckRow("mirror", CONNECT, f"{type(mirror).__name__} is there")]
+            rows = [CheckRow("mirror", CONNECT, f"{getattr(mirror, 'name', type(mirror).__name__)} is there")]
         if move and works(rows, "mirror"):
             rows += _move(mirror)
         elif move:
@@ -97,6 +110,26 @@ def check_camera(connect: Callable[[], CameraDriver]) -> list[CheckRow]:
     if not isinstance(camera, HeadwallCamera):
         return [row]
     return [row, _ask("camera", f"log in to its files, port {camera.server.port}", partial(log_in, camera.server))]
+
+
+def try_capture(connect: Callable[[], CameraDriver], wanted: Settings, clock: Clock = SYSTEM_CLOCK) -> CheckRow:
+    """Take references and a few lines, as a survey does, with the mirror left alone. Errors become a row."""
+    if wanted.wavelengths is None:
+        raise SettingsError("--capture needs a settings file with wavelengths and the table [camera] of a survey")
+    notes: list[str] = []
+
+    def devices(_: object) -> RigDevices:
+        return RigDevices(FakeMirror(clock), connect(), clock)
+
+    source = RigSource(wanted.camera, np.array(wanted.wavelengths), devices, rig=wanted.rig, note=notes.append)
+    try:
+        with source.session():
+            source.references(AT_REST)
+            lines = list(source.lines(replace(AT_REST, name="check", lines=TRIED_LINES)))
+    except RigError as error:
+        return failed("camera", "capture", error)
+    came = f"{sum(line.valid for line in lines)} of {TRIED_LINES} lines, dark and white frames"
+    return CheckRow("camera", "capture", came, "warn" if notes else "ok", "; ".join(notes))
 
 
 def _status(mirror: MirrorController) -> str:
@@ -136,6 +169,7 @@ def check(
     port: str | None = None,
     camera: str | None = None,
     move: Switch = False,
+    capture: Switch = False,
     as_json: AsJson = False,
 ) -> int:
     """Connect to mirror and camera, read their state, and report problems with remedies.
@@ -152,6 +186,8 @@ def check(
         Address of the camera: 10.0.65.50.
     move
         Also move the mirror along a small square, within 0.05 of the middle of its range. It stops at 0; 0.
+    capture
+        Also take dark and white frames and 20 lines with the camera, and compare them with the settings file.
     """
     wanted = load_settings(settings)
     rig = wanted.rig if port is None else replace(wanted.rig, port=port)
@@ -165,6 +201,8 @@ def check(
     if camera_asked:
         with stderr.status(f"asking the camera at {escape(rig.host)}"):
             rows += check_camera(partial(open_camera_driver, rig))
+            if capture and works(rows, "camera"):
+                rows.append(try_capture(partial(open_camera_driver, rig), wanted))
     good = [works(rows, device) for device in dict.fromkeys(row.device for row in rows)]
     code = DONE if all(good) else PARTLY if any(good) else FAILED
     verdicts = [row.verdict for row in rows]
@@ -172,6 +210,7 @@ def check(
         "port": rig.port if mirror_asked else None,
         "camera": rig.host if camera_asked else None,
         "move": move,
+        "capture": capture,
         "rows": [asdict(row) for row in rows],
         "failed": verdicts.count("fail"),
         "warned": verdicts.count("warn"),

@@ -107,6 +107,7 @@ def rig_source(settings: Settings, name: str, simulated: SimulatedSource, hold: 
         field_name=name,
         seen=simulated if fake else None,
         say=current_observer().say,
+        note=current_observer().note,
     )
 
 

@@ -87,8 +87,8 @@ def weights_path(settings: Settings) -> Path:
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know farm, scouting and trial only;"
-            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors. In one pass,"
-            " --until mosaic needs none"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors. A mosaic of"
+            " one pass needs none: --until mosaic --scan-step 1"
         )
     return shipped_weights()
 

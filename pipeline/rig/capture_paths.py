@@ -23,6 +23,7 @@ from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 Floats = NDArray[Any]  # float64
 Span = tuple[float, float]  # moments between which a command took effect: sent and acknowledged [s]
 STAMP_MS = 1.5e-3  # between a frame's time and its stamp in whole microseconds, counted from that of another frame
+MOST_PERIOD_ERROR = 0.05  # of a frame period: clocks differ by far less
 REFERENCES = "references"  # prefix of a capture for the dark and white frames in its folder
 
 
@@ -166,7 +167,7 @@ def positions_by_time(times: LineTimes, middle: Floats, taken: CaptureRecord, ex
     Frames count from the capture's first. ``middle`` (line, 2) are the path's positions at mid exposure, ``exposed``
     has exposure and frame period. The delay between a command and what it starts is unknown, so a constant offset of
     the lines remains; registration corrects it. Before and after its path the mirror holds the first and the last
-    position. Raises UnusableCaptureError: the time stamps go back.
+    position. Raises UnusableCaptureError: the time stamps go back. Raises RigError: they contradict the frame period.
     """
     period_s = exposed.frame_ms * 1e-3
     starts, known = _frame_starts(times, exposed.frame_ms)
@@ -200,6 +201,13 @@ def _frame_starts(times: LineTimes, period_ms: float) -> tuple[Floats, NDArray[n
         return by_period, times.frame >= 0
     if (np.diff(times.stamp_us[known]) < 0).any():
         raise UnusableCaptureError("the time stamps of its frames go back; was the camera's clock set? Capture again")
+    frames, steps_ms = np.maximum(np.diff(times.frame[known]), 1), np.diff(times.stamp_us[known]) * 1e-3
+    found_ms = (np.median(steps_ms / frames), steps_ms.sum() / frames.sum()) if len(frames) else (period_ms,)
+    if min(abs(ms / period_ms - 1) for ms in found_ms) > MOST_PERIOD_ERROR:  # neither by dropped frames nor by jitter
+        raise RigError(
+            f"the time stamps of its frames are {found_ms[0]:g} ms apart, the camera was set to a frame period of "
+            f"{period_ms:g} ms; are they in microseconds, and does it keep that period? The capture is kept"
+        )
     first = int(np.flatnonzero(known)[0])
     by_stamp = by_period[first] + (times.stamp_us - times.stamp_us[first]) * 1e-3 / period_ms
     near = np.abs(by_stamp - by_period) * period_ms <= STAMP_MS

@@ -2,7 +2,8 @@
 
 `MirrorController` and `HeadwallCamera` implement them, and the fakes of `pipeline.rig.fakes`. The table [rig] may name
 the drivers of another make by their import path. Times are those of the clock that a driver was opened with. Every
-method may raise `DeviceGone` and `DeadlinePassed`, besides the errors that it states; all are kinds of `RigError`.
+method may raise `DeviceGone` and `DeadlinePassed`, besides the errors that it states; all are kinds of `RigError`. Any
+other exception of a driver of another make is raised as `DriverFailed`.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import pkgutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Protocol, cast
+from functools import partial
+from typing import Any, Protocol, cast
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.errors import PipelineError, RigError, SettingsError
 from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
 from spectralzoom.pipeline.rig.camera.camera_files import Capture, Kept, Progress
 from spectralzoom.pipeline.rig.camera.headwall_camera import HeadwallCamera
@@ -200,10 +203,12 @@ def _open_other(rig: SurveyRig, setting: str, protocol: type, clock: Clock) -> o
     factory, name = _imported(rig, setting), getattr(rig, setting)
     try:
         device = factory(rig, clock)
-    except TypeError as error:
-        raise SettingsError(
-            f"rig.{setting} = {name!r} does not open a driver ({error}). Expected a function of the table [rig] and a "
-            "clock"
+    except PipelineError:
+        raise
+    except Exception as error:
+        raise (SettingsError if isinstance(error, TypeError) else DriverFailed)(
+            f"rig.{setting} = {name!r} does not open a driver ({type(error).__name__}: {error}). Expected a function "
+            "of the table [rig] and a clock, and a device that answers"
         ) from error
     missing = [one for one in vars(protocol) if not one.startswith("_") and not callable(getattr(device, one, None))]
     if missing:
@@ -211,4 +216,51 @@ def _open_other(rig: SurveyRig, setting: str, protocol: type, clock: Clock) -> o
             f"rig.{setting} = {name!r} gives a {type(device).__name__} without {', '.join(missing)}. Expected every "
             f"method of {protocol.__name__} in {protocol.__module__}"
         )
-    return device
+    return OtherMake(device, name)
+
+
+class DriverFailed(RigError):  # noqa: N818 - the name states the case
+    """A driver of another make raised an exception of its own, or returned what its protocol does not allow."""
+
+
+@dataclass(frozen=True)
+class OtherMake:
+    """A driver of another make, ``name`` as in the settings, that is named where it fails or answers wrongly."""
+
+    device: object
+    name: str
+
+    def __getattr__(self, method: str) -> Callable[..., object]:
+        return partial(_call, self.name, method, getattr(self.device, method))
+
+
+def _call(name: str, method: str, called: Callable[..., object], *given: object, **named: object) -> object:
+    """Call a driver's method; DriverFailed in place of any exception that has no message for the user."""
+    try:
+        answer = called(*given, **named)
+        _check_answer(method, answer)
+    except PipelineError:
+        raise
+    except Exception as error:
+        cause = f"{type(error).__name__}: {error}"
+        raise DriverFailed(f"{name}: {method} failed ({cause}); look at the device, or mend the driver") from error
+    return answer
+
+
+_TYPES: dict[str, Any] = {"capture": Capture, "is_capturing": bool, "fetch": CapturedLines, "references": dict}
+
+
+def _check_answer(method: str, answer: object) -> None:
+    """Check type, shape and numbers of an answer of a driver; TypeError where the protocol does not allow them."""
+    if not isinstance(answer, expected := _TYPES.get(method, object)):
+        raise TypeError(f"expected {expected.__name__}, got {type(answer)}")
+    if isinstance(answer, CapturedLines):
+        values, times = answer.values, answer.times
+        if values.ndim != 3 or values.dtype != np.uint16:
+            raise TypeError(f"expected (line, sample, band) uint16, got {values.shape} {values.dtype.str}")
+        for one in (times.frame, times.stamp_us):
+            if one.shape != values.shape[:1] or one.dtype.kind != "i":
+                raise TypeError(f"expected {len(values)} int64 numbers and stamps, got {one.shape} {one.dtype}")
+    for kind, one in answer.items() if isinstance(answer, dict) else ():
+        if not isinstance(one, MeanFrame) or one.mean.ndim != 2 or one.stuck.shape != one.mean.shape:
+            raise TypeError(f"expected a MeanFrame (sample, band) of {kind}, got {type(one)}")

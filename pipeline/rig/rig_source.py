@@ -53,7 +53,8 @@ class RigSource:
 
     ``open_devices`` connects both; they are closed when a session, or a call outside of one, ends. A fake camera sees
     the lines of ``seen``. ``keep`` opens a folder for the camera's files and the journal; that of an earlier process
-    continues its captures. ``say`` gets the present step while no line comes: upload, capture or transfer.
+    continues its captures. ``say`` gets the present step while no line comes: upload, capture or transfer; ``note``
+    gets what is odd about the references.
     """
 
     camera: LineCamera
@@ -65,6 +66,7 @@ class RigSource:
     field_name: str = ""
     seen: SimulatedSource | None = None
     say: Say = lambda step: None
+    note: Say = LOG.warning
     unknown: list[str] = field(default_factory=list)  # why the rig's state is unknown; shared by copies of this source
     name = "rig"
 
@@ -214,15 +216,15 @@ class RigSource:
         frames = runner.devices.camera.references(folder, self._kept)
         if missing := [kind for kind in ("dark", "white") if kind not in frames]:
             raise RigError(
-                f"{folder} on the camera holds no {' and no '.join(missing)} reference; take both with the camera's "
-                "own program, then run again"
+                f"the camera gives no {' and no '.join(missing)} frame of {folder}; take both, by its driver or with "
+                "its own program, then run again"
             )
         exposure_ms = exposing(self.camera, sweep).exposure_ms
         dark, white = frames["dark"], frames["white"]
         whole, notes = as_references(dark, white, white_reference=self.rig.white_reference, exposure_ms=exposure_ms)
         self._check_size(whole.dark.shape, folder)
         for note in (*notes, *full_scale_notes(whole.white, self.camera.full_scale_dn)):
-            self.say(note)
+            self.note(f"{folder}: {note}")
         return whole
 
     def _read(self, runner: CaptureRunner, taken: CaptureRecord, line: int) -> Iterator[Line]:

@@ -7,21 +7,32 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from spectral.io import envi
 
-from spectralzoom.flows.cli.rig_commands import check_camera
+from spectralzoom.flows.cli.rig_commands import check_camera, try_capture
+from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.pipeline.errors import RigError, SettingsError
+from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.scan import line_positions
+from spectralzoom.pipeline.rig.camera.camera_cubes import CapturedLines
 from spectralzoom.pipeline.rig.camera.camera_files import KeptInMemory
 from spectralzoom.pipeline.rig.capture_paths import REFERENCES, capture_prefix
 from spectralzoom.pipeline.rig.device_settings import SurveyRig
-from spectralzoom.pipeline.rig.drivers import CameraDriver, RigDevices, open_camera_driver, open_mirror_driver
+from spectralzoom.pipeline.rig.drivers import (
+    CameraDriver,
+    DriverFailed,
+    OtherMake,
+    RigDevices,
+    open_camera_driver,
+    open_mirror_driver,
+)
 from spectralzoom.pipeline.rig.fakes import FakeCamera, FakeClock, FakeMirror
 from spectralzoom.pipeline.rig.rig_source import RigSource
-from spectralzoom.pipeline.rig.transports import StateUnknown
+from spectralzoom.pipeline.rig.transports import Clock, StateUnknown
 from tests.docs.pages import DOCS, blocks_of
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 
@@ -139,6 +150,60 @@ def test_a_camera_program_that_does_not_run_ends_in_one_message(tmp_path: Path) 
         camera.fetch("lines-0", KeptInMemory())
     assert list(program.folder.iterdir()) == []
     assert [row.came for row in check_camera(lambda: camera)] == ["no capture runs"]
+
+
+WHOLE = np.zeros((FINE.lines, 48, 3), np.uint16)
+KNOWN = LineTimes(np.arange(FINE.lines), np.arange(FINE.lines) * 100_000)
+MEANS = {"dark": WHOLE[0].astype(np.float32)}
+
+
+@pytest.mark.usefixtures("module")
+def test_the_check_takes_lines_and_references(tmp_path: Path) -> None:
+    """The scene's overexposed white is a warning; lines of another size than the settings' are an error."""
+    _, camera, program = folder_rig(tmp_path / "incoming")
+    wanted = Settings(source="rig", scene="field", size=(48, 40), camera=CAMERA, wavelengths=(460.0, 550.0, 640.0))
+    row = try_capture(lambda: camera, wanted, program.seen.clock)
+    assert (row.verdict, row.came) == ("warn", "20 of 20 lines, dark and white frames")
+    assert row.mend.startswith("references-0: the white frame is at full scale")
+    row = try_capture(lambda: camera, wanted.but(wavelengths=(460.0, 550.0)), program.seen.clock)
+    assert "holds lines of (48, 3) (sample, band), the settings say (48, 2)" in row.came
+
+
+FAULTS: dict[str, tuple[str, object, str]] = {
+    "cable": ("fetch", OSError("cable pulled"), "OSError: cable pulled"),
+    "key": ("references", KeyError("nope"), "KeyError: 'nope'"),
+    "name": ("capture", "lines-0", "TypeError: expected Capture, got <class 'str'>"),
+    "nothing": ("is_capturing", None, "TypeError: expected bool, got <class 'NoneType'>"),
+    "array": ("fetch", WHOLE, "TypeError: expected CapturedLines, got <class 'numpy.ndarray'>"),
+    "float": ("fetch", CapturedLines(WHOLE.astype(float), 0, KNOWN), r"TypeError: .* uint16, got \(17, 48, 3\) <f8"),  # type: ignore[arg-type]
+    "short": ("fetch", CapturedLines(WHOLE[1:], 0, KNOWN), "TypeError: expected 16 int64 numbers and stamps, got .17,"),
+    "means": ("references", MEANS, r"TypeError: expected a MeanFrame .* of dark, got <class 'numpy.ndarray"),
+}
+
+
+@pytest.mark.usefixtures("module")
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_a_driver_is_one_message(tmp_path: Path, name: str) -> None:
+    """It names the driver, its method and the cause; a capture is not taken again for it."""
+    method, does, words = FAULTS[name]
+    source, camera, _ = folder_rig(tmp_path / "incoming")
+    assert isinstance(camera, OtherMake)
+    faulty = Mock(side_effect=does) if isinstance(does, Exception) else Mock(return_value=does)
+    setattr(camera.device, method, faulty)
+    with pytest.raises(DriverFailed, match=rf"^{MODULE}:open_camera: {method} failed \({words}.*; look at the device"):
+        assert (list(source.lines(FINE)), source.references(FINE)) == ([], None)
+    assert faulty.call_count == 1
+
+
+def unplugged(rig: SurveyRig, clock: Clock) -> None:
+    raise OSError("no route to the host")
+
+
+def test_a_driver_that_cannot_be_opened_is_named() -> None:
+    """Its function's own exception is the cause."""
+    name = f"{__name__}:unplugged"
+    with pytest.raises(DriverFailed, match=f"rig.camera_driver = '{name}' does not .*OSError: no route to the host"):
+        open_camera_driver(SurveyRig(camera_driver=name))
 
 
 BROKEN = {

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.frame_indices import LineTimes
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Sweep
@@ -77,6 +78,14 @@ def test_a_slow_clock_of_the_camera_is_followed():
     """Stamps count, where they differ from the frame's period by more than their rounding."""
     found = located(frames(drift=1e-3))
     np.testing.assert_allclose(found.position, at(np.arange(LINES) / (1 + 1e-3)), atol=1e-6)
+
+
+def test_stamps_that_contradict_the_frame_period_are_refused():
+    """Stamps of a computer, which gets two frames at a time, are none."""
+    whole = frames()
+    with pytest.raises(RigError, match="are 5 ms apart, the camera was set to a frame period of 10 ms"):
+        located(replace(whole, stamp_us=whole.stamp_us // 2))
+    assert located(replace(whole, stamp_us=whole.stamp_us[np.arange(LINES) // 2 * 2])).valid.all()
 
 
 def test_dropped_frames_do_not_move_other_lines():

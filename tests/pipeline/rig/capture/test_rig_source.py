@@ -102,6 +102,18 @@ def test_references_are_those_of_the_camera(white_at_rest: bool):
     assert rig.mirror.position == ((0.0, 0.0) if white_at_rest else (0.5, 0.5))
 
 
+def test_an_overexposed_white_frame_is_named():
+    """The note begins with the folder on the camera. The small scene's white is at full scale at 100 ms."""
+    rig, notes = SmallRig(), list[str]()
+    source = rig.source(note=notes.append)
+    source.references(replace(FINE, exposure_ms=1.0))
+    assert notes == []
+    source.references(FINE)
+    assert [note.partition(" in ")[0] for note in notes] == [
+        f"{rig.camera.captures[1]}: the white frame is at full scale"
+    ]
+
+
 def test_references_are_fetched_once():
     """All sweeps use one fetch. A source with other files fetches its own."""
     rig = SmallRig()
