@@ -253,11 +253,13 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
-    known = {key: value for key, value in run.settings.items() if key in Settings.model_fields}
-    known |= dict.fromkeys(OF_THE_MACHINE)
+    known = {key: value for key, value in run.settings.items() if key != "notes"} | dict.fromkeys(OF_THE_MACHINE)
     if isinstance(rig := known.get("rig"), Mapping):
         drivers = dict.fromkeys(("mirror_driver", "camera_driver"), FAKE)
         fakes = drivers if all(rig.get(name) == FAKE for name in drivers) else {}
         devices = {**fakes, "port": NO_PORT} if known.get("source") == RIG else {}
         known["rig"] = {name: rig[name] for name in OF_THE_LIGHT if name in rig} | devices
-    return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
+    try:
+        return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
+    except SettingsError as error:
+        raise SettingsError(f"{run.uri} was surveyed by another version: {error}; survey the field anew") from error

@@ -80,6 +80,15 @@ def reprocess(capsys: pytest.CaptureFixture[str]) -> Reprocess:
     return Reprocess(capsys)
 
 
+@pytest.mark.parametrize("changes", [{"zones": {"area": "a.geojson"}}, {"optics": {"keystone_px": 0.1}}])
+def test_settings_of_another_version_are_refused(surveyed: Path, changes: dict[str, Any]) -> None:
+    """None is left out in silence: an area of interest would be surveyed as a whole field."""
+    (run, *_) = Catalogue.read(Archive.open(surveyed, write=False)).runs
+    other = dataclasses.replace(run, receipt={**run.receipt, "settings": {**run.settings, **changes}})
+    with pytest.raises(SettingsError, match=r"another version: unknown setting '(zones|optics.keystone_px)'.*anew"):
+        reprocess_command.asked_again(other, surveyed, None)
+
+
 def test_settings_of_a_run_are_asked_again_without_devices(surveyed: Path) -> None:
     """A run without a rig has the usual table [rig], so that a raster or simulation is not refused for it."""
     for run in Catalogue.read(Archive.open(surveyed, write=False)).runs:
