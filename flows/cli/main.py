@@ -10,7 +10,7 @@ import io
 import os
 import sys
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, UnknownOptionError
 
 from spectralzoom.flows.terminal.processes import (
     TERMINATED,
@@ -70,6 +70,12 @@ def _run(arguments: list[str]) -> int:
         code = app(arguments, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
         what = str(error).partition(" Available commands:")[0].rstrip(".")  # the help lists all commands
+        verb = next(iter(error.command_chain or ()), "")
+        if isinstance(error, UnknownOptionError) and verb in ("survey", "plan", "simulate"):
+            flags = _of_tables(error.token.value)
+            what = (
+                f"{what.partition('.')[0]}. Settings of tables have the name of the table: {flags}" if flags else what
+            )
         say(f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help")
         return SettingsError.exit_code
     except KeyboardInterrupt as error:
@@ -84,6 +90,15 @@ def _run(arguments: list[str]) -> int:
         say(message)
         return code
     return code if isinstance(code, int) else 0
+
+
+def _of_tables(word: str) -> str:
+    """Return the flags of a table, or of the keys of tables, that a word such as ``--exposure-ms`` names."""
+    from spectralzoom.flows.settings.flags import KEYS
+    from spectralzoom.flows.settings.load import flag_of
+
+    own = word.lstrip("-").partition("=")[0].replace("-", "_")
+    return ", ".join(flag_of(key) for key in KEYS if "." in key and own in key.split("."))
 
 
 def build_app(*, listed: bool) -> App:

@@ -85,6 +85,11 @@ def test_every_flag_has_help(verb: str) -> None:
     ("words", "message"),
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
+        (
+            ["survey", "--exposure-ms", "5"],
+            "Unknown option: --exposure-ms. Settings of tables have the name of the table: --camera.exposure-ms; see "
+            "spectralzoom survey --help",
+        ),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
     ],
 )
