@@ -47,6 +47,11 @@ def room_of(name: str) -> str:
     return parts[1] if parts[0] == "spectralzoom" and len(parts) > 1 and parts[1] in MAY_IMPORT else parts[0]
 
 
+def test_settings_read_no_archive_and_no_file_of_a_scene() -> None:
+    """They import nothing of `storage`: what an archive knows is a layer of defaults that its caller gives."""
+    assert [one for one in imports() if one[0].startswith("flows/settings/") and room_of(one[1]) == "storage"] == []
+
+
 def test_imports_go_one_way_and_packages_are_declared() -> None:
     """The order is spectralzoom, flows, models and storage, pipeline; no import is relative or of tests."""
     found = [(file, name, name.split(".")[0]) for file, name in imports()]
