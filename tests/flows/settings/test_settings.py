@@ -220,6 +220,13 @@ def test_a_pose_is_read(toml):
     assert set(table["pose"]) | {"range_m"} == {item.name for item in fields(RigPose)}
 
 
+def test_the_sun_of_a_simulation_stands_over_the_pose():
+    """Without a pose it stands over the usual place."""
+    posed = parse_settings({"pose": POSE}).simulated_rig.sky
+    assert (posed.latitude_deg, posed.longitude_deg) == (POSE["lat_deg"], POSE["lon_deg"])
+    assert Settings().simulated_rig.sky == Sky()
+
+
 def test_a_rig_is_read_from_its_tables(toml):
     """Every table sets its part of the rig; without tables it is the rig at rest in calm, clear air."""
     assert Settings().simulated_rig == Rig()
@@ -384,6 +391,7 @@ def test_parameters_win_over_their_file_unless_they_are_null(toml):
         ({"policy": "mask", "mask": "m.png", "scan_step": 2}, "--scan-step asks for one uniform scan .* --policy is"),
         ({"seconds": 9, "scan_exposure_ms": 25}, "--seconds leaves the choice of the scan .* --scan-exposure-ms makes"),
         ({"scan_exposure_ms": 25}, "--scan-exposure-ms is for lines that you choose: give --scan-step too"),
+        ({"scene": "a.png", "scan_exposure_ms": 25}, "--scan-exposure-ms is of a camera"),
         ({"camera": Optics()}, r"\[camera\]: must be a table"),
         ({"": 5}, "unknown setting --"),
     ],
