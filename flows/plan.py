@@ -297,6 +297,7 @@ def _extent(opened: Field) -> tuple[PassLayout, ExtentChoice | None, Settings, t
         seconds=settings.seconds,
         max_age=settings.max_age,
         left_out=np.logical_or.reduce(masks) if masks else None,
+        scored=not opened.warnings,
     )
     return layout, extent, settings, (note,)
 

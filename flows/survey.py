@@ -55,6 +55,8 @@ def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
     observer = current_observer()
     archive = Archive.open(plan.settings.out)
     archive.reclaim()  # remove incomplete stores of killed runs
+    for warning in plan.field.warnings:
+        observer.warn(warning)
     for note in plan.notes:
         observer.note(note)
     stores = Stores(archive, name=plan.field.name, watch=observer.watch, log=observer.log, finish=tidy_up)

@@ -71,10 +71,10 @@ class Estimate:
     spread: float | None = None  # a standard deviation
 
 
-def estimate_survey(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, dict[str, Any]]:
+def estimate_survey(plan: SurveyPlan, fine: FinePlan | None, unscored: str) -> dict[str, dict[str, Any]]:
     """Return what a survey would take and score, `Estimate`s by the names of `LABELS`; a raster has no seconds.
 
-    ``fine`` is the fine pass, where it is planned already.
+    ``fine`` is the fine pass, where it is planned already; ``unscored`` is why no score is expected, or empty.
     """
     camera = {} if plan.field.raster is not None else _of_camera(plan, fine)
     expected = plan.least_gain is not None  # patches are chosen while the map is drawn
@@ -82,7 +82,7 @@ def estimate_survey(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, dict[s
     every = format_count(plan.work_done(plan.field.kept_patches).total)
     source = f"the patches that other scenes needed; {every} with every patch" if expected else "network and field"
     work = Estimate(plan.work_done(patch_index).total, source, fine is None and plan.chooses and not expected)
-    found = {**camera, "multiply_adds": work, "miou": _score(plan)}
+    found = {**camera, "multiply_adds": work, "miou": Estimate(None, unscored) if unscored else _score(plan)}
     return {name: asdict(one) for name, one in found.items()}
 
 

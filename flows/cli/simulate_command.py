@@ -20,7 +20,7 @@ from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse
 from spectralzoom.flows.stages.effects import choose_effects, load_manifest
 from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.flows.tasks.observer import tidy_up
-from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
+from spectralzoom.flows.tasks.scene import darkness, farm_refusal, open_scene
 from spectralzoom.flows.terminal.figures import counted, format_bytes, format_seconds
 from spectralzoom.flows.terminal.progress import StageProgress, print_json, stderr
 from spectralzoom.models.network.machine import keep_freed_memory
@@ -95,7 +95,7 @@ def open_simulation(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
             f"{settings.scene} has {scene.filled_px} pixels without a finite value, and a simulation needs one "
             "everywhere; fill or crop it, or choose other --bands"
         )
-    return scene, notes
+    return scene, (*darkness(settings), *notes)
 
 
 def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequence[Sweep]) -> tuple[Ref, Ref]:

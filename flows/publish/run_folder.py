@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Control, Products
 from spectralzoom.flows.publish.field_map import field_map
-from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, plots_csv
+from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, map_warnings, plots_csv
 from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
 from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt
 from spectralzoom.flows.publish.report import render_report
@@ -29,7 +29,6 @@ from spectralzoom.flows.stage import Row, Stores
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
 from spectralzoom.flows.stages.score import READING, SCORES, load_plan, read_in_full
-from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.scene import seen_in_training
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
@@ -94,11 +93,6 @@ def make_receipt(
     if (products.class_map.path / READING).exists():  # patches were chosen in the segmentation
         places["attention"] = f"{products.class_map.uri}/{READING}"
     files = (RECEIPT, "quicklook.png", REPORT, *([PLOTS_FILE] if field.zones.plots is not None else []))
-    scans = {
-        "taken": plan.scans.chosen,
-        "best_in_time": plan.scans.best_in_time(plan.passes.coarse_s + fine.seconds),
-        "reference": plan.scans.reference,
-    }  # where there is a table
     return build_receipt(
         survey=field.name,
         source=RASTER if field.source is None else field.source.name,
@@ -118,7 +112,6 @@ def make_receipt(
         effects_total=effects.get("total"),
         products={**places, **{name: f"{uri}/{name}" for name in files}},
         control=None if control is None else control_figures(control),
-        scans={name: as_figures(scan) for name, scan in scans.items() if scan is not None},
         **find_out(plan, products),
     )
 
@@ -188,7 +181,7 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
     return QuicklookData(
         survey=field.name,
         seed=plan.settings.seed,
-        about=fine.reason,
+        about="   ·   ".join([*map("Warning: {}".format, map_warnings(plan, products.class_map)), fine.reason]),
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
         class_map=found.classes,

@@ -71,11 +71,17 @@ def check_scene_there(scene: str) -> None:
 def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene in the light of the settings' sky; arguments, notes and errors as in `_in_clear_light`."""
     scene, notes = _in_clear_light(settings)
-    if settings.source == SIM and settings.sky.started is not None:
-        height = float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
-        if height <= 0:
-            notes += (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
     return scene.in_light(settings.sky.fraction_of_clear), notes
+
+
+def darkness(settings: Settings) -> tuple[str, ...]:
+    """Return the warning that a simulated field is dark; or nothing."""
+    if settings.source != SIM or settings.sky.started is None:
+        return ()
+    height = float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
+    if height > 0:
+        return ()
+    return (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
 
 
 def _in_clear_light(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:

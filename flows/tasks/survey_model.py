@@ -141,8 +141,8 @@ def beyond_training(
     return found
 
 
-def training_note(found: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Return the note that a scene is unlike the training of weights, with the conditions; or nothing."""
+def training_warning(found: Sequence[str], path: Path) -> tuple[str, ...]:
+    """Return the warning that conditions lie outside of the training of weights; or nothing."""
     advice = "Expect a poorer map; train on such labelled scenes: spectralzoom train DATASET -o my.safetensors"
     return (f"outside of the training data of {path.name}: {'; '.join(found)}. {advice}",) if found else ()
 

@@ -226,9 +226,11 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
     train_weights(_request(tmp_path / "cube.npy", out, **choices))
     np.save(tmp_path / "other.npy", factor * values[..., : len(bands)])
     asked = {"scene": str(tmp_path / "other.npy"), "wavelengths": bands, "source": "raster", "weights": str(out)}
-    notes = " ".join(open_field(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
-    assert re.search(note, notes)
-    assert bool(note) == ("of the training" in notes)
+    settings = load_settings(None, asked | {"out": str(tmp_path / "a")})
+    for planning in (False, True):
+        notes = " ".join(open_field(settings, planning=planning).warnings)
+        assert re.search(note, notes)
+        assert bool(note) == ("of the training" in notes)
 
 
 def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Path):
