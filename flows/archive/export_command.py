@@ -168,6 +168,7 @@ def _describe(run: ExportedRun, folder: Path, assets: Assets) -> Any:
     receipt = run.receipt
     start, end = (datetime.fromisoformat(text) for text in run.observed)
     about, warned = f"Survey of {receipt['survey']}", warnings_of(receipt)
+    words = [*map("Warning: {}".format, warned), f"{about} ({receipt['source']} source)."]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a file has no CRS: it gets no place
         item = rio_stac.create_stac_item(
@@ -177,9 +178,7 @@ def _describe(run: ExportedRun, folder: Path, assets: Assets) -> Any:
             assets=assets,
             properties={
                 "title": about,
-                "description": ". ".join(
-                    [*map("Warning: {}".format, warned), f"{about} ({receipt['source']} source)."]
-                ),
+                "description": ". ".join(words),
                 "spectralzoom:warnings": warned,
                 "instruments": [str(receipt["source"])],
                 "created": receipt["finished"],

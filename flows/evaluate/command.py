@@ -16,7 +16,7 @@ from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, su
 from spectralzoom.flows.settings.model_flags import EvaluateFlags
 from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from spectralzoom.flows.terminal.processes import writing
-from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
+from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, show_warnings, table
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
 from spectralzoom.models.weights.files import PLAIN, load_weights
@@ -35,6 +35,7 @@ def run_evaluate(dataset: str, flags: EvaluateFlags, console: Console, *, as_jso
     """Judge with progress on ``console``; print the figures as a table or JSON, and write them to the folder."""
     with StageProgress(console) as progress:
         content = evaluate_weights(dataset, flags, progress.show)
+    show_warnings(content["warnings"], console)
     put_out(content, print_evaluation, as_json=as_json)
     for line in (*(f"note: {note}" for note in content["data_notes"]), *content["files"]):
         show_text(line, console)
@@ -63,6 +64,7 @@ def evaluate_weights(
     jobs = sort_frames(data, candidates, show, named=bool(flags.frames))
     runs = _judge_frames(flags, fractions, data, candidates, jobs.frames, show)
     content = {
+        "warnings": [warning for one in candidates for warning in one.warnings],
         "dataset": data.law,
         "weights": [
             {"file": one.path.name, "key": one.described.key[:16], "frames": list(run)}
@@ -77,7 +79,7 @@ def evaluate_weights(
             fractions,
             candidates[0].described.config.patch,
         ),
-        "data_notes": [*data.notes, *jobs.notes, *(note for one in candidates for note in one.notes)],
+        "data_notes": [*data.notes, *jobs.notes],
         "files": [] if flags.out is None else [str(flags.out / "evaluation.json")],
     }
     if flags.out is not None:

@@ -59,8 +59,8 @@ class Candidate:
         return cast(dict[str, Any], self.described.record.get("split", {}))
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """Return the note on classes that the weights never draw, if any."""
+    def warnings(self) -> tuple[str, ...]:
+        """Return the warning about classes that the weights never draw, if any."""
         names = self.described.untaught
         return (f"{self.path.name}: {untaught_note(names)}",) if names else ()
 

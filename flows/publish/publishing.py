@@ -105,8 +105,7 @@ def _show_artifact(name: str, archive: str, published: Published) -> None:
         text = render_markdown(
             "survey.md",
             survey=published.receipt["survey"],
-            warnings=warnings_of(published.receipt),
-            headline=headline(published.receipt),
+            headline=[*map("Warning: {}".format, warnings_of(published.receipt)), *headline(published.receipt)],
             picture=base64.b64encode(small_jpeg((published.folder / "quicklook.png").read_bytes())).decode("ascii"),
             findings=[f"{name}: {text}" for name, text in finding_rows(published.receipt)],
             where=where,

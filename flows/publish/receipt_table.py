@@ -107,9 +107,9 @@ def format_score(receipt: Mapping[str, Any]) -> str:
     predicted = format_prediction(expected.get("miou"), expected.get("error"))
     if predicted and not warnings_of(receipt):
         return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities."
-    why = expected.get("not_predicted", "the score is not known: there are no labels")
-    if receipt["settings"].get("accuracy") is False:
-        why = "the accuracy was left out; the same survey with --accuracy adds it in a new run"
+    left = "the accuracy was left out; the same survey with --accuracy adds it in a new run"
+    known = [expected.get("not_predicted"), left if receipt["settings"].get("accuracy") is False else None]
+    why = "; ".join(filter(None, known)) or "the score is not known: there are no labels"
     return f"{why[0].upper()}{why[1:]}."
 
 

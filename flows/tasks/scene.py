@@ -76,12 +76,11 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
 
 def darkness(settings: Settings) -> tuple[str, ...]:
     """Return the warning that a simulated field is dark; or nothing."""
-    if settings.source != SIM or settings.sky.started is None:
-        return ()
-    height = float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
-    if height > 0:
-        return ()
-    return (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
+    is_lit = settings.source != SIM or settings.sky.started is None
+    height = 1.0 if is_lit else float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
+    return (
+        () if height > 0 else (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
+    )
 
 
 def _in_clear_light(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:

@@ -59,7 +59,7 @@ def test_pages_show_names_as_escapes() -> None:
     assert page.count(SHOWN) >= 2
     assert '<b title="' not in page
     words = HOSTILE + "<b>[x](y)`|"
-    shown = {"survey": words, "warnings": [], "headline": [words], "findings": [words]}
+    shown = {"survey": words, "headline": [words], "findings": [words]}
     text = render_markdown("survey.md", **shown, picture="", where="archive/runs/x_1")
     assert text.count(r"\<b\>\[x\](y)\`\|") == 3
     assert "`archive/runs/x_1/report.html`" in text

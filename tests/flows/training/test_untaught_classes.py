@@ -112,8 +112,8 @@ def test_evaluation_and_surveys_name_classes_that_weights_never_draw(tmp_path: P
     train_weights(other)
     content = evaluate_weights(str(folder), EvaluateFlags(weights=(fold.out, other.out), fractions="0.5"))
     assert content["frames"] == ["001", "002"]
-    assert f"a.safetensors: {NOTE}" in content["data_notes"]
-    assert not any(note.startswith("b.safetensors") for note in content["data_notes"])
+    assert f"a.safetensors: {NOTE}" in content["warnings"]
+    assert not any(note.startswith("b.safetensors") for note in content["warnings"])
     assert content["support"]["weed"] == 9
     assert {row["per_class_iou"]["weed"] for row in content["rows"]} == {0.0}
     asked = {"scene": str(folder / "001.npy"), "source": "raster", "weights": str(fold.out), "out": str(tmp_path / "o")}
