@@ -78,9 +78,8 @@ def darkness(settings: Settings) -> tuple[str, ...]:
     """Return the warning that a simulated field is dark; or nothing."""
     is_lit = settings.source != SIM or settings.sky.started is None
     height = 1.0 if is_lit else float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
-    return (
-        () if height > 0 else (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
-    )
+    text = f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark"
+    return () if height > 0 else (text,)
 
 
 def _in_clear_light(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
