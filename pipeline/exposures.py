@@ -22,7 +22,6 @@ from spectralzoom.pipeline.envi_headers import finite_number
 from spectralzoom.pipeline.errors import SceneError
 
 SAME = 1e-3  # largest relative difference of equal exposures, which cameras round
-SAME_SETTING = 0.01  # likewise of other numbers, which may be readings
 MOST_DARK_ERROR = 0.05  # of white that the dark current of another exposure may stand for
 WILD_RATIO = 100.0  # of two exposures of one camera; units that are confused differ by a thousand
 TO_MS = {"ns": 1e-6, "us": 1e-3, "ms": 1.0, "s": 1e3}
@@ -44,7 +43,7 @@ _FIXED = re.compile(  # the numbers depend on it
     r"(?!data .*gain values).*(?:(?<!\ba)gain|bin(?:n(?:ed|ing)|s?\b)|accum|co ?add|\btdi\b|\biso\b).*"
 )
 _OF_CAPTURE = re.compile(  # words of keys that describe the file, time, place or state of a capture
-    r"(?!.*(?:serial|averag|mode|format|readout)).*(?:file|path|folder|name|label|descri|comment|note|history|version"
+    r"(?!.*(?:serial|averag|mode|format|readout|expos|integrat|dwell)).*(?:file|path|folder|name|label|descri|comment|note|history|version"
     r"|ware|user|operator|project|byte|header|data (?:type|ignore|gain|offset|refl)|interleave|wavelength|fwhm"
     r"|band|bbl|scale factor|stretch|default|plot|class|legend|spectra|\btype|samples?\b|pixel ?size|reference|target"
     r"|time|date|stamp|clock|hour|\bday|duration|period|\bfps|rate\b|speed|frequency|interval|start\b|stop\b|\bend\b"
@@ -57,8 +56,8 @@ _OF_CAPTURE = re.compile(  # words of keys that describe the file, time, place o
 )
 _OF_LIGHT = re.compile(r".*(?:shutter|lamp|light|illumin|\bled\b|\bcap\b|\blid\b).*")  # off for a dark frame
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
-_NUMBERS = re.compile(rf"{_NUMBER}(?:[\s,;x*]+{_NUMBER}){{0,7}} ?(?:[a-zµ%°]{{1,8}})?")
-_WORDS_OF_MODE = re.compile(r"(?=.{1,24}$)[a-z0-9][a-z0-9+-]*(?: [a-z0-9][a-z0-9+-]*)?")
+_NUMBERS = rf"{_NUMBER}(?:[\s,;x*]+{_NUMBER}){{0,7}}"
+_SETTING = re.compile(rf"{_NUMBERS} ?[a-zµ%°]{{0,8}}|(?=.{{1,24}}$)[a-z0-9][a-z0-9+-]*(?: [a-z0-9][a-z0-9+-]*)?")
 _VALUE = re.compile(
     r"(?:(?P<over>1) ?/ ?)?(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)"
 )
@@ -151,7 +150,7 @@ class _Reader:
             self._add_time(name, value, match)
         elif _FIXED.fullmatch(name) or _AREA.fullmatch(name):
             self._put(self.frame, name, _setting_text(value))
-        elif _OF_CAPTURE.fullmatch(name) is None and _is_setting(text := _setting_text(value)):
+        elif _OF_CAPTURE.fullmatch(name) is None and _SETTING.fullmatch(text := _setting_text(value)):
             self.others.setdefault(name, text)
 
     def _add_time(self, name: str, value: str, match: re.Match[str]) -> None:
@@ -201,25 +200,11 @@ class _Reader:
 
 
 def _setting_text(value: str) -> str:
-    """Return a value as it is compared: numbers of a list after each other, or text in small letters."""
+    """Return a value as it is compared: numbers of a list, decimals to four digits, or text in small letters."""
     text = " ".join(value.lower().strip(" {}()[]\"'").split())
-    if _NUMBERS.fullmatch(text) is None or re.search("[a-wyzµ%°]", text):
+    if re.fullmatch(_NUMBERS, text) is None:
         return text
-    return ", ".join(f"{float(number):.9g}" for number in re.findall(_NUMBER, text))
-
-
-def _is_setting(text: str) -> bool:
-    """Return whether a value may be that of a setting: numbers, on, off or the word of a mode."""
-    return bool(_NUMBERS.fullmatch(text) or _WORDS_OF_MODE.fullmatch(text))
-
-
-def _same_setting(one: str, other: str) -> bool:
-    """Return whether two values are equal but for the spread of readings."""
-    numbers = [[finite_number(word) for word in re.findall(_NUMBER, text)] for text in (one, other)]
-    if one == other or not numbers[0] or re.sub(_NUMBER, "", one) != re.sub(_NUMBER, "", other):
-        return one == other
-    pairs = zip(*numbers, strict=True)
-    return all(abs(a - b) <= SAME_SETTING * max(abs(a), abs(b)) for a, b in pairs if a is not None and b is not None)
+    return ", ".join(number if number.isdigit() else f"{float(number):.4g}" for number in re.findall(_NUMBER, text))
 
 
 def all_alike(values: Iterable[float]) -> bool:
@@ -280,12 +265,9 @@ def _check_same(frame: Taken, cube: Taken, key: str, one: str, other: str) -> No
 
 def _differing(frame: Taken, cube: Taken, kind: str) -> list[str]:
     """Return a note on keys of both headers that look like settings and differ, other than those of `_check_same`."""
-    keys = [key for key in frame.others if kind != "dark" or not _OF_LIGHT.fullmatch(key)]
-    texts = [
-        f"{key} = {frame.others[key]}, not {cube.others[key]}"
-        for key in keys
-        if key in cube.others and not _same_setting(frame.others[key], cube.others[key])
-    ]
+    both = {key: (one, cube.others.get(key, one)) for key, one in frame.others.items()}
+    unlit = [key for key in both if kind == "dark" and _OF_LIGHT.fullmatch(key)]
+    texts = [f"{key} = {one}, not {other}" for key, (one, other) in both.items() if one != other and key not in unlit]
     what = f"{frame.where} was taken with other settings than {cube.where} ({'; '.join(texts)})"
     return [f"{what}: numbers are used as they are; if one changes them, give a frame of the same settings"] * bool(
         texts

@@ -5,7 +5,7 @@ They are left out one by one, as saturated samples are. More than a tenth of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,27 +57,24 @@ def darker_than_dark(raw: NDArray[np.number], dark: NDArray[np.float32]) -> Bool
     return found
 
 
-def _say(what: str, lines: NDArray[np.intp]) -> str:
-    return f"{len(lines)} {what} (the first is line {lines[0]})"
-
-
-def leave_out(
-    where: str, valid: Bools, faults: Mapping[str, Bools], cure: str, say: Callable[[str, NDArray[np.intp]], str] = _say
-) -> tuple[Bools, list[str]]:
+def leave_out(where: str, valid: Bools, faults: Mapping[str, Bools], cure: str) -> tuple[Bools, list[str]]:
     """Return (line,) lines that are still valid, and a note on those that a fault leaves out.
 
-    ``faults`` are (line,) by their names, and ``say`` returns the text of a fault and its lines. Raises SceneError:
-    more than a tenth of the lines have one.
+    ``faults`` are (line,) by their texts. Raises SceneError: more than a tenth of the lines have one.
     """
-    found = {what: np.flatnonzero(valid & wrong) for what, wrong in faults.items()}
-    left = valid.copy()
-    for numbers in found.values():
-        left[numbers] = False
-    count = int(np.count_nonzero(valid & ~left))
-    texts = "; ".join(say(what, numbers) for what, numbers in found.items() if len(numbers))
+    found = {what: valid & wrong for what, wrong in faults.items() if (valid & wrong).any()}
+    left = valid & ~np.any([np.zeros(len(valid), np.bool_), *found.values()], axis=0)
+    count, texts = int(np.count_nonzero(valid & ~left)), "; ".join(found)
     if count > MOST_LEFT_OUT * len(valid):
         raise SceneError(f"{where}: {count} of {len(valid)} lines cannot be used, more than a tenth: {texts}; {cure}")
     return left, [f"{where}: {count} of {len(valid)} lines are left out: {texts}"] if count else []
+
+
+def counted(faults: Iterable[tuple[str, Bools]]) -> dict[str, Bools]:
+    """Return (line,) faults by a text with their number and the first line."""
+    return {
+        f"{wrong.sum()} {what} (the first is line {wrong.argmax()})": wrong for what, wrong in faults if wrong.any()
+    }
 
 
 @dataclass
@@ -105,5 +102,5 @@ class LineJudge:
 
     def notes(self, where: str, lines: int) -> list[str]:
         """Return a note on the lines that were left out of ``lines`` (SceneError: they are more than a tenth)."""
-        faults = {what: np.isin(np.arange(lines), numbers) for what, numbers in self.faults.items()}
-        return leave_out(where, np.ones(lines, np.bool_), faults, CURE)[1]
+        wrong = ((what, np.isin(np.arange(lines), numbers)) for what, numbers in self.faults.items())
+        return leave_out(where, np.ones(lines, np.bool_), counted(wrong), CURE)[1]

@@ -91,13 +91,8 @@ def load_pointing(
     if not valid.any():
         raise SceneError(f"{path} calls no line of {name} valid; set valid = 1 for lines that can be used")
     if "time" in rows:
-        _refuse(
-            path,
-            rows,
-            ["time"],
-            valid & ~np.isfinite(rows["time"]),
-            "expected a number; set valid = 0 where it is not known",
-        )
+        unknown = valid & ~np.isfinite(rows["time"])
+        _refuse(path, rows, ["time"], unknown, "expected a number; set valid = 0 where it is not known")
     valid, position, exposure_ms, notes = _possible(path, rows, kind, valid, mounting)
     time_s = _times(path, rows, valid) if "time" in rows else None
     part = tuple(rows["sweep"]) if cut else None
@@ -116,14 +111,13 @@ def _possible(
     wild = np.zeros(len(rows), np.bool_) if exposure_ms is None else wild_exposures(exposure_ms, valid)
     unknown = ~np.isfinite(given).all(axis=1)
     lost = ~np.isfinite(_positions(kind, given, mounting)).all(axis=1)
-    columns = {"expected a number": KINDS[kind], REACH.get(kind, ""): KINDS[kind], POSSIBLE: ("exposure_ms",)}
-    faults = dict(zip(columns, (unknown, lost & ~unknown, wild & ~lost), strict=True))
-
-    def say(expected: str, lines: NDArray[np.intp]) -> str:
-        """Name the first row with a fault."""
-        return _row_text(rows.iloc[lines], columns[expected], expected)
-
-    valid, notes = leave_out(str(path), valid, faults, "correct the table", say)
+    checks = (
+        (valid & unknown, KINDS[kind], "expected a number"),
+        (valid & lost & ~unknown, KINDS[kind], REACH.get(kind, "")),
+        (valid & wild & ~lost, ("exposure_ms",), POSSIBLE),
+    )
+    faults = {_row_text(rows[wrong], names, expected): wrong for wrong, names, expected in checks if wrong.any()}
+    valid, notes = leave_out(str(path), valid, faults, "correct the table")
     if exposure_ms is not None:
         exposure_ms = _filled(np.where(wild, np.nan, exposure_ms), valid)
     every = [_filled(np.where(lost, np.nan, values), valid) for values in given.T]

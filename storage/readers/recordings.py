@@ -19,7 +19,15 @@ from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, scan_positions
 from spectralzoom.pipeline.ground.georeference import geobox_of_record
-from spectralzoom.pipeline.signal.line_faults import BEYOND, CURE, NO_EXPOSURE, beyond_mirror, leave_out, wild_exposures
+from spectralzoom.pipeline.signal.line_faults import (
+    BEYOND,
+    CURE,
+    NO_EXPOSURE,
+    beyond_mirror,
+    counted,
+    leave_out,
+    wild_exposures,
+)
 from spectralzoom.storage.arrays.cubes import RawCube
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
@@ -112,7 +120,8 @@ def _stored_sweep(path: Path, cube: RawCube, notes: list[str]) -> RecordedSweep:
     """Return the sweep of a raw cube; lines that cannot be are not valid, and have the usual exposure (SceneError)."""
     wild = wild_exposures(cube.exposure_ms, cube.valid_line)
     beyond = beyond_mirror(cube.position)
-    valid, more = leave_out(path.name, cube.valid_line, {NO_EXPOSURE: wild, BEYOND: beyond & ~wild}, CURE)
+    faults = counted((what, cube.valid_line & one) for what, one in ((NO_EXPOSURE, wild), (BEYOND, beyond & ~wild)))
+    valid, more = leave_out(path.name, cube.valid_line, faults, CURE)
     usual = float(np.median(cube.exposure_ms[~wild])) if not wild.all() else 1.0
     exposure_ms = np.where(wild, usual, cube.exposure_ms)
     references, varies = cube.references, not all_alike(exposure_ms)

@@ -18,7 +18,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
-from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, leave_out
+from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, counted, leave_out
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from spectralzoom.storage.readers.band_facts import Bands, bands_text
 from spectralzoom.storage.readers.cube_sources import (
@@ -339,7 +339,7 @@ def _find_gaps(
         seen |= known.any(axis=(0, 1))
         if kept is not None:
             kept[rows] = values.scaled(block)
-    _, notes = leave_out(source.name, source.valid, {DARK_LINE: dark}, CURE)
+    _, notes = leave_out(source.name, source.valid, counted([(DARK_LINE, dark)]), CURE)
     if void and not values.assumed:
         notes.append(f"{void} samples have the file's no-data value {values.nodata:g}")
     elif void:
