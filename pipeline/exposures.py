@@ -326,7 +326,7 @@ def match_exposures(
             notes += [f"{both}: values are scaled by the ratio"] if scaled else []
         elif kind == "white" and stated and not all_alike([usual, *lines_ms]):
             found[kind] = usual
-            notes.append(f"{both}: {usual:g} ms is assumed")
+            notes.append(f"{both}: {usual:g} ms is assumed, and values are scaled by the ratio to each line")
         else:
             notes.append(f"{both}: the same exposure is assumed")
     white_ms = found.get("white")
