@@ -41,6 +41,7 @@ class Output:
     path: Path  # a folder to write into
     report: Report
     spool: Path  # a folder, not made yet, that outlives a killed process; removed once the store is published
+    note: Callable[[str], None] = lambda text: None
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,7 @@ class Stores:
         dry: bool = False,
         watch: Callable[[str, str, str, float], None] = lambda *_: None,  # name, title, state and progress (0..1)
         log: Callable[[str], None] = lambda text: None,
+        note: Callable[[str], None] = lambda text: None,
         finish: Callable[[Path], None] = lambda folder: None,  # called with the folder of each store that was built
     ) -> None:
         self.archive = archive
@@ -169,7 +171,7 @@ class Stores:
         self.dry = dry
         self.rows: dict[str, Row] = {}
         self.bytes_written = 0
-        self._watch, self._log, self._finish = watch, log, finish
+        self._watch, self._log, self._note, self._finish = watch, log, note, finish
         self._cleared: dict[Ref, Callable[[], object]] = {}  # makes each again
 
     @property
@@ -232,7 +234,7 @@ class Stores:
         report(0.0)
 
         def build(folder: Path) -> None:
-            request.build(Output(folder, report, spool))
+            request.build(Output(folder, report, spool, self._note))
             self._finish(folder)
             self.bytes_written += bytes_in(spool)
 

@@ -16,8 +16,9 @@ from spectralzoom.flows.frame import FieldView
 from spectralzoom.flows.stage import Output, Unkeyed, stage
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, exposing
 from spectralzoom.pipeline.signal.condense import LineStatistics
+from spectralzoom.pipeline.signal.line_faults import LineJudge
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from spectralzoom.pipeline.source import RECORD, Line, SimulatedLight, Source
@@ -105,13 +106,17 @@ class SweepRecorder:
             shutil.copyfile(kept / RECORD, self.out.path / RECORD)
 
     def _sweep(self, source: Source, sweep: Sweep, found: SignalStatistics, taken: Callable[[int], None]) -> None:
-        """Write the lines of a sweep into spool and cube, one by one."""
+        """Write the lines of a sweep into spool and cube, one by one.
+
+        Lines that cannot be are not valid in the cube. Raises SceneError: they are more than a tenth.
+        """
         references = source.references(sweep)
         manifest = None if self.effects is None else load_manifest(self.effects)
         bands = self.view.wavelength_nm, self.view.fwhm_nm
         header = SweepHeader(sweep, references, *bands, source.name, simulation=manifest)
         of_spool = {"sweep": asdict(sweep), "camera": asdict(self.view.camera), **self.view.light}
         statistics = LineStatistics(found, sweep, references, self.view.camera)
+        judge = LineJudge(references, exposing(self.view.camera, sweep).exposure_ms)
         with (
             Spool.open(self.out.spool, *references.dark.shape, header=of_spool, name=sweep.name) as spool,
             RawCubeWriter(self.out.path / f"{sweep.name}.zarr", header, statistics.add) as cube,
@@ -119,13 +124,15 @@ class SweepRecorder:
 
             def take(line: Line) -> None:
                 spool.append(line)
-                cube.write([line])
+                cube.write([judge.judged(line)])
                 taken(spool.count)
 
             for block in spool.blocks():
-                cube.write(block)
+                cube.write([judge.judged(line) for line in block])
             taken(spool.count)
             take_lines(source, sweep, take, self.pool, first=spool.count)
+        for note in judge.notes(f"sweep {sweep.name}", sweep.lines):
+            self.out.note(note)
 
 
 Take = Callable[[Line], None]

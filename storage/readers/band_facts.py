@@ -222,6 +222,17 @@ def bands_of_fields(
     ``colours`` are GDAL's colour interpretations.
     """
     count = len(names)
+    listed = bands_of_lists(fields, count, where)
+    if listed.wavelength_nm is not None:
+        return listed
+    notes = listed.notes
+    names = names if any(names) else _listed_names(fields, count)
+    found = bands_of_names(names, where, () if notes else colours)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def bands_of_lists(fields: Mapping[str, object], count: int, where: str) -> Bands:
+    """Return (band,) facts by lists in a file's fields, else notes alone."""
     notes: list[str] = []
     for key, numbers, unit in _lists(fields, CENTRES, count, notes):
         _, *widths = next(_lists(fields, WIDTHS, count, notes), ("",))
@@ -229,9 +240,7 @@ def bands_of_fields(
         notes += found.notes
         if found.wavelength_nm is not None:
             return replace(found, notes=tuple(notes))
-    names = names if any(names) else _listed_names(fields, count)
-    found = bands_of_names(names, where, () if notes else colours)
-    return replace(found, notes=(*notes, *found.notes))
+    return Bands(notes=tuple(notes))
 
 
 def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:

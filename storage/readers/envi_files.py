@@ -22,6 +22,7 @@ from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
 from spectralzoom.pipeline.frame_indices import FRAME_INDEX, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, numbers_of_list
+from spectralzoom.storage.readers.band_matches import match_bands
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
 from spectralzoom.storage.readers.image_files import rescaled
 from spectralzoom.storage.readers.own_files import within
@@ -248,6 +249,11 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     taken, exposure_ms = _taken(parts, height, notes)
     of_parts = [bands_of_fields(one.header.fields, [None] * count, one.header_path.name) for one in cubes]
     bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
+    for one, part in zip(of_parts, cubes, strict=True):
+        order, _ = match_bands(one, bands, part.header_path.name, cubes[0].header_path.name)
+        if order is not None and (order != np.arange(count)).any():
+            where = f"{part.header_path.name} has the bands of {cubes[0].header_path.name} in another order"
+            raise SceneError(f"{where}; name these parts one by one")
     bad, doubts = bad_bands(cubes[0].header.fields, count)
     notes += [*bands.notes, *doubts]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
+from spectralzoom.pipeline.signal.calibrate import check_frames
 from spectralzoom.storage.readers.array_cubes import open_arrays
 from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store
 from spectralzoom.storage.readers.band_facts import Bands
@@ -106,14 +107,16 @@ def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource
 def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     """Return a Headwall cube with the dark and white frames of its folder, if there are some."""
     found = {kind: find_reference(folder, kind) for kind in ("dark", "white")}
-    frames = {kind: load_frame(file, kind, source.shape[1:]) for kind, file in found.items() if file is not None}
+    frames = {
+        kind: load_frame(file, kind, source.shape[1:], source.bands) for kind, file in found.items() if file is not None
+    }
     stated_ms = source.lines.exposure_ms
     lines_ms = np.ones(1) if stated_ms is None else stated_ms
     notes = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]
     white_ms = None
     if len(frames) == 2:
         white_ms, more = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
-        notes += more
+        notes += [*more, *check_frames(source.name, frames["dark"].values, frames["white"].values)]
     else:
         notes = [f"{note} is not used: values over white need a dark and a white frame" for note in notes]
         notes += [] if all_alike(lines_ms) else [f"numbers of {span_text(lines_ms)} are not scaled to one exposure"]

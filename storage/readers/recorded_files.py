@@ -15,10 +15,10 @@ from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Axis, Floats
-from spectralzoom.pipeline.signal.calibrate import find_bad_elements, full_scale_notes
+from spectralzoom.pipeline.signal.calibrate import check_frames, find_bad_elements
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.array_files import find_zarr_store
-from spectralzoom.storage.readers.band_facts import bands_text, numbers_of_list, why_unknown
+from spectralzoom.storage.readers.band_facts import bands_text, why_unknown
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, load_envi_header
 from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, taken_of
@@ -109,12 +109,11 @@ def open_file_cube(path: Path, wavelengths: Sequence[float] | None, stated: Mapp
         raise WavelengthError(f"{path} gives no wavelength of bands {without} (from 0); give --wavelengths in nm")
     folder = path if path.is_dir() and find_zarr_store(path) is None else path.parent
     name = _stem(path.absolute())  # of the folder ., too
+    frames = find_frames(folder / name, stated, source.shape[1:], source.bands)
     fields = load_envi_header(find_envi_pair(path)[0]).fields if reader_of(path) == "envi" else {}
     if (axis := fields.get("line axis", "x").strip()) not in ("x", "y"):
         raise SceneError(f"{path} has line axis = {axis!r}, expected x or y; correct the header")
-    return FileCube(
-        name, folder, source, find_frames(folder / name, stated, source.shape[1:]), "y" if axis == "y" else "x"
-    )
+    return FileCube(name, folder, source, frames, "y" if axis == "y" else "x")
 
 
 def with_bits(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera, list[str]]:
@@ -175,17 +174,13 @@ def references_of(
         )
     dark = found.get("dark", np.zeros(frame, np.float32))
     white = found.get("white", np.full(frame, white_dn, np.float32))
-    if not (white > dark).any():
-        raise SceneError(
-            f"the white frame of {name} is nowhere brighter than its dark frame; exchange them, or give others with "
-            "--dark and --white"
-        )
+    more = check_frames(name, dark, white, white_dn)
+    notes += more if "white" in found else []
     bad: NDArray[Any] = found.get("bad", np.zeros(frame, np.float32))
     if measured and "bad" not in found:
         bad = find_bad_elements(dark, white)
-        notes += full_scale_notes(white, white_dn)
     fields = frames["white"].fields if "white" in frames else {}
-    listed = numbers_of_list(fields.get("white_reference", ""), frame[1])
+    listed = frames["white"].white_reference if "white" in frames else None
     value = np.asarray(white_reference if listed is None or np.isnan(listed).any() else listed, np.float32)
     if value.shape not in ((), frame[1:]):
         raise SceneError(

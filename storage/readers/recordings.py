@@ -19,6 +19,16 @@ from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, scan_positions
 from spectralzoom.pipeline.ground.georeference import geobox_of_record
+from spectralzoom.pipeline.signal.line_faults import (
+    BEYOND,
+    CURE,
+    NO_EXPOSURE,
+    beyond_mirror,
+    counted,
+    leave_out,
+    wild_exposures,
+)
+from spectralzoom.storage.arrays.cubes import RawCube
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.array_files import lost_chunks
@@ -94,12 +104,8 @@ def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
             raise SceneError(f"{path} has other bands than {stores[0]}; name the raw cubes of one survey")
         if "dn" in cube.group and (lost := lost_chunks(array_of(cube.group, "dn"))[0]):
             raise IncompleteStoreError(f"{path}/dn lacks {lost} of its chunks, whose lines would be 0; copy it again")
-    sweeps = tuple(
-        RecordedSweep(
-            cube.sweep, cube.references, cube.position, cube.time_s, cube.exposure_ms, cube.valid_line, cube.read_lines
-        )
-        for cube in cubes
-    )
+    notes = [RESTORED] if any(isinstance(cube, RestoredCube) for cube in cubes) else []
+    sweeps = tuple(_stored_sweep(path, cube, notes) for path, cube in zip(stores, cubes, strict=True))
     light = tuple(
         f"{path.name} {sha256(path.parent / MANIFEST)}"
         if (path.parent / MANIFEST).is_file()
@@ -107,8 +113,26 @@ def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
         for path in stores
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
-    notes = (RESTORED,) if any(isinstance(cube, RestoredCube) for cube in cubes) else ()
-    return Recording(sweeps, camera, first.wavelength_nm, first.fwhm_nm, notes, light)
+    return Recording(sweeps, camera, first.wavelength_nm, first.fwhm_nm, tuple(notes), light)
+
+
+def _stored_sweep(path: Path, cube: RawCube, notes: list[str]) -> RecordedSweep:
+    """Return the sweep of a raw cube; lines that cannot be are not valid, and have the usual exposure (SceneError)."""
+    wild = wild_exposures(cube.exposure_ms, cube.valid_line)
+    beyond = beyond_mirror(cube.position)
+    faults = counted((what, cube.valid_line & one) for what, one in ((NO_EXPOSURE, wild), (BEYOND, beyond & ~wild)))
+    valid, more = leave_out(path.name, cube.valid_line, faults, CURE)
+    usual = float(np.median(cube.exposure_ms[~wild])) if not wild.all() else 1.0
+    exposure_ms = np.where(wild, usual, cube.exposure_ms)
+    references, varies = cube.references, not all_alike(exposure_ms)
+    if varies and references.exposure_ms is None and not isinstance(cube, RestoredCube):
+        references = replace(references, exposure_ms=usual)
+        more.append(f"{path.name}: white is taken to have {usual:g} ms")
+    if varies:
+        more.append(f"{path.name}: lines of {span_text(exposure_ms)} are scaled to the exposure of white")
+    notes += more
+    position = np.where(beyond[:, None], np.nan, cube.position)
+    return RecordedSweep(cube.sweep, references, position, cube.time_s, exposure_ms, valid, cube.read_lines)
 
 
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
@@ -172,7 +196,7 @@ def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -
     if not file.is_file():
         raise SceneError(f"there is no pointing table {file}; check the name (seen from {Path.cwd()})")
     pointing = load_pointing(file, cube.name, cube.source.shape[0], mounting, alone=alone)
-    notes = [f"{cube.name}: pointing from {file.name}"]
+    notes = [f"{cube.name}: pointing from {file.name}", *pointing.notes]
     stated, pointed = cube.exposure_ms, pointing.exposure_ms
     if stated is not None and pointed is not None and not all(map(all_alike, zip(stated, pointed, strict=True))):
         both = f"{span_text(pointed)}, count; the files state {span_text(stated)}"

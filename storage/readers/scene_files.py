@@ -18,9 +18,17 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
+from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, counted, leave_out
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from spectralzoom.storage.readers.band_facts import Bands, bands_text
-from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, check_memory, scene_lines, unpacked
+from spectralzoom.storage.readers.cube_sources import (
+    BLOCK_LINES,
+    CubeSource,
+    check_memory,
+    dark_lines,
+    scene_lines,
+    unpacked,
+)
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
 from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
@@ -306,8 +314,11 @@ def _find_gaps(
     missing = np.zeros((height, width), np.bool_)
     seen = np.zeros(len(chosen), np.bool_)
     filled_px = void = infinite = absent = 0
+    source, dark = values.source, np.zeros(height, np.bool_)
     for rows in cuts(height, BLOCK_LINES):
         picked, block, empty = values.converted(rows.start, rows.stop)
+        if source.dark is not None:
+            dark[rows] = dark_lines(source, source.read(rows.start, rows.stop))
         void += 0 if empty is None else int(np.count_nonzero(empty))
         if beyond_range(picked) is not None:
             found = find_beyond(picked if empty is None else np.where(empty, picked.dtype.type(0), picked))
@@ -328,7 +339,7 @@ def _find_gaps(
         seen |= known.any(axis=(0, 1))
         if kept is not None:
             kept[rows] = values.scaled(block)
-    notes: list[str] = []
+    _, notes = leave_out(source.name, source.valid, counted([(DARK_LINE, dark)]), CURE)
     if void and not values.assumed:
         notes.append(f"{void} samples have the file's no-data value {values.nodata:g}")
     elif void:
