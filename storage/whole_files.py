@@ -84,12 +84,12 @@ def is_folder(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink()
 
 
-def check_no_link(path: Path, root: Path, allowed: str = "stages") -> None:
-    """Raise ArchiveError where a name between an archive and a path in it is a link; ``allowed`` alone may be one."""
+def check_no_link(path: Path, root: Path) -> None:
+    """Raise ArchiveError where a name between an archive and a path in it is a link; ``stages`` alone may be one."""
     for part in (path, *path.parents):
         if part == root:
             return
-        if part.is_symlink() and part != root / allowed:
+        if part.is_symlink() and part != root / "stages":
             raise _link_refusal(part)
 
 

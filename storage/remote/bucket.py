@@ -112,33 +112,23 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
     with archive.in_use():
         wanted = _of_run(objects, run, there) if run is not None else sorted(there, key=lambda uri: uri[:4] == "runs")
         waiting = [uri for uri in wanted if not is_known(archive.root / uri)]
-        texts = dict(
-            zip(waiting, some_at_a_time(lambda uri: _read_or_error(uri, there[uri], objects), waiting), strict=True)
-        )
+        known = dict(zip(waiting, some_at_a_time(lambda uri: _lineage(uri, there[uri], objects), waiting), strict=True))
 
-        def adopt(uri: str) -> int | None:
-            if isinstance(text := texts[uri], IncompleteStoreError):
-                raise text
-            return None if text is None else _adopt(uri, there[uri], text, objects, archive)
+        def fetch(uri: str) -> int | None:
+            return fetch_store(uri, there[uri], objects, archive)
 
-        known = {uri: _lineage(text) for uri, text in texts.items()}
         return _copy(
-            archive, objects, wanted, known, report, adopt, lambda uri: digest_of(archive.root / uri), archive.name
+            archive, objects, wanted, known, report, fetch, lambda uri: digest_of(archive.root / uri), archive.name
         )
 
 
-def _read_or_error(uri: str, kind: str, objects: Objects) -> bytes | IncompleteStoreError | None:
-    """Return a manifest, or its damage; None if another machine has removed it meanwhile."""
-    try:
-        return objects.read(f"{uri}/{kind}", parse_manifest)
-    except IncompleteStoreError as error:
-        return error
-
-
-def _lineage(text: bytes | IncompleteStoreError | None) -> dict[str, Any]:
+def _lineage(uri: str, kind: str, objects: Objects) -> dict[str, Any]:
     """Return inputs and their digests of a manifest; none of a damaged or missing one."""
-    content = parse_manifest(text) if isinstance(text, bytes) else {"inputs": [], RESTS_ON: {}}
-    return {name: content[name] for name in ("inputs", RESTS_ON)}
+    with suppress(IncompleteStoreError):
+        if (text := objects.read(f"{uri}/{kind}", parse_manifest)) is not None:
+            content = parse_manifest(text)
+            return {name: content[name] for name in ("inputs", RESTS_ON)}
+    return {"inputs": [], RESTS_ON: {}}
 
 
 def _copy(
@@ -206,11 +196,8 @@ def _send(folder: Path, uri: str, objects: Objects) -> tuple[int | None, bytes]:
 def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int | None:
     """Fetch one store or run into the archive; return the bytes of its files, None where it is here or gone."""
     text = objects.read(f"{uri}/{kind}", parse_manifest)
-    return None if text is None else _adopt(uri, kind, text, objects, archive)
-
-
-def _adopt(uri: str, kind: str, text: bytes, objects: Objects, archive: Archive) -> int | None:
-    """Fetch the files that a manifest lists; return as `fetch_store`."""
+    if text is None:  # another machine has removed it meanwhile
+        return None
     if kind == OF_CLEARED:
         return 0 if archive.adopt(uri, text) else None
     files = parse_manifest(text)["files"]

@@ -28,7 +28,11 @@ PART_BYTES = 8 << 20  # of the parts of a large object
 MOST_BYTES = 256 << 20  # of a manifest, which takes 100 bytes a file
 RETRIES, RETRIED_S = 4, 2.0  # of one request, by obstore, and the time in which they begin
 PAUSES_S = (0.5, 2.0, 8.0)  # before what obstore does not try again
-REQUEST_S, REQUEST_BYTES, LONGEST_S = 10, 256 << 10, 900  # a request ends in so many seconds, and in as many more for each 256 kB
+REQUEST_S, REQUEST_BYTES, LONGEST_S = (
+    10,
+    256 << 10,
+    900,
+)  # a request ends in so many seconds, and in as many more for each 256 kB
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _PART = r"(?!\.+(?:/|$))[A-Za-z0-9_.=+-]+"
 _ADDRESS = re.compile(rf"s3:/{{1,2}}({_PART})((?:/{_PART})*)/?")  # also as a path has it, which makes one slash of two
@@ -107,17 +111,13 @@ class Objects:
 
         self._store = store
         try:
-            self._reader(0)
+            self._client(0)
         except BaseError as error:
             raise ArchiveError(f"{self.url} cannot be used: {_first_line(error)}") from error
 
-    def _reader(self, size: int) -> Any:
-        """Return a client for answers of this size, which gives up a connection that stalls."""
-        return self._store(_seconds(size), f"{REQUEST_S}s")
-
-    def _writer(self, size: int) -> Any:
-        """Return a client for requests of this size: an answer comes when all is sent."""
-        return self._store(_seconds(size), f"{_seconds(size)}s")
+    def _client(self, size: int, *, sending: bool = False) -> Any:
+        """Return a client for requests of this size; a connection that stalls is given up before, unless it sends."""
+        return self._store(_seconds(size), f"{_seconds(size) if sending else REQUEST_S}s")
 
     def read(self, name: str, check: Callable[[bytes], object] = len) -> bytes | None:
         """Return the content of a small object; None without one.
@@ -126,7 +126,7 @@ class Objects:
         """
 
         def read() -> bytes:
-            answer = self._reader(self._sizes.get(name, 0)).get(name)
+            answer = self._client(self._sizes.get(name, 0)).get(name)
             try:
                 if answer.meta["size"] > MOST_BYTES:
                     raise ValueError(f"it has {answer.meta['size']} bytes")
@@ -147,11 +147,11 @@ class Objects:
 
         def write() -> bytes:
             try:
-                self._writer(len(content)).put(name, content, mode="create", use_multipart=False)
+                self._client(len(content), sending=True).put(name, content, mode="create", use_multipart=False)
                 return content
             except AlreadyExistsError as error:  # or two writers at the same time, or one whose answer was lost
                 try:
-                    return bytes(self._reader(len(content)).get(name).bytes())
+                    return bytes(self._client(len(content)).get(name).bytes())
                 except FileNotFoundError:
                     raise error from None
 
@@ -160,7 +160,7 @@ class Objects:
     def write(self, name: str, source: Path | bytes) -> None:
         """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
         size = len(source) if isinstance(source, bytes) else source.stat().st_size
-        store = self._writer(min(size, PART_BYTES))
+        store = self._client(min(size, PART_BYTES), sending=True)
         self._ask(lambda: store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2), size)
 
     def fetch(self, name: str, path: Path, size: int, sha256: str) -> None:
@@ -170,7 +170,7 @@ class Objects:
             digest = hashlib.sha256()
             path.unlink(missing_ok=True)
             with open_own(path, "xb") as file:
-                answer = self._reader(size).get(name)
+                answer = self._client(size).get(name)
                 for block in answer.stream(PART_BYTES) if answer.meta["size"] == size else ():
                     digest.update(block)
                     file.write(block)
@@ -194,7 +194,7 @@ class Objects:
         bucket, prefix = self._address
 
         def listed() -> dict[str, int]:
-            return {one["path"]: one["size"] for batch in self._reader(0).list(chunk_size=1000) for one in batch}
+            return {one["path"]: one["size"] for batch in self._client(0).list(chunk_size=1000) for one in batch}
 
         try:
             self._sizes = self._ask(listed)
@@ -206,7 +206,7 @@ class Objects:
             except OSError as refused:
                 raise self.explain(refused) from refused
             self._sizes = dict.fromkeys(names, 0)
-            self.bad_names = [name for name in names if not PATH.fullmatch(name)]
+            self.bad_names = [name for name in names if name and not PATH.fullmatch(name.removesuffix("/"))]
         return set(self._sizes)
 
     def explain(self, error: BaseException) -> UnreachableError:
