@@ -28,11 +28,8 @@ PART_BYTES = 8 << 20  # of the parts of a large object
 MOST_BYTES = 256 << 20  # of a manifest, which takes 100 bytes a file
 RETRIES, RETRIED_S = 4, 2.0  # of one request, by obstore, and the time in which they begin
 PAUSES_S = (0.5, 2.0, 8.0)  # before what obstore does not try again
-REQUEST_S, REQUEST_BYTES, LONGEST_S = (
-    10,
-    256 << 10,
-    900,
-)  # a request ends in so many seconds, and in as many more for each 256 kB
+REQUEST_S, LONGEST_S = 10, 900  # of a request
+REQUEST_BYTES = 256 << 10  # for each so many bytes a request may take `REQUEST_S` more
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _PART = r"(?!\.+(?:/|$))[A-Za-z0-9_.=+-]+"
 _ADDRESS = re.compile(rf"s3:/{{1,2}}({_PART})((?:/{_PART})*)/?")  # also as a path has it, which makes one slash of two
