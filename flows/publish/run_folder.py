@@ -39,7 +39,7 @@ from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_
 from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
 from spectralzoom.storage.runs import RECEIPT
-from spectralzoom.storage.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json, write_new
 
 REPORT = "report.html"
 COSTS_OF_STAGE = ("wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
@@ -67,11 +67,11 @@ def publish_run(
         nonlocal receipt
         receipt = make_receipt(stores, plan, products, control, uri, started)
         page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
-        (folder / "quicklook.png").write_bytes(quicklook)
+        write_new(folder / "quicklook.png", quicklook)
         if "plots" in receipt:
-            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]), encoding="utf-8")
-        (folder / RECEIPT).write_text(to_json(receipt), encoding="utf-8")
-        (folder / REPORT).write_text(page, encoding="utf-8")
+            write_new(folder / PLOTS_FILE, plots_csv(receipt["plots"]))
+        write_new(folder / RECEIPT, to_json(receipt))
+        write_new(folder / REPORT, page)
         return {"survey": receipt["survey"], "settings": receipt["settings"]}
 
     day = moment_of(plan.field.acquired)

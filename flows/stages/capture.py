@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import cast
@@ -26,6 +26,7 @@ from spectralzoom.storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHe
 from spectralzoom.storage.arrays.spool import Spool
 from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.store import Ref
+from spectralzoom.storage.whole_files import make_folder, read_own, write_new
 
 RAW, RAW_VERSION = "capture", 15
 KEPT = "source"  # folder of a source's own files within a capture's spool
@@ -90,7 +91,7 @@ class SweepRecorder:
         before = 0
         self.out.report(0.0)  # before the first line, which takes a rig some time
         kept = self.out.spool / KEPT
-        kept.mkdir(parents=True, exist_ok=True)
+        make_folder(kept, self.out.spool.parents[1])
         if self.effects is not None:
             source = cast(SimulatedLight, source).with_effects(chosen_effects(self.effects), request.starts_s)
         with source.opened(kept) as opened:
@@ -102,8 +103,8 @@ class SweepRecorder:
                 self._sweep(opened, sweep, found, taken)
                 before += sweep.lines
         np.savez(self.out.path / STATISTICS, allow_pickle=False, **found.arrays())
-        if (kept / RECORD).exists():
-            shutil.copyfile(kept / RECORD, self.out.path / RECORD)
+        with suppress(FileNotFoundError):
+            write_new(self.out.path / RECORD, read_own(kept / RECORD))
 
     def _sweep(self, source: Source, sweep: Sweep, found: SignalStatistics, taken: Callable[[int], None]) -> None:
         """Write the lines of a sweep into spool and cube, one by one.

@@ -19,7 +19,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.selection.choice import decide, list_effects, sum_up
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
 from spectralzoom.storage.store import Ref, read_table
-from spectralzoom.storage.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json, write_new
 
 RECORD = "effects.json"
 
@@ -32,7 +32,7 @@ def choose_effects(
     probes = probe_survey(scene, rig, sweeps, tol.unit, cost)
     decision = decide(probes, rig, EFFECTS, tol.value, asked)
     text = to_json({"effects": list_effects(decision), "total": sum_up(decision)})
-    (out.path / RECORD).write_text(text, encoding="utf-8")
+    write_new(out.path / RECORD, text)
     out.report(1.0)
 
 

@@ -119,7 +119,9 @@ class RigSource:
         source = self.keeping(self.keep(kept))
         with source.session():
             yield source
-        (kept / RECORD).write_text(json.dumps(source.record, indent=1) + "\n")
+        (kept / RECORD).unlink(missing_ok=True)
+        with (kept / RECORD).open("x") as file:  # a new file, so that no link is followed
+            file.write(json.dumps(source.record, indent=1) + "\n")
 
     @contextmanager
     def session(self) -> Iterator[CaptureRunner]:

@@ -37,7 +37,7 @@ from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
-from spectralzoom.storage.store import MANIFEST, Archive, check_store, is_archive, try_manifest
+from spectralzoom.storage.store import MANIFEST, Archive, check_store, damage, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256
 
 SAME_PERIOD = 0.01
@@ -355,6 +355,8 @@ def _run_with_cubes(address: str | Path) -> tuple[Archive, Run, list[Path]] | No
     archive = Archive.open(place, create=False, write=False)
     for folder in [archive.run_folder(name)] if name else archive.past_runs():
         run = read_run(folder)
+        if run.problem is not None and (name or run.products):
+            raise damage(folder, run.problem)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
