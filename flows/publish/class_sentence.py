@@ -43,7 +43,7 @@ def main_places(classes: NDArray[np.integer], names: Sequence[str], geobox: GeoB
         if (here := numbers == number).any():
             centre = at[:, here].mean(axis=1)
             side = np.where(abs(centre) > MIDDLE_THIRD, np.sign(centre), 0)
-            inside = (side[:, None] * at >= 0 if side.any() else abs(at) <= AROUND_MIDDLE).all(axis=0)
+            inside = np.all(side[:, None] * at >= 0 if side.any() else abs(at) <= AROUND_MIDDLE, axis=0)
             if inside[here].mean() >= max(MOST, inside.mean() + MORE):
                 found[name] = _words(*side.tolist(), compass=compass)
     return found
