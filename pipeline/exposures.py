@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -263,6 +263,14 @@ def _check_same(frame: Taken, cube: Taken, key: str, one: str, other: str) -> No
         raise SceneError(f"{both}; give a frame taken with the cube's own settings{unit}")
 
 
+def _compared_alone(dark: Taken, white: Taken, cube: Taken) -> list[str]:
+    """Return a note on settings of both frames that the cube does not state (SceneError: the numbers depend on one)."""
+    for key in sorted((dark.settings.keys() & white.settings.keys()) - cube.settings.keys()):
+        _check_same(white, dark, key, white.settings[key], dark.settings[key])
+    others = {key: one for key, one in dark.others.items() if key not in cube.others}
+    return _differing(replace(dark, others=others), white, "dark")
+
+
 def _differing(frame: Taken, cube: Taken, kind: str) -> list[str]:
     """Return a note on keys of both headers that look like settings and differ, other than those of `_check_same`."""
     both = {key: (one, cube.others.get(key, one)) for key, one in frame.others.items()}
@@ -329,6 +337,8 @@ def match_exposures(
             notes.append(f"{both}: {usual:g} ms is assumed, and values are scaled by the ratio to each line")
         else:
             notes.append(f"{both}: the same exposure is assumed")
+    if {"dark", "white"} <= frames.keys():
+        notes += _compared_alone(frames["dark"][1], frames["white"][1], cube)
     white_ms = found.get("white")
     if "dark" in found and not all_alike([found["dark"], white_ms or usual, *lines_ms]):
         notes.append(_dark_note(frames, found["dark"], white_ms or usual, lines_ms, lines))

@@ -277,18 +277,19 @@ def check_frames(
     This is that of the camera, or the largest number of 8 to 16 bits. Raises SceneError: the white frame has no light
     beside the dark one, as where they are exchanged.
     """
-    light = np.asarray(white, np.float64) - dark
-    if not np.nansum(np.maximum(light, 0)) > LEAST_LIGHT * np.nansum(np.maximum(-light, 0)):
+    known = np.isfinite(white) & np.isfinite(dark)
+    light = np.subtract(white, dark, where=known, out=np.zeros(white.shape))
+    if not np.maximum(light, 0).sum() > LEAST_LIGHT * np.maximum(-light, 0).sum():
         brighter = 100 * np.mean(light > 0)
         raise SceneError(
             f"{where}: the white frame is not brighter than the dark one ({brighter:.0f} % of its elements are); "
             "exchange them if they are swapped, or give others"
         )
-    most = float(np.nanmax(white))
+    most = float(white[known].max())
     scales = [*(2.0**bits - 1 for bits in range(8, 17)), *([] if full_scale_dn is None else [full_scale_dn])]
     if not any(abs(most - scale) < 0.5 for scale in scales):
         return []
-    full = 100 * float(np.mean(white >= most - 0.5))
+    full = 100 * float(np.mean(white[known] >= most - 0.5))
     what = f"{where}: the white frame is at full scale ({most:g} DN) in {full:.2g} % of the elements"
     return [f"{what}: if it is saturated, values there are too high, and a darker one is needed"]
 

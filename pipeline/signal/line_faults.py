@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,21 +41,26 @@ def beyond_mirror(position: NDArray[np.floating]) -> Bools:
     return np.asarray(~(np.hypot(position[..., 0], position[..., 1]) <= 1 + RIM_SLACK["float32"]))
 
 
-def darker_than_dark(raw: NDArray[np.number], dark: NDArray[np.float32]) -> Bools:
-    """Return (line,) whether raw lines (line, sample, band) are darker than their dark frame by more than noise.
+class DarkLevel:
+    """The numbers (sample, band) of a dark frame, below which noise does not reach in most elements.
 
-    Half of the elements are then a quarter of the dark level below it, or a quarter of them are 0. A line with nothing
-    but 0 is such a line beside any dark frame.
+    A line is darker than that if half of its elements are a quarter of the dark level below it, or if a quarter of them
+    are 0. A line with nothing but 0 is such a line beside any dark frame.
     """
-    found = np.zeros(len(raw), np.bool_)
-    limit = max(int(np.nanmax(dark, initial=0)), 0)  # no element is that far below its level above it
-    for number, line in enumerate(raw):
-        if np.count_nonzero(line <= limit) > MOST_ZEROS * line.size:
-            zero = line == 0
-            below = line < dark - np.maximum(DARKER * dark, LEAST_DARKER_DN)
-            unlit = np.mean(below) > MOST_DARKER or np.mean(zero & (dark >= LEAST_LEVEL_DN)) > MOST_ZEROS
-            found[number] = unlit or zero.all()
-    return found
+
+    def __init__(self, dark: NDArray[np.float32]) -> None:
+        level = np.nan_to_num(np.asarray(dark, np.float32), nan=0, posinf=0, neginf=0)
+        self._floor = level - np.maximum(DARKER * level, LEAST_DARKER_DN)
+        self._without_zeros = level >= LEAST_LEVEL_DN
+        self._most = max(int(level.max(initial=0)), 0)
+
+    def is_above(self, line: NDArray[np.number]) -> bool:
+        """Return whether a raw line (sample, band) is darker than the dark frame by more than noise."""
+        if np.count_nonzero(line <= self._most) <= MOST_ZEROS * line.size:
+            return False
+        zero = line == 0
+        unlit = np.mean(line < self._floor) > MOST_DARKER or np.mean(zero & self._without_zeros) > MOST_ZEROS
+        return bool(unlit or zero.all())
 
 
 def leave_out(where: str, valid: Bools, faults: Mapping[str, Bools], cure: str) -> tuple[Bools, list[str]]:
@@ -85,6 +91,10 @@ class LineJudge:
     exposure_ms: float  # of the sweep
     faults: dict[str, list[int]] = field(default_factory=dict)
 
+    @cached_property
+    def _dark(self) -> DarkLevel:
+        return DarkLevel(self.references.dark)
+
     def judged(self, line: Line) -> Line:
         """Return a line, not valid if it cannot be; then its exposure is that of the sweep, its position unknown."""
         if not line.valid:
@@ -95,7 +105,7 @@ class LineJudge:
         if beyond_mirror(np.array([line.mirror_x, line.mirror_y])):
             self.faults.setdefault(BEYOND, []).append(line.number)
             return replace(line, valid=False, mirror_x=np.nan, mirror_y=np.nan)
-        if darker_than_dark(line.data[None], self.references.dark)[0]:
+        if self._dark.is_above(line.data):
             self.faults.setdefault(DARK_LINE, []).append(line.number)
             return replace(line, valid=False)
         return line

@@ -21,7 +21,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.signal.calibrate import calibrate
-from spectralzoom.pipeline.signal.line_faults import darker_than_dark
+from spectralzoom.pipeline.signal.line_faults import DarkLevel
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.band_facts import Bands
 
@@ -189,5 +189,6 @@ def dark_lines(source: CubeSource, raw: NDArray[Any]) -> NDArray[np.bool_]:
     """Return (line,) whether raw lines of a cube are darker than its dark frame; none without one, or without data."""
     if source.dark is None or source.white is None:
         return np.zeros(len(raw), np.bool_)
-    found = darker_than_dark(raw, source.dark)
+    level = DarkLevel(source.dark)
+    found = np.array([level.is_above(line) for line in raw], np.bool_)
     return found if source.nodata is None else found & ~(raw == source.nodata).all(axis=(1, 2))

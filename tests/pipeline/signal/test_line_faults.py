@@ -6,17 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.pipeline.signal.line_faults import LineJudge, darker_than_dark, wild_exposures
+from spectralzoom.pipeline.signal.line_faults import DarkLevel, LineJudge, wild_exposures
 from spectralzoom.pipeline.source import Line, References
 
 SHAPE = (40, 30)  # sample, band
 
 
-def lines(level: float, sigma: float, count: int = 20) -> np.ndarray:
+def lines(level: float, sigma: float, count: int = 20) -> NDArray[np.uint16]:
     """Return raw lines of noise around a level."""
     return np.clip(np.rint(np.random.default_rng(1).normal(level, sigma, (count, *SHAPE))), 0, 65535).astype(np.uint16)
+
+
+def darker_than_dark(raw: NDArray[np.uint16], dark: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return (line,) whether lines are darker than a dark frame, one element of which is not known."""
+    dark[0, 0] = np.nan
+    return np.array([DarkLevel(dark).is_above(line) for line in raw])
 
 
 @pytest.mark.parametrize(

@@ -517,3 +517,16 @@ def test_lines_of_a_scene_folder_below_dark_are_left_out(tmp_path: Path, lost: i
     assert any(
         "1 of 12 lines are left out: 1 darker than the dark frame (the first is line 8)" in n for n in scene.provenance
     )
+
+
+def test_settings_of_the_frames_alone_are_compared(tmp_path: Path) -> None:
+    """A cube that states none says nothing on them."""
+    white = {MS: 10, "accumulations": 4, "trigger mode": "external"}
+    folder = write_taken(tmp_path / "a", (10, {MS: 10}), (10, white), {**white, "trigger mode": "internal"})
+    notes = open_recording(folder).notes
+    assert any("scan.dark.hdr was taken with other settings than the white frame" in note for note in notes)
+    folder = write_taken(tmp_path / "b", (10, {MS: 10}), (10, white), {**white, "accumulations": 1})
+    with pytest.raises(
+        SceneError, match=r"scan\.white\.hdr was taken with accumulations = 4, the dark frame .* with 1"
+    ):
+        open_recording(folder)
