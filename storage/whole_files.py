@@ -174,7 +174,7 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def sha256(path: Path, opened: Callable[[Path, str], IO[Any]] = Path.open) -> str:
+def sha256(path: Path, opened: Callable[[Path, str], Any] = Path.open) -> str:
     """Return the SHA-256 of a file's content, in hex; `open_own` opens a file of an archive."""
     with opened(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

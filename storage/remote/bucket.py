@@ -112,9 +112,12 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
     with archive.in_use():
         wanted = _of_run(objects, run, there) if run is not None else sorted(there, key=lambda uri: uri[:4] == "runs")
         waiting = [uri for uri in wanted if not is_known(archive.root / uri)]
-        known = dict(zip(waiting, some_at_a_time(lambda uri: _lineage(uri, there[uri], objects), waiting), strict=True))
+        found = some_at_a_time(lambda uri: _lineage(uri, there[uri], objects), waiting)
+        known = {uri: one for uri, one in zip(waiting, found, strict=True) if one is not None}
 
         def fetch(uri: str) -> int | None:
+            if "damage" in known[uri]:
+                raise known[uri]["damage"]
             return fetch_store(uri, there[uri], objects, archive)
 
         return _copy(
@@ -122,13 +125,13 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
         )
 
 
-def _lineage(uri: str, kind: str, objects: Objects) -> dict[str, Any]:
-    """Return inputs and their digests of a manifest; none of a damaged or missing one."""
-    with suppress(IncompleteStoreError):
-        if (text := objects.read(f"{uri}/{kind}", parse_manifest)) is not None:
-            content = parse_manifest(text)
-            return {name: content[name] for name in ("inputs", RESTS_ON)}
-    return {"inputs": [], RESTS_ON: {}}
+def _lineage(uri: str, kind: str, objects: Objects) -> dict[str, Any] | None:
+    """Return inputs and their digests of a manifest, or its ``damage``; None if another machine has removed it."""
+    try:
+        text = objects.read(f"{uri}/{kind}", parse_manifest)
+    except IncompleteStoreError as error:
+        return {"inputs": [], RESTS_ON: {}, "damage": error}
+    return None if text is None else {name: parse_manifest(text)[name] for name in ("inputs", RESTS_ON)}
 
 
 def _copy(
