@@ -273,6 +273,23 @@ def check_taught(dataset: str, taught: Sequence[str], frames: Sequence[str]) -> 
         raise SceneError(f"{dataset}: training needs two or more classes, and {note}")
 
 
+UNNAMED_ZERO = {"class_0": "0", "colour_000000": "[0, 0, 0]"}  # class without a name of its own -> its label
+
+
+def zero_cure(kind: str) -> str:
+    """Return how to say that the label 0 is no class; empty for another class, or one that a scene.toml names."""
+    value = UNNAMED_ZERO.get(kind)
+    return f"if it means unlabelled, write unlabelled = {value} into a {SETTINGS_NAME} beside the scene" * bool(value)
+
+
+def zero_sentence(**label_zero: Any) -> str:
+    """Return what label 0 stands for, by its ``class`` and ``fraction`` in a record."""
+    kind, share = label_zero["class"], f"{label_zero['fraction']:.1%} of the pixels"
+    if kind:
+        return "; ".join(filter(None, (f"label 0 is the class {kind}: {share}", zero_cure(kind))))
+    return f"label 0 is no class, {share} are unlabelled; a table [classes] in a {SETTINGS_NAME} can name it: NAME = 0"
+
+
 EMPTY = "{scenes} without any value left out: {names}"
 MOVED = (
     "labels of {names} have another place, CRS or pixels than their images: they are brought to the images' pixels by"
