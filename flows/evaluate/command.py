@@ -12,7 +12,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from spectralzoom.flows.evaluate.frames import (
-    OTHER_PIXELS,
     ROLES,
     VALIDATION,
     Candidate,
@@ -130,44 +129,32 @@ def _by_role(runs: Sequence[Run], jobs: Jobs, first: Candidate, fractions: Seque
 
 
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
-    """Print frames and weights, accuracy with costs, the classes, and an explanation; other frames in rows apart."""
+    """Print frames and weights, rows of frames apart, accuracy with costs, the classes, and an explanation."""
     weights = content["weights"]
     named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
     left = f"; left out (training frames): {len(content['left_out'])}" if content["left_out"] else ""
-    of = f" of {OTHER_PIXELS}" * (content["headline"] == OTHER_PIXELS)
-    lines = [_sentence(content["brief"], named, of) if content["headline"] else NO_HEADLINE]
+    lines = [_sentence(content["brief"], named, content["headline"]) if content["headline"] else NO_HEADLINE]
     lines += [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
     if len(weights) > 1:
         lines += [f"  {one['file']}: {', '.join(one['frames']) or 'no frame'}" for one in weights]
+    for role, one in content["apart"].items():
+        lines += [f"  {role}: mIoU {format_points(one['rows'][-1]['miou'])} of {counted(len(one['frames']), 'frame')}"]
     for line in lines:
         show_text(line, console)
-    if content["apart"]:
-        console.print(_apart(content["apart"]))
-    if not content["headline"]:
-        return
-    console.print(_accuracy(content))
-    console.print(_classes(content))
-    console.print(escape(CAPTION), soft_wrap=True, style="dim")
+    if content["headline"]:
+        console.print(_accuracy(content))
+        console.print(_classes(content))
+        console.print(escape(CAPTION), soft_wrap=True, style="dim")
 
 
-def _apart(groups: Mapping[str, dict[str, Any]]) -> Table:
-    columns = ("not in the headline", "frames", "mIoU", "overall")
-    rows = []
-    for role, one in groups.items():
-        whole = one["rows"][-1]
-        figures = (format_points(whole["miou"]), format_points(whole["pixel_accuracy"]))
-        rows.append((role, str(len(one["frames"])), *figures))
-    return table(columns, rows, whole=columns[1:])
-
-
-def _sentence(brief: dict[str, Any], named: str, of: str) -> str:
+def _sentence(brief: dict[str, Any], named: str, headline: str) -> str:
     """Return what to know first: the weights, the best plain classifier, and the cost of each."""
     found = {
         name: f"{format_points(one['miou'])} ({format_count(one['multiply_adds_a_pixel'])} multiply-adds a pixel)"
         for name, one in brief.items()
     }
     peer = f", the best plain classifier of single pixels {found[PLAIN]}" if PLAIN in found else ""
-    return f"mIoU{of}: {named} {found['weights']}{peer}"
+    return f"mIoU, {headline}: {named} {found['weights']}{peer}"
 
 
 def _accuracy(content: dict[str, Any]) -> Table:

@@ -33,8 +33,7 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 FARM_TEST_SCENES = 4
 HELD_OUT, OTHER_PIXELS, VALIDATION = "held out", "untrained pixels of training frames", "validation"
-ROLES = (HELD_OUT, OTHER_PIXELS, VALIDATION)  # of judged frames; the first but the last one is the headline
-TRAINED = "training"
+ROLES = (HELD_OUT, OTHER_PIXELS, VALIDATION)  # of judged frames; one of the first two is the headline
 VALIDATED = (
     "the training chose reading, calibration and thresholds by {names}: scores of these validation frames may be too"
     " good, and stand apart"
@@ -73,11 +72,11 @@ class Candidate:
         known = self.split.get("validation", {}).values()
         return scene.clear_key in known or any(one in self.split.get("validated", ()) for one in scene.content)
 
-    def role_of(self, scene: RasterScene) -> str:
-        """Return the part of a scene in the training, one of `ROLES` or `TRAINED`."""
+    def role_of(self, scene: RasterScene) -> str | None:
+        """Return the part of a scene in the training, one of `ROLES`; None where all of it was taught."""
         seen = seen_in_training(scene, self.described)
         if seen == "all":
-            return TRAINED
+            return None
         return VALIDATION if self.validated_on(scene) else HELD_OUT if seen is None else OTHER_PIXELS
 
 
@@ -163,7 +162,7 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
             )
         for one in weights:
             check_labels(scene, one.described)
-        roles = {at: role for at, one in enumerate(weights) if (role := one.role_of(scene)) != TRAINED}
+        roles = {at: role for at, one in enumerate(weights) if (role := one.role_of(scene))}
         if not roles:
             jobs.left_out.append(name)
             continue
@@ -189,11 +188,10 @@ def _cure(data: TrainingData, weights: Sequence[Candidate]) -> str:
     names = [*data.files.files] if data.files else []
     held = [name for name in names if any(name in one.split.get("held_out", ()) for one in weights)]
     zero = [cure for name in weights[0].described.class_names if (cure := zero_cure(name))]
-    path = data.files.path if data.files else data.law
+    way = "Judge by another scene, or by pixels that the training had no label of: --labels FILE"
     if held:
         way = f"Judge by frames that were held out: --frames {','.join(held)}"
-    elif len(names) > 1:
+    elif len(names) > 1 and data.files:
+        path = data.files.path
         way = f"Hold some out of a training: spectralzoom train {path} --hold-out {names[-1]} -o FILE.safetensors"
-    else:
-        way = "Judge by another scene, or by pixels that the training had no label of: --labels FILE"
     return "; ".join([way, *(f"label 0 was a class of the training: {one}, and train again" for one in zero)])

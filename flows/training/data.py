@@ -282,12 +282,13 @@ def zero_cure(kind: str) -> str:
     return f"if it means unlabelled, write unlabelled = {value} into a {SETTINGS_NAME} beside the scene" * bool(value)
 
 
-def zero_sentence(**label_zero: Any) -> str:
-    """Return what label 0 stands for, by its ``class`` and ``fraction`` in a record."""
-    kind, share = label_zero["class"], f"{label_zero['fraction']:.1%} of the pixels"
-    if kind:
-        return "; ".join(filter(None, (f"label 0 is the class {kind}: {share}", zero_cure(kind))))
-    return f"label 0 is no class, {share} are unlabelled; a table [classes] in a {SETTINGS_NAME} can name it: NAME = 0"
+def zero_sentence(name: str = "", fraction: float = 0.0) -> str:
+    """Return what label 0 stands for: a class of that name, or unlabelled; empty where all labels are others."""
+    share = f"{fraction:.1%} of the pixels"
+    if name:
+        return "; ".join(filter(None, (f"label 0 is the class {name}: {share}", zero_cure(name))))
+    way = f"a table [classes] in a {SETTINGS_NAME} can name it: NAME = 0"
+    return f"label 0 is no class, {share} are unlabelled; {way}" if fraction else ""
 
 
 EMPTY = "{scenes} without any value left out: {names}"

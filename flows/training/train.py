@@ -346,8 +346,8 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     with one_after_the_other(console) as report:
         record = train_weights(request, report, lambda note: show_text(f"note: {note}", console))
     _print_figures(record, request, console)
-    if LABEL_ZERO in record:
-        show_text(zero_sentence(**record[LABEL_ZERO]), console)
+    if text := zero_sentence(**record.get(LABEL_ZERO, {})):
+        show_text(text, console)
     return record
 
 

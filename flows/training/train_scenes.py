@@ -97,7 +97,7 @@ class Scenes:
         number = self.common.names.index(zero) if zero else UNLABELLED
         labels = [one.labels[: one.shape[0], : one.shape[1]] for one in self.train.examples]
         count = sum(np.count_nonzero(one == number) for one in labels)
-        return {"class": zero, "fraction": count / sum(one.size for one in labels)}
+        return {"name": zero, "fraction": count / sum(one.size for one in labels)}
 
     @property
     def joined(self) -> Scenes:

@@ -21,35 +21,31 @@ RANGES: dict[str, tuple[float, float]] = {
     "loss": (-1, 1),
     "bias": (-100, 100),
 }
-MAY_LACK = ("day", "sun_elevation_deg", "ground_pixel_m", "bands_nm")  # null
-MAY_LACK_SCORE = ("miou", "spread", "per_class_iou", "error", "loss")  # null, or NaN where no pixel has a label
+MAY_LACK = ("day", "sun_elevation_deg", "ground_pixel_m", "bands_nm")  # null where unknown
+SCORES = ("miou", "spread", "per_class_iou", "error", "loss")  # null or NaN where no pixel has a label
 READ = ("calibration", "trained_on", "scans", "cascade", "validation")  # tables of a record
 
 
 def check_record(record: Mapping[str, Any], parts: int) -> None:
     """Raise ValueError for an entry that is no table, or has a number beyond its range; of the mixture's ``parts``."""
-    for name, table in {name: record[name] for name in READ if record.get(name) is not None}.items():
-        if not isinstance(table, Mapping):
-            raise ValueError(f"its {name} is {table!r}, expected a table")
-        check_ranges(table)
-    check_ranges({"class_values": record.get("class_values") or []})
-    if (plain := record.get("plain")) is not None and plain not in range(parts):
-        raise ValueError(f"its plain classifier is {plain!r}, expected a number below {parts}")
+    tables = {name: record.get(name) or {} for name in (*READ, "split")}
+    if wrong := [name for name, table in tables.items() if not isinstance(table, Mapping)]:
+        raise ValueError(f"its {wrong[0]} is {tables[wrong[0]]!r}, expected a table")
+    check_ranges([*map(tables.get, READ), {"class_values": record.get("class_values") or []}])
+    if record.get("plain") is not None and record["plain"] not in range(parts):
+        raise ValueError(f"its plain classifier is {record['plain']!r}, expected a number below {parts}")
 
 
 def check_ranges(content: Any, name: str = "") -> None:
-    """Raise ValueError for a number in a table, or in lists of one, that is beyond the range of its ``name``."""
+    """Raise ValueError for a number in tables and lists that is beyond the range of its ``name``."""
     if isinstance(content, Mapping):
         for key, value in content.items():
             check_ranges(value, name or (key if key in RANGES else ""))
     elif isinstance(content, list):
         for value in content:
             check_ranges(value, name)
-    elif name:
+    elif name and not (content is None and name in (*MAY_LACK, *SCORES)):
         low, high = RANGES[name]
         is_number = isinstance(content, int | float) and not isinstance(content, bool)
-        lacks = content is None and name in (*MAY_LACK, *MAY_LACK_SCORE)
-        if not lacks and not (
-            is_number and (low <= content <= high or (content != content and name in MAY_LACK_SCORE))
-        ):
+        if not is_number or not (low <= content <= high or (content != content and name in SCORES)):
             raise ValueError(f"its {name} is {content!r}, expected a number from {low:g} to {high:g}")

@@ -63,26 +63,24 @@ def _checked(codecs: Any, where: str, numbers: int | None = None, width: int = 0
     for codec in codecs:
         given = codec if isinstance(codec, dict) else {"name": codec}
         name = str(given.get("name", given.get("id")))
-        kind = name.lower().removeprefix("numcodecs.")
         about = given.get("configuration") or given
         types = [np.dtype(about[key]) for key in _TYPES if about.get(key) is not None]
-        if kind not in PLAIN_CODECS.union(PACKERS, CHECKSUMS) or any(one.kind not in "buif" for one in types):
+        kinds.append(name.lower().removeprefix("numcodecs."))
+        if kinds[-1] not in PLAIN_CODECS.union(PACKERS, CHECKSUMS) or any(one.kind not in "buif" for one in types):
             raise SceneError(
                 f"{where} asks for the codec {name!r}, which is not read; store plain numbers with {', '.join(PACKERS)}"
             )
         width = types[-1].itemsize if types else width
-        if kind == "sharding_indexed":
+        if kinds[-1] == "sharding_indexed":
             lists = {key: _checked(about[key], where) for key in ("codecs", "index_codecs") if key in about}
             codec = given | {"configuration": about | lists}
-        elif kind in PACKERS:
-            if {"sharding_indexed", *PACKERS} & {*kinds}:
-                raise SceneError(f"{where} packs chunks twice, by {kinds[-1]} and {name}; store them with one packer")
+        elif kinds[-1] in PACKERS:
+            if {"sharding_indexed", *PACKERS} & {*kinds[:-1]}:
+                raise SceneError(f"{where} packs chunks twice, by {kinds[-2]} and {name}; store them with one packer")
             spare = 4 * sum(one in CHECKSUMS for one in kinds)
-            limited = {"packer": kind, "spare": spare}
-            codec = {"name": LIMITED, "configuration": limited}
+            codec = {"name": LIMITED, "configuration": {"packer": kinds[-1], "spare": spare}}
             if numbers is not None:
-                codec = {"id": LIMITED, "packer": kind, "size": numbers * width + spare}
-        kinds.append(kind)
+                codec = {"id": LIMITED, "packer": kinds[-1], "size": numbers * width + spare}
         found.append(codec)
     return found
 

@@ -12,6 +12,7 @@ import io
 import math
 import zlib
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numcodecs
@@ -30,40 +31,34 @@ _ZSTD = 0xFD2FB528  # with which frames begin
 def unpack(packer: str, packed: Any, size: int) -> NDArray[np.uint8]:
     """Return the ``size`` decoded bytes of a chunk (ValueError: it has another size, or is damaged)."""
     data = memoryview(packed).cast("B")
+    plain: Any = b""
     if packer == "zlib":
         stream = zlib.decompressobj()
         plain = stream.decompress(data, size + 1)
-        there = len(plain) if stream.eof or len(plain) > size else -1
+        plain = plain if stream.eof else b""  # longer or cut off
     elif packer in ("gzip", "bz2"):
         with gzip.open(io.BytesIO(data)) if packer == "gzip" else bz2.open(io.BytesIO(data)) as file:
             plain = file.read(size + 1)
-        there = len(plain)
-    else:
-        stated = _zstd_size(data) if packer == "zstd" else _number(data[4:8] if packer == "blosc" else data[:4])
-        there = size if stated is None else stated  # numcodecs fills an array exactly where no size is stated
-        plain = b""
-        if packer == "blosc" and _number(data[12:16]) > len(data):  # its decoder would read beyond them
-            there = -1
-        if there == size:
-            return np.asarray(numcodecs.get_codec({"id": packer}).decode(data, np.empty(size, np.uint8)))
-    if there != size:
-        many = "cut off" if there < 0 else f"more than {size}" if there > size else f"{there}"
-        raise ValueError(f"a chunk packed by {packer} has {many} bytes, and its array declares {size}")
+    elif _stated_size(packer, data) in (None, size):  # numcodecs fills an array exactly where no size is stated
+        plain = numcodecs.get_codec({"id": packer}).decode(data, np.empty(size, np.uint8))
+    if len(plain) != size:
+        raise ValueError(f"a chunk packed by {packer} has not the {size} bytes that its array declares")
     return np.frombuffer(plain, np.uint8)
 
 
-def _zstd_size(data: memoryview) -> int | None:
-    """Return the bytes that the first frame of a chunk states; None if it states none."""
-    if len(data) < 5 or _number(data[:4]) != _ZSTD:
-        raise ValueError("a chunk packed by zstd is damaged")
+def _stated_size(packer: str, data: memoryview) -> int | None:
+    """Return the decoded bytes that the head of a chunk states: of zstd in its first frame, None if there is none."""
+    number = partial(int.from_bytes, byteorder="little")
+    if packer == "lz4":
+        return number(data[:4])
+    if packer == "blosc":  # its decoder would read beyond a chunk that is cut off
+        return number(data[4:8]) if number(data[12:16]) <= len(data) else -1
+    if len(data) < 5 or number(data[:4]) != _ZSTD:
+        return -1
     single = data[4] >> 5 & 1
     width = (single, 2, 4, 8)[data[4] >> 6]
     at = 6 - single + (0, 1, 2, 4)[data[4] & 3]
-    return _number(data[at : at + width]) + 256 * (width == 2) if width else None
-
-
-def _number(data: memoryview) -> int:
-    return int.from_bytes(data, "little")
+    return number(data[at : at + width]) + 256 * (width == 2) if width else None
 
 
 @dataclass(frozen=True)

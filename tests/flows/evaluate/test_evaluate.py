@@ -177,7 +177,7 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("mIoU: w.safetensors ", "overall", "average", "kappa", "MACs"))
+    assert all(word in shown for word in ("mIoU, held out: w.safetensors ", "overall", "average", "kappa", "MACs"))
 
 
 def test_miou_of_frames_comes_from_their_summed_counts():
