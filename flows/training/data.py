@@ -273,6 +273,24 @@ def check_taught(dataset: str, taught: Sequence[str], frames: Sequence[str]) -> 
         raise SceneError(f"{dataset}: training needs two or more classes, and {note}")
 
 
+UNNAMED_ZERO = {"class_0": "0", "colour_000000": "[0, 0, 0]"}  # class without a name of its own -> its label
+
+
+def zero_cure(kind: str) -> str:
+    """Return how to say that the label 0 is no class; empty for another class, or one that a scene.toml names."""
+    value = UNNAMED_ZERO.get(kind)
+    return f"if it means unlabelled, write unlabelled = {value} into a {SETTINGS_NAME} beside the scene" * bool(value)
+
+
+def zero_sentence(name: str = "", fraction: float = 0.0) -> str:
+    """Return what label 0 stands for: a class of that name, or unlabelled; empty where all labels are others."""
+    share = f"{fraction:.1%} of the pixels"
+    if name:
+        return "; ".join(filter(None, (f"label 0 is the class {name}: {share}", zero_cure(name))))
+    way = f"a table [classes] in a {SETTINGS_NAME} can name it: NAME = 0"
+    return f"label 0 is no class, {share} are unlabelled; {way}" if fraction else ""
+
+
 EMPTY = "{scenes} without any value left out: {names}"
 MOVED = (
     "labels of {names} have another place, CRS or pixels than their images: they are brought to the images' pixels by"

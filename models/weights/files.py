@@ -20,6 +20,7 @@ from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.network.sizes import SegmenterConfig, TemporalSizes
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from spectralzoom.models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
+from spectralzoom.models.weights.ranges import check_ranges, check_record
 from spectralzoom.pipeline.errors import WavelengthError, WeightsError
 from spectralzoom.pipeline.readings import readings_alone
 from spectralzoom.pipeline.signal.components import Components
@@ -299,6 +300,8 @@ def describe_weights(path: Path) -> Description:
                 f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected "
                 f"{config.columns} of them between ascending wavelengths"
             )
+        check_record(record, len(config.parts))
+        check_ranges(about.get(MAP_SCORES) or {})
         keys = about["keys"]
         map_scores = MapScores.read(about[MAP_SCORES]) if MAP_SCORES in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None

@@ -215,9 +215,8 @@ def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | No
     """Return the texts, one a band, of the first array of texts that has one of the names; None each without one."""
     listed = [arrays[name] for name in names if name in arrays]
     texts = next((one for one in listed if one.shape == (count,) and one.dtype.kind in "SOUT"), None)
-    each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
-    plain = [one.item() if isinstance(one, np.ndarray) else one for one in each]
-    return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in plain]
+    each = [None] * count if texts is None else texts[...].tolist()
+    return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in each]
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.allowed_codecs import CheckedStore, outside_links
+from spectralzoom.storage.readers.allowed_codecs import CheckedStore, check_filters, outside_links
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
 from spectralzoom.storage.readers.own_files import within
 
@@ -216,6 +216,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     def read(name: str, part: Any) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
+            check_filters(file[name])
             return np.asarray(file[name][part])
 
     def visit(name: str, item: Any) -> None:
