@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import AsyncIterator
 from typing import Any
 
 import h5py
-from zarr.abc.store import ByteRequest, Store
+from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
+from zarr.storage import LocalStore, WrapperStore
 
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.storage.readers.user_files import files_below, is_there
 
 PACKERS = ("blosc", "zstd", "gzip", "zlib", "bz2", "lz4")
 PLAIN_CODECS = {
@@ -20,15 +22,17 @@ PLAIN_CODECS = {
 }
 
 
-class CheckedStore(WrapperStore[Store]):
-    """A store of any kind whose arrays use codecs of numbers alone.
+class CheckedStore(WrapperStore[LocalStore]):
+    """A store in a folder, whose arrays use codecs of numbers alone; links in it are followed.
 
-    Raises SceneError on others, such as pickle. Consolidated metadata are left out: each array's own are read.
+    Raises SceneError on others, such as pickle, and on what is no file. Consolidated metadata are left out: each
+    array's own are read.
     """
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key; metadata are checked first."""
         name = key.rpartition("/")[2]
+        is_there(self._store.root / key)
         found = None if name == ".zmetadata" else await super().get(key, prototype, byte_range)
         if found is None or name not in ("zarr.json", ".zarray"):
             return found
@@ -40,6 +44,11 @@ class CheckedStore(WrapperStore[Store]):
         for listed in ("compressor", "filters", "codecs"):
             _check_codecs(about.get(listed) or [], where)
         return prototype.buffer.from_bytes(json.dumps(about).encode())
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Yield the keys that begin with a folder; those in linked folders too."""
+        for file in files_below(self._store.root / prefix):
+            yield file.relative_to(self._store.root).as_posix()
 
 
 def _check_codecs(codecs: Any, where: str) -> None:

@@ -15,7 +15,7 @@ from spectralzoom.pipeline.capture.straight_scans import angles_to_positions
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats
-from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.user_files import first_there, is_there
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +48,7 @@ class LinePointing:
 def find_pointing(folder: Path, stem: str, marks: Sequence[str] = (".pointing",)) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = [f"{stem}{mark}{ending}" for mark in marks for ending in ENDINGS]
-    return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
+    return first_there(folder / name for name in names)
 
 
 def load_pointing(
@@ -59,6 +59,7 @@ def load_pointing(
     If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` transforms the
     device's positions to the model's. Raises SceneError: the table cannot be read, or does not describe the cube.
     """
+    is_there(path)
     table = _read_table(path)
     kind = _kind_of(path, list(table.columns))
     rows = table
