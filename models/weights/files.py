@@ -222,7 +222,7 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
 
 
 def load_reader(weights: Path, described: Description | None = None) -> TemporalReader:
-    """Load the temporal reader of weights, as ``described``. WeightsError: their file has none, is damaged or another."""
+    """Load the temporal reader of weights, as ``described``. WeightsError: as `load_weights`, or none is there."""
     import torch
 
     described = described or describe_weights(weights)

@@ -34,7 +34,7 @@ class FileNumbers:
             shape, offset = (max(stop - first, 0), *shape[1:]), offset + first * self.strides[0]
             part = slice(None, None, rows.step), *rest
         with self.path.open("rb") as file:
-            return self._block(file, offset, shape, self.strides)[part]
+            return np.asarray(self._block(file, offset, shape, self.strides)[part])
 
     def _block(self, file: BinaryIO, offset: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> NDArray[Any]:
         """Read a block at once if most bytes of its span are wanted, else piece by piece along its widest axis."""
@@ -49,4 +49,4 @@ class FileNumbers:
         axis = max((axis for axis, size in enumerate(shape) if size > 1), key=strides.__getitem__)
         rest, steps = shape[:axis] + shape[axis + 1 :], strides[:axis] + strides[axis + 1 :]
         pieces = [self._block(file, offset + at * strides[axis], rest, steps) for at in range(shape[axis])]
-        return np.stack(pieces, axis)
+        return np.moveaxis(np.stack(pieces), 0, axis)

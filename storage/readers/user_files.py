@@ -149,10 +149,11 @@ def files_below(folder: Path) -> list[Path]:
     opened = _reading.get() or OpenedFiles()
     for place, folders, names in os.walk(folder, followlinks=True):
         about = Path(place).stat()
+        if (about.st_dev, about.st_ino) in visited:
+            folders.clear()
+            continue
+        visited.add((about.st_dev, about.st_ino))
         own = [path for path in (Path(place, name) for name in names) if path.is_file()]
-        if (identity := (about.st_dev, about.st_ino)) in visited:
-            own = folders[:] = []
-        visited.add(identity)
         for path in (Path(place), *own):
             opened.note(path)
         found += own
