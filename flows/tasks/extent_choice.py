@@ -179,7 +179,7 @@ def _swaths(
     Probabilities are those of the nearest pixel among every second row and column.
     """
     store = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr")
-    read = None if weights.reader is None else load_reader(path)
+    read = None if weights.reader is None else load_reader(path, weights)
     across = np.arange(grid.width) // EVERY_PX
     for rows in cuts(grid.height, SWATH_PATCHES * grid.patch):
         first, last = max(rows.start - EVERY_PX * HALO, 0), min(rows.stop + EVERY_PX * HALO, grid.height)

@@ -49,11 +49,11 @@ class SurveyModel:
         Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
         """
         described = describe_weights(path)
-        load = Once(lambda: load_weights(path).on(choose_device(device)))
+        load = Once(lambda: load_weights(path, described).on(choose_device(device)))
         if not planning:
             load()
             if described.reader is not None:
-                load_reader(path)
+                load_reader(path, described)
         return SurveyModel(path, described, load)
 
     @staticmethod

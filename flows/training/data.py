@@ -36,7 +36,6 @@ from spectralzoom.storage.readers.label_files import (
     scene_number,
 )
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
@@ -136,7 +135,7 @@ def _scenes(path: str | Path) -> tuple[dict[str, str], dict[str, Path], tuple[Pa
             f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"
             f"{folders_within(folder)}"
         )
-    names = _names([within(folder, image) for image in found.images])
+    names = _names(found.images)
     return (
         {name: str(image) for name, image in names.items()},
         {name: found.labels[image] for name, image in names.items() if image in found.labels},

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import AsyncIterator
 from typing import Any
 
 import h5py
 import numpy as np
-from zarr.abc.store import ByteRequest, Store
+from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
+from zarr.storage import LocalStore, WrapperStore
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.chunk_limits import LIMITED, PACKERS
+from spectralzoom.storage.readers.user_files import files_below, is_there
 
 CHECKSUMS = ("crc32", "crc32c", "adler32", "fletcher32", "jenkins_lookup3")  # of four bytes
 PLAIN_CODECS = {
@@ -24,15 +26,17 @@ _TYPES = ("dtype", "decode_dtype", "astype", "encode_dtype")  # in codecs; the l
 ORDERING = (2, 3, 5, 6)  # filters of HDF5 that do not unpack: shuffle, fletcher32, nbit, scaleoffset
 
 
-class CheckedStore(WrapperStore[Store]):
-    """A store of any kind whose arrays use codecs of numbers alone, and whose chunks give what their array declares.
+class CheckedStore(WrapperStore[LocalStore]):
+    """A store in a folder, whose arrays use codecs of numbers alone, and whose chunks give what their array declares.
 
-    Raises SceneError on other codecs, such as pickle. Consolidated metadata are left out: each array's own are read.
+    Links in it are followed. Raises SceneError on other codecs, such as pickle, and on what is no file. Consolidated
+    metadata are left out: each array's own are read.
     """
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the bytes of a key; metadata are checked first, and name a limited codec for each packer."""
         name = key.rpartition("/")[2]
+        is_there(self._store.root / key)
         found = None if name == ".zmetadata" else await super().get(key, prototype, byte_range)
         if found is None or name not in ("zarr.json", ".zarray"):
             return found
@@ -51,6 +55,11 @@ class CheckedStore(WrapperStore[Store]):
                 {"filters": codecs[:-1] or None, "compressor": codecs[-1]} if packer else {"filters": codecs or None}
             )
         return prototype.buffer.from_bytes(json.dumps(about).encode())
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Yield the keys that begin with a folder; those in linked folders too."""
+        for file in files_below(self._store.root / prefix):
+            yield file.relative_to(self._store.root).as_posix()
 
 
 def _checked(codecs: Any, where: str, numbers: int | None = None, width: int = 0) -> list[Any]:

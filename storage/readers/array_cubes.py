@@ -44,6 +44,7 @@ from spectralzoom.storage.readers.cube_sources import (
 )
 from spectralzoom.storage.readers.packing import CODED, ENDS, FILLS, Turn, packing_of, shown, unpacking, values_of
 from spectralzoom.storage.readers.places import Place, place_of_dataset
+from spectralzoom.storage.readers.user_files import files_below
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -70,6 +71,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
     ending = path.suffix.lower()
     guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
     with guard():
+        files = tuple(files_below(path)) if path.is_dir() else (path,)
         arrays, about = list_arrays(path)
         name, notes = _chosen(arrays, variable, path, (2, 3) if labels else (3, 2))
         array = arrays[name]
@@ -88,7 +90,6 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         packing = packing_of(array.attrs, array.where, count)
         unpack, nodata = unpacking(packing, array.dtype.newbyteorder("="))
         taken = taken_with(path.name, about, array.attrs)
-        files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
     unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
     said = [*of_time, *acquired.notes, *array.notes, *notes, *_value_notes(array), *unnamed]
     dtype, read = _reader_of(array, order, unpack, guard)

@@ -24,6 +24,7 @@ from spectralzoom.pipeline.signal.calibrate import calibrate
 from spectralzoom.pipeline.signal.line_faults import DarkLevel
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.band_facts import Bands
+from spectralzoom.storage.readers.user_files import OpenedFiles
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
@@ -99,6 +100,7 @@ class CubeSource:
     dtype: np.dtype[Any]
     read: ReadLines
     files: tuple[Path, ...]  # that it was read from
+    opened: OpenedFiles = field(default_factory=OpenedFiles)  # these, and headers and metadata
     lines: LineFacts = LineFacts()
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)

@@ -16,7 +16,7 @@ from spectralzoom.storage.readers.band_facts import Bands, bands_of_lists, numbe
 from spectralzoom.storage.readers.band_matches import match_bands
 from spectralzoom.storage.readers.cube_sources import reading
 from spectralzoom.storage.readers.envi_files import open_envi_cube
-from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.user_files import first_there, is_there
 
 KINDS = ("dark", "white", "bad")  # behind the name of a cube in those of its frames
 
@@ -39,7 +39,7 @@ def find_reference(folder: Path, kind: str) -> Path | None:
     if len(found) > 1:
         names = ", ".join(entry.name for entry in found)
         raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
-    return within(folder, found[0]) if found else None
+    return found[0] if found else None
 
 
 def find_frames(
@@ -54,7 +54,7 @@ def find_frames(
         beside = (stem.with_name(f"{stem.name}.{kind}{ending}") for ending in (".hdr", ".npy"))
         if (file := stated.get(kind)) is not None and not file.exists():
             raise SceneError(f"there is no file {file}; check the name (seen from {Path.cwd()})")
-        file = file or next((within(stem.parent, one) for one in beside if one.is_file()), None)
+        file = file or first_there(beside)
         file = find_reference(stem.parent, kind) if file is None and kind != "bad" else file
         if file is not None:
             frames[kind] = load_frame(file, kind, shape, bands)
@@ -67,16 +67,16 @@ def load_frame(path: Path, kind: str, shape: tuple[int, int], bands: Bands) -> F
     Raises SceneError: it has no real numbers of the (sample, band) ``shape``, or other bands.
     """
     where = f"the {kind} frame {path.name}"
-    if path.is_dir():
+    if is_there(path) and path.is_dir():
         raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
     files: tuple[Path, ...] = (path,)
     taken, fields = Taken(where), {}
     if path.suffix.lower() == ".npy":
         with reading(path, ".npy"):
-            values = load_npy(path)
+            values = load_npy(path)[...]
     else:
         cube = open_envi_cube(path)
-        values, fields = cube.values, dict(cube.header.fields)
+        values, fields = cube.values[...], dict(cube.header.fields)
         files, taken = (cube.header_path, cube.path), taken_with(where, fields, cube.header.settings)
     values = values.astype(np.uint8) if values.dtype.kind == "b" else values  # of a bad frame
     if values.dtype.kind not in "uif":

@@ -37,6 +37,7 @@ from spectralzoom.storage.readers.cube_sources import (
 )
 from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
 from spectralzoom.storage.readers.places import place_of_file
+from spectralzoom.storage.readers.user_files import is_there
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
 JPEG2000_ENDINGS = (".jp2", ".j2k")
@@ -58,9 +59,11 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     Scale and offset of the file are applied if ``scaled``; else the numbers of a palette are kept. Raises SceneError:
     it is damaged, claims more than its bytes can hold, or is a scene with a palette.
     """
-    check_sidecars(path)
+    check_sidecars(path, _DRIVERS[path.suffix.lower()])
     with _opened(path) as file:
         _check_image(file, path)
+        for own in file.files:  # also metadata, mask and overviews beside it
+            is_there(Path(own))
         orientation, exif = _exif_of(path)
         if scaled and [kind.name for kind in file.colorinterp] == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")

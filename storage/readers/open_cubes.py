@@ -22,6 +22,7 @@ from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_sour
 from spectralzoom.storage.readers.frames import find_reference, load_frame, taken_of
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
+from spectralzoom.storage.readers.user_files import is_there, reading_files
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -81,27 +82,29 @@ def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource
 
     ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
     averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred. Raises
-    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
+    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used; FileChangedError, also as its
+    lines are read: one of its files changed since it was opened.
     """
     path, variable = split_variable(address)
-    match reader_of(address):
-        case "zarr":
-            source = open_arrays(find_zarr_store(path) or path, variable, labels=labels)
-        case "headwall":
-            source = _with_frames(open_headwall_cube(path), path)
-        case "envi":
-            source = open_envi_source(path, scaled=not labels)
-        case "image":
-            source = open_image(path, scaled=not labels)
-        case "array":
-            source = open_arrays(path, variable, labels=labels)
-        case "none" if not path.exists():
+    with reading_files() as opened:
+        if not is_there(path):
             raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-        case "none":
-            ending = path.suffix.lower() or "nothing"
-            raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
+        match reader_of(address):
+            case "zarr":
+                source = open_arrays(find_zarr_store(path) or path, variable, labels=labels)
+            case "headwall":
+                source = _with_frames(open_headwall_cube(path), path)
+            case "envi":
+                source = open_envi_source(path, scaled=not labels)
+            case "image":
+                source = open_image(path, scaled=not labels)
+            case "array":
+                source = open_arrays(path, variable, labels=labels)
+            case "none":
+                ending = path.suffix.lower() or "nothing"
+                raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
     check_cube_source(source)
-    return source
+    return replace(source, opened=opened, read=opened.guarded(source.read))
 
 
 def _with_frames(source: CubeSource, folder: Path) -> CubeSource:

@@ -330,7 +330,7 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     if not set(_ENVI_PLACES) & set(header):
         return None, ()
     rasterio = importlib.import_module("rasterio")
-    check_sidecars(data)
+    check_sidecars(data, "ENVI")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)

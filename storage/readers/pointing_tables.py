@@ -17,7 +17,7 @@ from spectralzoom.pipeline.exposures import WILD_RATIO
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats
 from spectralzoom.pipeline.signal.line_faults import leave_out, wild_exposures
-from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.user_files import first_there, is_there
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,7 +54,7 @@ class LinePointing:
 def find_pointing(folder: Path, stem: str, marks: Sequence[str] = (".pointing",)) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = [f"{stem}{mark}{ending}" for mark in marks for ending in ENDINGS]
-    return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
+    return first_there(folder / name for name in names)
 
 
 def load_pointing(
@@ -66,6 +66,7 @@ def load_pointing(
     device's positions to the model's. Lines that cannot be are not valid. Raises SceneError: the table cannot be read,
     or does not describe the cube, or more than a tenth of the lines cannot be.
     """
+    is_there(path)
     table = _read_table(path)
     kind = _kind_of(path, list(table.columns))
     rows = table

@@ -23,8 +23,8 @@ from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, load_envi_header
 from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, taken_of
 from spectralzoom.storage.readers.open_cubes import open_cube_source, reader_of, with_wavelengths
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import LinePointing
+from spectralzoom.storage.readers.user_files import is_there
 
 SAMPLED_LINES = 64  # for bits
 
@@ -59,7 +59,8 @@ def find_cubes(path: Path) -> list[Path]:
     """Return the cubes of an address: itself, or the ENVI cubes or Zarr stores of a folder (SceneError: none)."""
     if not path.is_dir() or find_zarr_store(path) is not None:
         return [path]
-    headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
+    entries = sorted(entry for entry in path.iterdir() if entry.suffix.lower() in (".hdr", ".zarr") and is_there(entry))
+    headers = [entry for entry in entries if entry.suffix.lower() == ".hdr" and entry.is_file()]
     if any(entry.name.lower().startswith("raw_") for entry in headers):
         return [path]  # parts of a Headwall camera's cube
     stems = [(entry, _stem(entry).lower()) for entry in headers]
@@ -79,7 +80,7 @@ def find_cubes(path: Path) -> list[Path]:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     if cubes and stores:
         raise SceneError(f"{path} holds ENVI cubes and the Zarr store {stores[0].name}; name one, or move either kind")
-    return [within(path, one) for one in cubes or stores]
+    return cubes or stores
 
 
 def _stem(path: Path) -> str:

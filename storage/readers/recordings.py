@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -33,9 +33,9 @@ from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
+from spectralzoom.storage.readers.user_files import OpenedFiles, files_below, reading_files
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import MANIFEST, Archive, check_store, damage, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256
@@ -54,6 +54,7 @@ def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]
     return raw if all(map(is_there, raw)) else condensed[:1] or raw
 
 
+@reading_files()
 def open_recording(
     address: str | Path,
     camera: LineCamera | None = None,
@@ -78,7 +79,7 @@ def open_recording(
     if (of_archive := _run_with_cubes(address)) is not None:
         stores = of_archive[2]
     else:
-        beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
+        beside = [path] if _is_raw_cube(path) else sorted(path.glob("*.zarr"))
         stores = [one for one in beside if _is_raw_cube(one)]
     flags = {"pointing": pointing, "dark": dark, "white": white, "wavelengths": wavelengths}
     if not stores:
@@ -97,7 +98,9 @@ def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
     """Open raw cubes, or condensed sweeps, of an archive."""
     for folder in {path.parent for path in stores if (path.parent / MANIFEST).is_file()}:
         check_store(folder)
-    cubes = [open_lines(path) for path in stores]
+    with reading_files() as opened:
+        light = tuple(_content_of(path, opened) for path in stores)
+        cubes = [open_lines(path) for path in stores]
     first = cubes[0]
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
@@ -105,12 +108,9 @@ def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
         if "dn" in cube.group and (lost := lost_chunks(array_of(cube.group, "dn"))[0]):
             raise IncompleteStoreError(f"{path}/dn lacks {lost} of its chunks, whose lines would be 0; copy it again")
     notes = [RESTORED] if any(isinstance(cube, RestoredCube) for cube in cubes) else []
-    sweeps = tuple(_stored_sweep(path, cube, notes) for path, cube in zip(stores, cubes, strict=True))
-    light = tuple(
-        f"{path.name} {sha256(path.parent / MANIFEST)}"
-        if (path.parent / MANIFEST).is_file()
-        else " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
-        for path in stores
+    sweeps = tuple(
+        replace(one, read=opened.guarded(one.read))
+        for one in (_stored_sweep(path, cube, notes) for path, cube in zip(stores, cubes, strict=True))
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
     return Recording(sweeps, camera, first.wavelength_nm, first.fwhm_nm, tuple(notes), light)
@@ -135,15 +135,17 @@ def _stored_sweep(path: Path, cube: RawCube, notes: list[str]) -> RecordedSweep:
     return RecordedSweep(cube.sweep, references, position, cube.time_s, exposure_ms, valid, cube.read_lines)
 
 
+def _content_of(path: Path, opened: OpenedFiles) -> str:
+    """Return the hash of a raw cube: of its store's manifest in an archive, elsewhere of each file."""
+    if (path.parent / MANIFEST).is_file():
+        return f"{path.name} {sha256(path.parent / MANIFEST)}"
+    return " ".join(f"{file.relative_to(path)}:{opened.digest(file)}" for file in files_below(path))
+
+
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
     """Return the camera with the exposure of a recording, if known."""
     kept = not exposures_ms or camera.exposure_ms in exposures_ms
     return camera if kept else replace(camera, exposure_ms=exposures_ms[0])
-
-
-def _stamps(files: Iterable[Path]) -> list[str]:
-    """Return name, size and time of change of files."""
-    return [f"{file.name}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
 
 
 def _recording_of(files: Mapping[Path, FileCube], camera: LineCamera, white_reference: ArrayLike) -> Recording:
@@ -176,7 +178,7 @@ def _recording_of(files: Mapping[Path, FileCube], camera: LineCamera, white_refe
         found, more = _sweeps_of(cube, camera, white_reference, stated=stated)
         sweeps += found
         notes += more
-    light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
+    light = tuple(cube.source.opened.digest(file) for cube in cubes for file in cube.source.files)
     unique = tuple(dict.fromkeys(notes))
     acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
     of_bands = bands.wavelength_nm, bands.fwhm_nm

@@ -39,7 +39,7 @@ from spectralzoom.storage.readers.scene_toml import (
     find_scene_settings,
     settle_wavelengths,
 )
-from spectralzoom.storage.whole_files import sha256
+from spectralzoom.storage.readers.user_files import reading_files
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed
@@ -78,6 +78,7 @@ class SceneFile:
         return self.read(0, self.shape[0]) if self.kept is None else self.kept
 
 
+@reading_files()
 def open_scene_file(
     address: str | Path,
     *,
@@ -112,7 +113,7 @@ def open_scene_file(
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
     missing, filled_px, void, gaps = _find_gaps(file, values, kept)
     found, label_note = _labels_of(file, source, labels, settings, classes or {})
-    content = _content_hash(file, source.files)
+    content = _content_hash(file, source)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     scene = SceneFile(
         name=file.stem,
@@ -164,12 +165,12 @@ def _light_hash(
     return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
 
 
-def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
+def _content_hash(file: Path, source: CubeSource) -> str:
     """Return the hash of all files, and of their names within a folder."""
-    if files == (file,):
-        return sha256(file)
-    within = [entry.relative_to(file).as_posix() if file in entry.parents else "" for entry in files]
-    return _digest(*((name, sha256(entry)) for name, entry in zip(within, files, strict=True)))
+    if source.files == (file,):
+        return source.opened.digest(file)
+    names = [entry.relative_to(file).as_posix() if file in entry.parents else "" for entry in source.files]
+    return _digest(*zip(names, map(source.opened.digest, source.files), strict=True))
 
 
 def _chosen_bands(
@@ -228,6 +229,7 @@ def _read_from(address: str | Path, found: Labels, settings: SceneSettings) -> s
     return f"labels from {address}, {how}"
 
 
+@reading_files()
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
     """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
     settings = find_scene_settings(split_variable(address)[0])

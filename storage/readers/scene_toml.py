@@ -25,7 +25,8 @@ from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.setting_fields import numbers_of
 from spectralzoom.pipeline.toml_files import read_toml
 from spectralzoom.storage.readers.band_facts import RANGE_NM, Bands, bands_text, why_unknown
-from spectralzoom.storage.readers.own_files import stated_file, within
+from spectralzoom.storage.readers.own_files import stated_file
+from spectralzoom.storage.readers.user_files import first_there
 
 SETTINGS_NAME = "scene.toml"
 IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scene.toml may be above such a folder
@@ -92,11 +93,8 @@ def find_scene_settings(scene: Path) -> SceneSettings:
     Raises SceneError: the file is no TOML, or has an unknown key or a wrong value.
     """
     folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
-    home = next((folder for folder in folders if (folder / SETTINGS_NAME).is_file()), None)
-    if home is None:
-        return SceneSettings()
-    beside = None if scene.name == SETTINGS_NAME else scene.resolve().parent
-    return load_scene_settings(within(home, home / SETTINGS_NAME, beside))
+    found = first_there(folder / SETTINGS_NAME for folder in folders)
+    return SceneSettings() if found is None else load_scene_settings(found)
 
 
 def is_image_folder(folder: Path) -> bool:
