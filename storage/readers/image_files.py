@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from spectralzoom.pipeline.envi_headers import header_text, split_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, is_named, split_list
+from spectralzoom.storage.readers.band_facts import CENTRES, bad_bands, bands_of_fields, is_named, letters, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -31,11 +32,12 @@ from spectralzoom.storage.readers.cube_sources import (
     ReadLines,
     check_claim,
     check_memory,
+    library_log,
     read_by_chunks,
     reading,
     unpacked,
 )
-from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars
+from spectralzoom.storage.readers.own_files import check_overviews, check_sidecars, within
 from spectralzoom.storage.readers.places import place_of_file
 
 PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
@@ -46,6 +48,7 @@ _DRIVERS = dict.fromkeys(JPEG2000_ENDINGS, "JP2OpenJPEG") | {".png": "PNG", ".bm
 _DRIVERS |= dict.fromkeys((".jpg", ".jpeg"), "JPEG") | dict.fromkeys((".tif", ".tiff"), "GTiff")
 _STRICT = {"GDAL_ERROR_ON_LIBJPEG_WARNING": True, "GDAL_PNG_WHOLE_IMAGE_OPTIM": False}  # cut off files are refused
 _CALLED = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}  # in messages
+MOST_WARNINGS = 5  # of GDAL, as notes
 ALPHA_NOTE = (
     "its alpha channel says where there are pixels, and is no band; if it is one, write so into the file"
     " (gdal_edit.py -colorinterp_4 undefined)"
@@ -59,38 +62,71 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     it is damaged, claims more than its bytes can hold, or is a scene with a palette.
     """
     check_sidecars(path)
-    with _opened(path) as file:
+    with library_log() as heard, _opened(path) as file:
         _check_image(file, path)
         orientation, exif = _exif_of(path)
         if scaled and [kind.name for kind in file.colorinterp] == ["palette"]:
             raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
-        alpha = _alpha_band(file, path)
+        beside, header, of_header = _header_beside(file, path)
+        where_bands = " and ".join((str(path), *(one.name for one in header)))
+        alpha = _alpha_band(file, beside)
         keep = [band for band in range(file.count) if band != alpha]
         void, of_mask = _void(file, alpha)
         geobox, where = place_of_file(file)
-        tags = _tags_of(file, keep)
+        tags = _tags_of(file, keep, beside)
         names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
-        bands = bands_of_fields(tags, names, str(path), colours)
+        bands = bands_of_fields(tags, names, where_bands, colours)
+        if not header and bands.wavelength_nm is None:
+            bands = replace(bands, notes=(*bands.notes, *of_header))
         bad, doubts = bad_bands(tags, len(keep))
         acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
         kind, read = _values_of(file, path, keep, void if scaled else None)
+        of_mask_alone = "NODATA_VALUES" in file.tags()  # a colour
+        voids = [None if of_mask_alone else file.nodatavals[band] for band in keep or [0]]
         source = CubeSource(
             name=path.name,
             shape=(file.height, file.width, len(keep)),
             dtype=kind,
             read=read,
-            files=(path,),
+            files=(path, *header),
             bands=bands,
-            nodata=None if "NODATA_VALUES" in file.tags() else file.nodata,  # a colour is in the mask
+            nodata=voids[0],
             geobox=geobox,
             bad_bands=bad,
             void=void,
             acquired=acquired.text,
-            notes=(*(() if alpha is None else (ALPHA_NOTE,)), *of_mask, *where, *bands.notes, *doubts, *acquired.notes),
+            notes=(
+                *(() if alpha is None else (ALPHA_NOTE,)),
+                *(of_mask + where + bands.notes + doubts + acquired.notes),
+                *(of_header if header else ()),
+            ),
         )
-        scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
-    plain = not scaled or ((scale == 1).all() and (offset == 0).all())
-    return _upright(source if plain else rescaled(source, scale, offset), orientation)
+        if scaled:
+            scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
+            alike = len(set(map(str, voids))) < 2
+            source = rescaled(source, scale, offset, None if alike else np.array(voids, np.float64))
+    warned = [re.sub(r"^CPLE_\w+ in ", "", one.getMessage())[:200] for one in heard if one.name.startswith("rasterio")]
+    warned = [f"GDAL warns: {text}" for text in dict.fromkeys(warned)][:MOST_WARNINGS]
+    return _upright(replace(source, notes=(*source.notes, *warned)), orientation)
+
+
+def _header_beside(file: Any, path: Path) -> tuple[dict[str, str], tuple[Path, ...], tuple[str, ...]]:
+    """Return the fields of an ENVI header beside an image of its size, and its path; else a note that names it."""
+    names = [f"{stem}{ending}" for stem in (path.name, path.stem) for ending in (".hdr", ".HDR")]
+    found = next((one for one in map(path.with_name, names) if one.is_file()), None)
+    try:
+        fields = {} if found is None else split_header(header_text(within(path, found).read_bytes()), found.name)[0]
+    except SceneError:  # of another kind
+        return {}, (), ()
+    if found is None or not any(CENTRES.fullmatch(letters(key)) for key in fields):
+        return {}, (), ()
+    sizes = [fields.get(key, "?") for key in ("lines", "samples", "bands")]
+    if sizes != [str(size) for size in (file.height, file.width, file.count)]:
+        size = f"{sizes[0]} x {sizes[1]} px (y x x) and {sizes[2]} bands"
+        return {}, (), (f"{found.name} beside it is not read: it describes {size}",)
+    others = ", ".join(key for key in fields if re.match(r"reflectance scale|data .*(ignore|gain|offset)", key))
+    note = f"of {found.name} beside it, facts of bands are read, and not {others}; state these in a scene.toml"
+    return fields, (found,), (note,) if others else ()
 
 
 def _check_image(file: Any, path: Path) -> None:
@@ -109,13 +145,14 @@ def _check_image(file: Any, path: Path) -> None:
     check_memory(path, at_a_time if file.driver in _CALLED else claimed * 3)
 
 
-def _alpha_band(file: Any, path: Path) -> int | None:
+def _alpha_band(file: Any, beside: Mapping[str, str]) -> int | None:
     """Return the alpha channel, from 0; None without one, as GDAL calls a fourth band of bytes alpha by default."""
     kinds = [kind.name for kind in file.colorinterp]
     if "alpha" not in kinds:
         return None
     alpha, name = kinds.index("alpha"), file.descriptions[kinds.index("alpha")]
-    known = bands_of_fields(_tags_of(file, range(file.count)), file.descriptions, str(path), kinds).wavelength_nm
+    tags = _tags_of(file, range(file.count), beside)
+    known = bands_of_fields(tags, file.descriptions, "", kinds).wavelength_nm
     named = is_named(name, alpha) and not re.search("alpha|transparen|opacity|mask|^a$", name.lower())
     return None if named or (known is not None and np.isfinite(known[alpha])) else alpha
 
@@ -140,20 +177,36 @@ def _values_of(
     return kind, read_by_chunks(read_rows, file.height, rows)
 
 
-def rescaled(source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64]) -> CubeSource:
-    """Return the cube with ``number * scale + offset`` as values, (band,) each, NaN for its no-data value."""
-    pairs = sorted(set(zip(scale.tolist(), offset.tolist(), strict=True)))
-    others = "" if len(pairs) == 1 else " (others by band)"
+def rescaled(
+    source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64], fill: NDArray[np.float64] | None = None
+) -> CubeSource:
+    """Return the cube with ``number * scale + offset`` as values, (band,) each, NaN for its no-data value.
+
+    ``fill`` is the no-data value of each band, NaN of one without. One that the numbers cannot hold is that of values.
+    """
+    nodata, kind = source.nodata, source.dtype
+    notes = [] if fill is None else [f"the no-data values of the bands are {', '.join(f'{one:g}' for one in fill)}"]
+    if (scale != 1).any() or offset.any():
+        pairs = sorted(set(zip(scale.tolist(), offset.tolist(), strict=True)))
+        others = "" if len(pairs) == 1 else " (others by band)"
+        stated = f"times {pairs[0][0]:g} plus {pairs[0][1]:g}{others}, as in its header"
+        notes.append(f"values are the file's numbers {stated}")
+    elif fill is None:
+        return source
+    held = (
+        nodata is None or kind.kind == "f" or (nodata % 1 == 0 and np.iinfo(kind).min <= nodata <= np.iinfo(kind).max)
+    )
+    if fill is None and not held:
+        notes.append(f"its no-data value {nodata:g} is compared after scaling, since {kind} cannot hold it")
+    void = nodata if fill is None else fill.astype(kind) if kind.kind == "f" else fill
     return replace(
         source,
         dtype=np.dtype(np.float32),
-        read=lambda first, last: unpacked(source.read(first, last), scale, offset, source.nodata),
-        nodata=None,
-        scaling=f"scale {scale.tolist()} offset {offset.tolist()}",
-        notes=(
-            *source.notes,
-            f"values are the file's numbers times {pairs[0][0]:g} plus {pairs[0][1]:g}{others}, as in its header",
-        ),
+        read=lambda first, last: unpacked(source.read(first, last), scale, offset, void),
+        nodata=None if held or fill is not None else nodata,
+        packed_nodata=nodata if held and fill is None else None,
+        scaling=f"scale {scale.tolist()} offset {offset.tolist()}{'' if fill is None else f' nodata {fill.tolist()}'}",
+        notes=(*source.notes, *notes),
     )
 
 
@@ -187,10 +240,13 @@ def _void(file: Any, alpha: int | None) -> tuple[NDArray[np.bool_] | None, tuple
     return found if found.any() else None, ()
 
 
-def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
-    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own."""
+def _tags_of(file: Any, bands: Sequence[int], beside: Mapping[str, str]) -> dict[str, str | Sequence[str]]:
+    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own.
+
+    Fields of a header ``beside`` it count where it has none of this name.
+    """
     tags: dict[str, str | Sequence[str]] = {}
-    for name, value in (file.tags() | file.tags(ns="ENVI")).items():
+    for name, value in {**beside, **file.tags(), **file.tags(ns="ENVI")}.items():
         words = split_list(value, file.count)
         tags[name] = value if words is None else [words[band] for band in bands]
     of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
