@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import h5py
@@ -39,7 +40,19 @@ class CheckedStore(WrapperStore[Store]):
         about.pop("consolidated_metadata", None)
         for listed in ("compressor", "filters", "codecs"):
             _check_codecs(about.get(listed) or [], where)
+        _check_fill(about, where)
         return prototype.buffer.from_bytes(json.dumps(about).encode())
+
+
+def _check_fill(about: dict[str, Any], where: str) -> None:
+    """Refuse the metadata of an array of numbers whose fill value is none (SceneError)."""
+    kind, fill = str(about.get("dtype", about.get("data_type"))), about.get("fill_value", 0)
+    special = "nan|inf(inity)?" if "dtype" in about else r"nan|inf(inity)?|0x[\da-f]+"
+    forms = r"[\d.]+(e[-+]?\d+)?|" + (special if "f" in kind else r"\d+")
+    is_number = re.fullmatch(f"[-+]?({forms})", str(fill).lower())
+    of_numbers = re.fullmatch(r"[<>|=]?[biuf]\d+|bool|u?int\d+|float\d+", kind)
+    if of_numbers and not (is_number or isinstance(fill, bool) or (fill is None and "dtype" in about)):
+        raise SceneError(f"{where} has fill_value = {str(fill)[:80]!r}, expected a number; correct it")
 
 
 def _check_codecs(codecs: Any, where: str) -> None:

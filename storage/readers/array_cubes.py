@@ -57,6 +57,7 @@ BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel
 
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 MOST_UNEVEN = 16  # times that a picture is longer than wide
+_FILL_WORDS = "fillvalue|(data)?ignorevalue|nodata(value)?"
 _SHOWN = 5  # arrays in a note
 
 
@@ -89,6 +90,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         acquired = acquired_of({**stated, **time})
         packing = packing_of(array.attrs, array.where, count)
         unpack, nodata = unpacking(packing, array.dtype.newbyteorder("="))
+        fills = [float(one) for name in FILLS for one in np.ravel(packing.get(name, ()))]
         taken = taken_with(path.name, about, array.attrs)
         files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
     unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
@@ -104,6 +106,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         taken=taken,
         bands=bands,
         nodata=nodata,
+        packed_nodata=fills[0] if fills and unpack is not None else None,
         geobox=geobox,
         bad_bands=bad,
         acquired=acquired.text,
@@ -131,13 +134,15 @@ def _reader_of(
 
 
 def _value_notes(array: FileArray) -> list[str]:
-    """Return notes on the unit of the values, and on scales by names that are not CF's."""
+    """Return notes on the unit of the values, and on scales and fill values by names that are not CF's."""
     unit = unit_of(array.attrs)
-    values = {key: value for key, value in array.attrs.items() if re.search("scale|offset", key.lower())}
+    scales = {key: "scale_factor and add_offset" for key in array.attrs if re.search("scale|offset", key.lower())}
+    fills = {key: "numbers in _FillValue" for key in array.attrs if re.fullmatch(_FILL_WORDS, letters(key))}
+    ends = {key: "numbers" for key in ENDS if np.asarray(array.attrs.get(key, 0)).dtype.kind not in "iuf"}
     return ([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]) + [
-        f"its {key} = {shown(value)} is not applied: only scale_factor and add_offset are"
-        for key, value in values.items()
-        if key not in CODED
+        f"its {key} = {shown(array.attrs[key])} is not applied: only {allowed} are"
+        for key, allowed in (scales | fills | ends).items()
+        if key not in (*CODED, *FILLS)
     ]
 
 

@@ -27,7 +27,7 @@ _LENGTHS: Mapping[str, float] = {
 }
 _BY_SIZE = {"nm": 1.0, "micrometres": 1000.0, "metres": 1e9}
 _UNSAID = ("", "unknown", "none", "unspecified", "-", "1")
-_MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
+MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
 _NUMBER = r"(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[+-]?\d+)?"
 _BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE)  # also of np.float64(450.0)
 _KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
@@ -191,7 +191,7 @@ def _words(value: object) -> list[Any]:
 
 def _is_number(word: object) -> bool:
     """Return whether an item of a list is a number, or a word for a missing one."""
-    return _plain_text(word) in _MISSING or re.fullmatch(rf"[+-]?{_NUMBER}", _plain_text(word)) is not None
+    return _plain_text(word) in MISSING or re.fullmatch(rf"[+-]?{_NUMBER}", _plain_text(word)) is not None
 
 
 def _to_number(text: object) -> float:
@@ -237,6 +237,16 @@ def bands_of_fields(
     return replace(found, notes=(*notes, *found.notes))
 
 
+def stated_first(own: Bands, beside: Bands) -> Bands:
+    """Return a file's own facts if it states them, else those of the header ``beside`` it, if that does; with notes."""
+    if beside.wavelength_nm is None:
+        return own
+    if own.wavelength_nm is None or "assumed" in own.origin:
+        return beside
+    others = [("the header beside it", nm, nm) for nm in beside.wavelength_nm.tolist()]
+    return replace(own, notes=(*own.notes, *_contradiction("the image", own.wavelength_nm, others)))
+
+
 def _contradiction(key: str, nm: NDArray[np.float64], others: Sequence[tuple[str, float, float]]) -> list[str]:
     """Return a note on the first band of which ``others`` give a range [nm] beyond its wavelength in the list."""
     pairs = zip(nm.tolist(), others, strict=True)
@@ -244,7 +254,7 @@ def _contradiction(key: str, nm: NDArray[np.float64], others: Sequence[tuple[str
     if not wrong:
         return []
     at, more = wrong[0], f" (so in {len(wrong)} bands)" if len(wrong) > 1 else ""
-    return [f"band {at} is {nm[at]:g} nm by {key}, which counts; {others[at][0]} contradicts it{more}"]
+    return [f"band {at} is {nm[at]:g} nm by {key}, which counts; {others[at][0]} says another{more}"]
 
 
 def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
@@ -253,7 +263,7 @@ def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | No
         if letters(key) in ("bandname", "bandnames", "longname"):
             words = value.split(",") if isinstance(value, str) else _words(value)
             if len(words) == count:
-                return list(map(str, words))
+                return [str(word).strip() for word in words]
     return [None] * count
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -82,11 +83,13 @@ for _library in (logging.getLogger("PIL"), logging.getLogger("rasterio")):
 
 @contextmanager
 def library_log() -> Iterator[list[logging.LogRecord]]:
-    """Keep what Pillow and rasterio log off the terminal, and return it; a call within another adds to its list."""
+    """Keep what Pillow and rasterio say off the terminal, and return their log; a call within another adds to it."""
     heard: list[logging.LogRecord] = [] if (outer := _HEARD.get()) is None else outer
     token = _HEARD.set(heard)
     try:
-        yield heard
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="PIL|rasterio")
+            yield heard
     finally:
         _HEARD.reset(token)
 
@@ -95,8 +98,7 @@ def library_log() -> Iterator[list[logging.LogRecord]]:
 def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None]:
     """Turn any error of a decoder into a SceneError with the file's name and kind."""
     try:
-        with library_log():
-            yield
+        yield
     except SceneError:
         raise
     except Exception as error:

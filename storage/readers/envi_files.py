@@ -151,7 +151,7 @@ def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -
     """Return the numbers of a list in a header, one a band; the default where there is none. SceneError: others."""
     found = numbers_of_list(fields[name], count) if fields.get(name) else np.full(count, default)
     if found is None or not np.isfinite(found).all():
-        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} numbers; correct the header")
+        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} as numbers; correct it")
     return found
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 import importlib
 import math
 import re
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,16 @@ from PIL import ExifTags, Image
 from spectralzoom.pipeline.envi_headers import header_text, split_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import CENTRES, bad_bands, bands_of_fields, is_named, letters, split_list
+from spectralzoom.storage.readers.band_facts import (
+    CENTRES,
+    Bands,
+    bad_bands,
+    bands_of_fields,
+    is_named,
+    letters,
+    split_list,
+    stated_first,
+)
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -49,6 +57,7 @@ _DRIVERS |= dict.fromkeys((".jpg", ".jpeg"), "JPEG") | dict.fromkeys((".tif", ".
 _STRICT = {"GDAL_ERROR_ON_LIBJPEG_WARNING": True, "GDAL_PNG_WHOLE_IMAGE_OPTIM": False}  # cut off files are refused
 _CALLED = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}  # in messages
 MOST_WARNINGS = 5  # of GDAL, as notes
+MOST_HEADER = 1 << 24  # bytes
 ALPHA_NOTE = (
     "its alpha channel says where there are pixels, and is no band; if it is one, write so into the file"
     " (gdal_edit.py -colorinterp_4 undefined)"
@@ -61,72 +70,95 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
     Scale and offset of the file are applied if ``scaled``; else the numbers of a palette are kept. Raises SceneError:
     it is damaged, claims more than its bytes can hold, or is a scene with a palette.
     """
-    check_sidecars(path)
-    with library_log() as heard, _opened(path) as file:
-        _check_image(file, path)
-        orientation, exif = _exif_of(path)
-        if scaled and [kind.name for kind in file.colorinterp] == ["palette"]:
-            raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
-        beside, header, of_header = _header_beside(file, path)
-        where_bands = " and ".join((str(path), *(one.name for one in header)))
-        alpha = _alpha_band(file, beside)
-        keep = [band for band in range(file.count) if band != alpha]
-        void, of_mask = _void(file, alpha)
-        geobox, where = place_of_file(file)
-        tags = _tags_of(file, keep, beside)
-        names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
-        bands = bands_of_fields(tags, names, where_bands, colours)
-        if not header and bands.wavelength_nm is None:
-            bands = replace(bands, notes=(*bands.notes, *of_header))
-        bad, doubts = bad_bands(tags, len(keep))
-        acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
-        kind, read = _values_of(file, path, keep, void if scaled else None)
-        of_mask_alone = "NODATA_VALUES" in file.tags()  # a colour
-        voids = [None if of_mask_alone else file.nodatavals[band] for band in keep or [0]]
-        source = CubeSource(
-            name=path.name,
-            shape=(file.height, file.width, len(keep)),
-            dtype=kind,
-            read=read,
-            files=(path, *header),
-            bands=bands,
-            nodata=voids[0],
-            geobox=geobox,
-            bad_bands=bad,
-            void=void,
-            acquired=acquired.text,
-            notes=(
-                *(() if alpha is None else (ALPHA_NOTE,)),
-                *(of_mask + where + bands.notes + doubts + acquired.notes),
-                *(of_header if header else ()),
-            ),
-        )
-        if scaled:
-            scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
-            alike = len(set(map(str, voids))) < 2
-            source = rescaled(source, scale, offset, None if alike else np.array(voids, np.float64))
+    with library_log() as heard:
+        check_sidecars(path)
+        with _opened(path) as file:
+            _check_image(file, path)
+            if scaled and [kind.name for kind in file.colorinterp] == ["palette"]:
+                raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
+            orientation, exif = _exif_of(path)
+            source = _source_of(file, path, exif, scaled)
     warned = [re.sub(r"^CPLE_\w+ in ", "", one.getMessage())[:200] for one in heard if one.name.startswith("rasterio")]
     warned = [f"GDAL warns: {text}" for text in dict.fromkeys(warned)][:MOST_WARNINGS]
     return _upright(replace(source, notes=(*source.notes, *warned)), orientation)
 
 
-def _header_beside(file: Any, path: Path) -> tuple[dict[str, str], tuple[Path, ...], tuple[str, ...]]:
-    """Return the fields of an ENVI header beside an image of its size, and its path; else a note that names it."""
+def _source_of(file: Any, path: Path, exif: Mapping[str, Any], scaled: bool) -> CubeSource:
+    """Return an open image as a cube, upright or not."""
+    header = _header_beside(file, path)
+    alpha = _alpha_band(file, header.fields)
+    keep = [band for band in range(file.count) if band != alpha]
+    void, of_mask = _void(file, alpha)
+    geobox, where = place_of_file(file)
+    bands, bad, of_bands = _bands_of(file, path, keep, header)
+    acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
+    kind, read = _values_of(file, path, keep, void if scaled else None)
+    of_colour = "NODATA_VALUES" in file.tags()  # which is in the mask
+    voids = [None if of_colour else file.nodatavals[band] for band in keep or [0]]
+    source = CubeSource(
+        name=path.name,
+        shape=(file.height, file.width, len(keep)),
+        dtype=kind,
+        read=read,
+        files=(path, *header.files),
+        bands=bands,
+        nodata=voids[0],
+        geobox=geobox,
+        bad_bands=bad,
+        void=void,
+        acquired=acquired.text,
+        notes=(*(() if alpha is None else (ALPHA_NOTE,)), *of_mask, *where, *of_bands, *acquired.notes),
+    )
+    if not scaled:
+        return source
+    scale, offset = (np.array([of[band] for band in keep]) for of in (file.scales, file.offsets))
+    alike = len(set(map(str, voids))) == 1
+    return rescaled(source, scale, offset, None if alike else np.array(voids, np.float64))
+
+
+class _Header(NamedTuple):
+    """An ENVI header beside an image: its fields and file if it describes the image, else a note that names it."""
+
+    fields: Mapping[str, str] = {}
+    files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def _header_beside(file: Any, path: Path) -> _Header:
+    """Return the header with wavelengths beside an image, if there is one."""
     names = [f"{stem}{ending}" for stem in (path.name, path.stem) for ending in (".hdr", ".HDR")]
     found = next((one for one in map(path.with_name, names) if one.is_file()), None)
+    if found is None:
+        return _Header()
     try:
-        fields = {} if found is None else split_header(header_text(within(path, found).read_bytes()), found.name)[0]
-    except SceneError:  # of another kind
-        return {}, (), ()
-    if found is None or not any(CENTRES.fullmatch(letters(key)) for key in fields):
-        return {}, (), ()
+        with within(path, found).open("rb") as opened:
+            fields, _ = split_header(header_text(opened.read(MOST_HEADER)), found.name)
+    except (SceneError, OSError):  # of another kind
+        return _Header()
+    if not any(CENTRES.fullmatch(letters(key)) for key in fields):
+        return _Header()
     sizes = [fields.get(key, "?") for key in ("lines", "samples", "bands")]
     if sizes != [str(size) for size in (file.height, file.width, file.count)]:
         size = f"{sizes[0]} x {sizes[1]} px (y x x) and {sizes[2]} bands"
-        return {}, (), (f"{found.name} beside it is not read: it describes {size}",)
+        return _Header(notes=(f"{found.name} beside it is not read: it describes {size}",))
     others = ", ".join(key for key in fields if re.match(r"reflectance scale|data .*(ignore|gain|offset)", key))
-    note = f"of {found.name} beside it, facts of bands are read, and not {others}; state these in a scene.toml"
-    return fields, (found,), (note,) if others else ()
+    left = f"of {found.name} beside it, facts of bands are read, and not {others}; state these in a scene.toml"
+    return _Header(fields, (found,), (left,) if others else ())
+
+
+def _bands_of(
+    file: Any, path: Path, keep: Sequence[int], header: _Header
+) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
+    """Return facts of some bands by tags and names, else by a header; those marked as bad; and notes."""
+    tags, beside = _tags_of(file, keep), _cut(header.fields, file.count, keep)
+    names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
+    bands = bands_of_fields(tags, names, str(path), colours)
+    if header.files:
+        bands = stated_first(bands, bands_of_fields(beside, names, header.files[0].name))
+    bad, doubts = bad_bands({**beside, **tags}, len(keep))
+    if bands.wavelength_nm is None or header.files:
+        bands = replace(bands, notes=(*bands.notes, *header.notes))
+    return bands, bad, (*bands.notes, *doubts)
 
 
 def _check_image(file: Any, path: Path) -> None:
@@ -145,13 +177,13 @@ def _check_image(file: Any, path: Path) -> None:
     check_memory(path, at_a_time if file.driver in _CALLED else claimed * 3)
 
 
-def _alpha_band(file: Any, beside: Mapping[str, str]) -> int | None:
+def _alpha_band(file: Any, beside: Mapping[str, object]) -> int | None:
     """Return the alpha channel, from 0; None without one, as GDAL calls a fourth band of bytes alpha by default."""
     kinds = [kind.name for kind in file.colorinterp]
     if "alpha" not in kinds:
         return None
     alpha, name = kinds.index("alpha"), file.descriptions[kinds.index("alpha")]
-    tags = _tags_of(file, range(file.count), beside)
+    tags = {**beside, **_tags_of(file, range(file.count))}
     known = bands_of_fields(tags, file.descriptions, "", kinds).wavelength_nm
     named = is_named(name, alpha) and not re.search("alpha|transparen|opacity|mask|^a$", name.lower())
     return None if named or (known is not None and np.isfinite(known[alpha])) else alpha
@@ -215,13 +247,13 @@ def _opened(path: Path) -> Iterator[Any]:
     """Open a file (SceneError: it is damaged, or of another kind)."""
     rasterio = importlib.import_module("rasterio")
     driver = _DRIVERS[path.suffix.lower()]
-    with warnings.catch_warnings(), rasterio.Env(**_STRICT):
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        with (
-            reading(path, _CALLED.get(driver, path.suffix.lower()), "Copy it again, or save it as PNG or TIFF"),
-            rasterio.open(path, driver=driver) as file,
-        ):
-            yield file
+    with (
+        library_log(),
+        rasterio.Env(**_STRICT),
+        reading(path, _CALLED.get(driver, path.suffix.lower()), "Copy it again, or save it as PNG or TIFF"),
+        rasterio.open(path, driver=driver) as file,
+    ):
+        yield file
 
 
 def _void(file: Any, alpha: int | None) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
@@ -240,18 +272,19 @@ def _void(file: Any, alpha: int | None) -> tuple[NDArray[np.bool_] | None, tuple
     return found if found.any() else None, ()
 
 
-def _tags_of(file: Any, bands: Sequence[int], beside: Mapping[str, str]) -> dict[str, str | Sequence[str]]:
-    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own.
-
-    Fields of a header ``beside`` it count where it has none of this name.
-    """
-    tags: dict[str, str | Sequence[str]] = {}
-    for name, value in {**beside, **file.tags(), **file.tags(ns="ENVI")}.items():
-        words = split_list(value, file.count)
-        tags[name] = value if words is None else [words[band] for band in bands]
+def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
+    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own."""
     of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
     names = dict.fromkeys(name for own in of_bands for name in own)
+    tags = _cut(file.tags() | file.tags(ns="ENVI"), file.count, bands)
     return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
+
+
+def _cut(fields: Mapping[str, str], count: int, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
+    """Return fields with lists of ``count`` numbers cut to some bands (from 0)."""
+    words = {name: split_list(value, count) for name, value in fields.items()}
+    lists = {name: [one[band] for band in bands] for name, one in words.items() if one is not None}
+    return {**fields, **lists}
 
 
 _ORIENTATION = 274  # tag of Exif 2.32
@@ -269,8 +302,7 @@ _TURNS: Mapping[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
 def _exif_of(path: Path) -> tuple[int, dict[str, Any]]:
     """Return the orientation tag of a TIFF, JPEG or PNG, or that of its XMP, else 1 (upright); and tags of Exif."""
     try:
-        with warnings.catch_warnings(), Image.open(path) as image:
-            warnings.simplefilter("ignore")  # on size, which was checked, and on damaged tags
+        with Image.open(path) as image:
             found = image.getexif().get(_ORIENTATION, 1)
             more = image.getexif().get_ifd(ExifTags.IFD.Exif)  # GDAL reads those of a JPEG, but not of a PNG
     except Exception:  # of a kind that Pillow does not open; a damaged file is refused where it is read

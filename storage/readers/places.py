@@ -333,12 +333,11 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     if not set(_ENVI_PLACES) & set(header):
         return None, ()
     rasterio = importlib.import_module("rasterio")
-    check_sidecars(data)
+    with library_log():
+        check_sidecars(data)
     try:
-        with library_log(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(data, driver="ENVI") as file:
-                found, notes = place_of_file(file)
+        with library_log(), rasterio.open(data, driver="ENVI") as file:
+            found, notes = place_of_file(file)
     except Exception as error:  # of GDAL and PROJ
         return None, (f"its map info cannot be read: {error}",)
     if found is None or found.crs is None:

@@ -96,7 +96,9 @@ def open_scene_file(
     stated = wavelengths is not None or settings.wavelengths_nm is not None or settings.wavelengths_file is not None
     known = [band for band in range(count) if stated or band not in source.bands.unknown]
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands, known)
-    light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
+    light = settle_wavelengths(
+        file, chosen, count, stated=wavelengths, settings=settings, known=source.bands, shape=source.shape
+    )
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
     if keep:
