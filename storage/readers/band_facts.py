@@ -237,16 +237,6 @@ def bands_of_fields(
     return replace(found, notes=(*notes, *found.notes))
 
 
-def stated_first(own: Bands, beside: Bands) -> Bands:
-    """Return a file's own facts if it states them, else those of the header ``beside`` it, if that does; with notes."""
-    if beside.wavelength_nm is None:
-        return own
-    if own.wavelength_nm is None or "assumed" in own.origin:
-        return beside
-    others = [("the header beside it", nm, nm) for nm in beside.wavelength_nm.tolist()]
-    return replace(own, notes=(*own.notes, *_contradiction("the image", own.wavelength_nm, others)))
-
-
 def _contradiction(key: str, nm: NDArray[np.float64], others: Sequence[tuple[str, float, float]]) -> list[str]:
     """Return a note on the first band of which ``others`` give a range [nm] beyond its wavelength in the list."""
     pairs = zip(nm.tolist(), others, strict=True)
@@ -321,37 +311,37 @@ def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[st
 
     A name with a length and another number, and colours that contradict the file's, give a note alone.
     """
-    texts = [_without_number(name, place) for place, name in enumerate(names)]
-    found = [_LENGTH.search(text) for text in texts]
-    if not any(found):
-        return _bands_of_colours(names, where, colours)
     centres = np.full(len(names), np.nan)
-    for at, length in enumerate(found):
-        if length is None:
-            continue
-        if not _is_one_length(texts[at]):
-            return Bands(notes=(f"the band name {names[at]!r} may give several lengths",))
-        centres[at] = _to_number(length[1]) * (scale_nm(length[2]) or np.nan)
-        if not RANGE_NM[0] <= centres[at] <= THERMAL_NM:
-            return Bands(notes=(f"the band name {names[at]!r} gives {centres[at]:g} nm, which is no wavelength",))
+    for at, name in enumerate(names):
+        length, doubt = _length(name, at)
+        if doubt:
+            return Bands(notes=(f"the band name {name!r} {doubt}",))
+        centres[at] = length
     known = centres[np.isfinite(centres)]
+    if not known.size:
+        return _bands_of_colours(names, where, colours)
     if len(set(known)) < len(known):
         return Bands(notes=("the band names give several bands the same length",))
     return bands_of_numbers(centres, "nm", f"wavelengths from the band names of {where}")
 
 
-def _is_one_length(text: str) -> bool:
-    """Return whether a text has one number, which is no width and no end of a range."""
-    one = len(re.findall(r"\d+(?:\.\d+)?", text)) == 1
-    return one and not WIDTHS.search(letters(text)) and not re.search("[<>≤≥±~]", text)
+def _length(name: str | None, place: int) -> tuple[float, str]:
+    """Return the only length in a name [nm], NaN without one; and why it is doubtful: a width, or one of several."""
+    text = _without_number(name, place)
+    if (found := _LENGTH.search(text)) is None:
+        return np.nan, ""
+    several = len(re.findall(r"\d+(?:\.\d+)?", text)) > 1
+    if several or WIDTHS.search(letters(text)) or re.search("[<>≤≥±~]", text):
+        return np.nan, "may give several lengths"
+    nm = _to_number(found[1]) * (scale_nm(found[2]) or np.nan)
+    return nm, "" if RANGE_NM[0] <= nm <= THERMAL_NM else f"gives {nm:g} nm, which is no wavelength"
 
 
 def _named_range(name: str | None, place: int) -> tuple[float, float]:
     """Return the least and greatest wavelength [nm] of a band by its length or whole name; any without one."""
-    text = _without_number(name, place)
-    length = _LENGTH.search(text)
-    if length is not None and _is_one_length(text):
-        return (_to_number(length[1]) * (scale_nm(length[2]) or np.nan),) * 2
+    nm, doubt = _length(name, place)
+    if nm > 0 and not doubt:
+        return nm, nm
     return _NAMED.get(_whole_name(name, place), (0.0, 0.0, np.inf))[1:]
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +22,7 @@ from PIL import ExifTags, Image
 from spectralzoom.pipeline.envi_headers import header_text, split_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.acquired import acquired_of
-from spectralzoom.storage.readers.band_facts import (
-    CENTRES,
-    Bands,
-    bad_bands,
-    bands_of_fields,
-    is_named,
-    letters,
-    split_list,
-    stated_first,
-)
+from spectralzoom.storage.readers.band_facts import CENTRES, bad_bands, bands_of_fields, is_named, letters, split_list
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
     DEFLATE_RATIO,
@@ -78,19 +69,24 @@ def open_image(path: Path, *, scaled: bool = True) -> CubeSource:
                 raise SceneError(f"{path} holds places in a palette; write its colours (gdal_translate -expand rgb)")
             orientation, exif = _exif_of(path)
             source = _source_of(file, path, exif, scaled)
-    warned = [re.sub(r"^CPLE_\w+ in ", "", one.getMessage())[:200] for one in heard if one.name.startswith("rasterio")]
-    warned = [f"GDAL warns: {text}" for text in dict.fromkeys(warned)][:MOST_WARNINGS]
-    return _upright(replace(source, notes=(*source.notes, *warned)), orientation)
+    texts = [re.sub(r"^CPLE_\w+ in ", "", one.getMessage()) for one in heard if one.name.startswith("rasterio")]
+    warned = dict.fromkeys(f"GDAL warns: {text.removeprefix(f'{path.name}: ')[:200]}" for text in texts)
+    return _upright(replace(source, notes=(*source.notes, *list(warned)[:MOST_WARNINGS])), orientation)
 
 
 def _source_of(file: Any, path: Path, exif: Mapping[str, Any], scaled: bool) -> CubeSource:
     """Return an open image as a cube, upright or not."""
-    header = _header_beside(file, path)
-    alpha = _alpha_band(file, header.fields)
+    beside, header, of_header = _header_beside(file, path)
+    alpha = _alpha_band(file, beside)
     keep = [band for band in range(file.count) if band != alpha]
     void, of_mask = _void(file, alpha)
     geobox, where = place_of_file(file)
-    bands, bad, of_bands = _bands_of(file, path, keep, header)
+    tags = _tags_of(file, keep, beside)
+    names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
+    bands = bands_of_fields(tags, names, " and ".join([str(path), *(one.name for one in header)]), colours)
+    of_header = of_header if header or bands.wavelength_nm is None else ()
+    bands = replace(bands, notes=(*bands.notes, *of_header))
+    bad, doubts = bad_bands(tags, len(keep))
     acquired = acquired_of({**exif, **file.tags(), **file.tags(ns="EXIF"), **file.tags(ns="IMAGERY")})
     kind, read = _values_of(file, path, keep, void if scaled else None)
     of_colour = "NODATA_VALUES" in file.tags()  # which is in the mask
@@ -100,14 +96,14 @@ def _source_of(file: Any, path: Path, exif: Mapping[str, Any], scaled: bool) -> 
         shape=(file.height, file.width, len(keep)),
         dtype=kind,
         read=read,
-        files=(path, *header.files),
+        files=(path, *header),
         bands=bands,
         nodata=voids[0],
         geobox=geobox,
         bad_bands=bad,
         void=void,
         acquired=acquired.text,
-        notes=(*(() if alpha is None else (ALPHA_NOTE,)), *of_mask, *where, *of_bands, *acquired.notes),
+        notes=(*(() if alpha is None else (ALPHA_NOTE,)), *of_mask, *where, *bands.notes, *doubts, *acquired.notes),
     )
     if not scaled:
         return source
@@ -116,49 +112,33 @@ def _source_of(file: Any, path: Path, exif: Mapping[str, Any], scaled: bool) -> 
     return rescaled(source, scale, offset, None if alike else np.array(voids, np.float64))
 
 
-class _Header(NamedTuple):
-    """An ENVI header beside an image: its fields and file if it describes the image, else a note that names it."""
+def _header_beside(file: Any, path: Path) -> tuple[dict[str, str], tuple[Path, ...], tuple[str, ...]]:
+    """Return the fields of an ENVI header beside an image without wavelengths, and its path; and notes that name it.
 
-    fields: Mapping[str, str] = {}
-    files: tuple[Path, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-def _header_beside(file: Any, path: Path) -> _Header:
-    """Return the header with wavelengths beside an image, if there is one."""
+    A header of another size has neither.
+    """
     names = [f"{stem}{ending}" for stem in (path.name, path.stem) for ending in (".hdr", ".HDR")]
     found = next((one for one in map(path.with_name, names) if one.is_file()), None)
-    if found is None:
-        return _Header()
+    if found is None or _states_wavelengths(_tags_of(file, range(file.count), {})):
+        return {}, (), ()
     try:
         with within(path, found).open("rb") as opened:
             fields, _ = split_header(header_text(opened.read(MOST_HEADER)), found.name)
     except (SceneError, OSError):  # of another kind
-        return _Header()
-    if not any(CENTRES.fullmatch(letters(key)) for key in fields):
-        return _Header()
-    sizes = [fields.get(key, "?") for key in ("lines", "samples", "bands")]
-    if sizes != [str(size) for size in (file.height, file.width, file.count)]:
-        size = f"{sizes[0]} x {sizes[1]} px (y x x) and {sizes[2]} bands"
-        return _Header(notes=(f"{found.name} beside it is not read: it describes {size}",))
+        return {}, (), ()
+    lines, samples, bands = (fields.get(key, "?") for key in ("lines", "samples", "bands"))
+    if not _states_wavelengths(fields):
+        return {}, (), ()
+    if (lines, samples, bands) != (str(file.height), str(file.width), str(file.count)):
+        size = f"{lines} x {samples} px (y x x) and {bands} bands"
+        return {}, (), (f"{found.name} beside it is not read: it describes {size}",)
     others = ", ".join(key for key in fields if re.match(r"reflectance scale|data .*(ignore|gain|offset)", key))
     left = f"of {found.name} beside it, facts of bands are read, and not {others}; state these in a scene.toml"
-    return _Header(fields, (found,), (left,) if others else ())
+    return fields, (found,), (left,) if others else ()
 
 
-def _bands_of(
-    file: Any, path: Path, keep: Sequence[int], header: _Header
-) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
-    """Return facts of some bands by tags and names, else by a header; those marked as bad; and notes."""
-    tags, beside = _tags_of(file, keep), _cut(header.fields, file.count, keep)
-    names, colours = [file.descriptions[band] for band in keep], [file.colorinterp[band].name for band in keep]
-    bands = bands_of_fields(tags, names, str(path), colours)
-    if header.files:
-        bands = stated_first(bands, bands_of_fields(beside, names, header.files[0].name))
-    bad, doubts = bad_bands({**beside, **tags}, len(keep))
-    if bands.wavelength_nm is None or header.files:
-        bands = replace(bands, notes=(*bands.notes, *header.notes))
-    return bands, bad, (*bands.notes, *doubts)
+def _states_wavelengths(fields: Mapping[str, object]) -> bool:
+    return any(CENTRES.fullmatch(letters(key)) for key in fields)
 
 
 def _check_image(file: Any, path: Path) -> None:
@@ -177,13 +157,13 @@ def _check_image(file: Any, path: Path) -> None:
     check_memory(path, at_a_time if file.driver in _CALLED else claimed * 3)
 
 
-def _alpha_band(file: Any, beside: Mapping[str, object]) -> int | None:
+def _alpha_band(file: Any, beside: Mapping[str, str]) -> int | None:
     """Return the alpha channel, from 0; None without one, as GDAL calls a fourth band of bytes alpha by default."""
     kinds = [kind.name for kind in file.colorinterp]
     if "alpha" not in kinds:
         return None
     alpha, name = kinds.index("alpha"), file.descriptions[kinds.index("alpha")]
-    tags = {**beside, **_tags_of(file, range(file.count))}
+    tags = _tags_of(file, range(file.count), beside)
     known = bands_of_fields(tags, file.descriptions, "", kinds).wavelength_nm
     named = is_named(name, alpha) and not re.search("alpha|transparen|opacity|mask|^a$", name.lower())
     return None if named or (known is not None and np.isfinite(known[alpha])) else alpha
@@ -272,19 +252,18 @@ def _void(file: Any, alpha: int | None) -> tuple[NDArray[np.bool_] | None, tuple
     return found if found.any() else None, ()
 
 
-def _tags_of(file: Any, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
-    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own."""
+def _tags_of(file: Any, bands: Sequence[int], beside: Mapping[str, str]) -> dict[str, str | Sequence[str]]:
+    """Return the tags of an open file for some bands (from 0): texts of the file, and lists of the bands' own.
+
+    Fields of a header ``beside`` it come first, and count where the file has none of this name.
+    """
+    tags: dict[str, str | Sequence[str]] = {}
+    for name, value in {**beside, **file.tags(), **file.tags(ns="ENVI")}.items():
+        words = split_list(value, file.count)
+        tags[name] = value if words is None else [words[band] for band in bands]
     of_bands = [file.tags(band + 1) | file.tags(band + 1, ns="IMAGERY") for band in bands]
     names = dict.fromkeys(name for own in of_bands for name in own)
-    tags = _cut(file.tags() | file.tags(ns="ENVI"), file.count, bands)
     return tags | {name: [own.get(name, "") for own in of_bands] for name in names}
-
-
-def _cut(fields: Mapping[str, str], count: int, bands: Sequence[int]) -> dict[str, str | Sequence[str]]:
-    """Return fields with lists of ``count`` numbers cut to some bands (from 0)."""
-    words = {name: split_list(value, count) for name, value in fields.items()}
-    lists = {name: [one[band] for band in bands] for name, one in words.items() if one is not None}
-    return {**fields, **lists}
 
 
 _ORIENTATION = 274  # tag of Exif 2.32
