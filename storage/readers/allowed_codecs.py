@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -54,12 +55,24 @@ class CheckedStore(WrapperStore[LocalStore]):
             about |= (
                 {"filters": codecs[:-1] or None, "compressor": codecs[-1]} if packer else {"filters": codecs or None}
             )
+        _check_fill(about, where)
         return prototype.buffer.from_bytes(json.dumps(about).encode())
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
         """Yield the keys that begin with a folder; those in linked folders too."""
         for file in files_below(self._store.root / prefix):
             yield file.relative_to(self._store.root).as_posix()
+
+
+def _check_fill(about: dict[str, Any], where: str) -> None:
+    """Refuse the metadata of an array of numbers whose fill value is none (SceneError)."""
+    kind, fill = str(about.get("dtype", about.get("data_type"))), about.get("fill_value", 0)
+    special = "nan|inf(inity)?" if "dtype" in about else r"nan|inf(inity)?|0x[\da-f]+"
+    forms = r"[\d.]+(e[-+]?\d+)?|" + (special if "f" in kind else r"\d+")
+    is_number = re.fullmatch(f"[-+]?({forms})", str(fill).lower())
+    of_numbers = re.fullmatch(r"[<>|=]?[biuf]\d+|bool|u?int\d+|float\d+", kind)
+    if of_numbers and not (is_number or isinstance(fill, bool) or (fill is None and "dtype" in about)):
+        raise SceneError(f"{where} has fill_value = {str(fill)[:80]!r}, expected a number; correct it")
 
 
 def _checked(codecs: Any, where: str, numbers: int | None = None, width: int = 0) -> list[Any]:

@@ -27,11 +27,12 @@ from spectralzoom.storage.readers.band_facts import (
     GOOD_BANDS,
     WIDTHS,
     Bands,
-    are_wavelengths,
+    axis_hint,
     bad_bands,
     bands_of_fields,
     is_spectral,
     letters,
+    unit_of,
 )
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -57,6 +58,7 @@ BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel
 
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 MOST_UNEVEN = 16  # times that a picture is longer than wide
+_FILL_WORDS = "fillvalue|(data)?ignorevalue|nodata(value)?"
 _SHOWN = 5  # arrays in a note
 
 
@@ -83,12 +85,14 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         dims = [dim or f"axis {at}" for at, dim in enumerate((array.dims or DIMS)[: array.ndim])]
         near = _in_scope(arrays, name)
         stated = {**about, **array.attrs}
-        bands, bad, doubts = _bands_of(name, stated, dims[order[2]] if len(order) == 3 else "", near, count)
+        axis = dims[order[2]] if len(order) == 3 else ""
+        bands, bad, doubts = _bands_of(name, stated, axis, near, () if named else array.shape, count)
         geobox, of_place = _place_of(name, dims, order, near, stated)
         time, of_time = _time_of(near)
         acquired = acquired_of({**stated, **time})
         packing = packing_of(array.attrs, array.where, count)
         unpack, nodata = unpacking(packing, array.dtype.newbyteorder("="))
+        fills = [float(one) for name in FILLS for one in np.ravel(packing.get(name, ()))]
         taken = taken_with(path.name, about, array.attrs)
     unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
     said = [*of_time, *acquired.notes, *array.notes, *notes, *_value_notes(array), *unnamed]
@@ -103,6 +107,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         taken=taken,
         bands=bands,
         nodata=nodata,
+        packed_nodata=fills[0] if fills and unpack is not None else None,
         geobox=geobox,
         bad_bands=bad,
         acquired=acquired.text,
@@ -130,22 +135,25 @@ def _reader_of(
 
 
 def _value_notes(array: FileArray) -> list[str]:
-    """Return notes on the unit of the values, and on scales by names that are not CF's."""
-    unit = str(array.attrs.get("units", "")).strip()
-    values = {key: value for key, value in array.attrs.items() if re.search("scale|offset", key.lower())}
+    """Return notes on the unit of the values, and on scales and fill values by names that are not CF's."""
+    unit = unit_of(array.attrs)
+    scales = {key: "scale_factor and add_offset" for key in array.attrs if re.search("scale|offset", key.lower())}
+    fills = {key: "numbers in _FillValue" for key in array.attrs if re.fullmatch(_FILL_WORDS, letters(key))}
+    ends = {key: "numbers" for key in ENDS if np.asarray(array.attrs.get(key, 0)).dtype.kind not in "iuf"}
     return ([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]) + [
-        f"its {key} = {shown(value)} is not applied: only scale_factor and add_offset are"
-        for key, value in values.items()
-        if key not in CODED
+        f"its {key} = {shown(array.attrs[key])} is not applied: only {allowed} are"
+        for key, allowed in (scales | fills | ends).items()
+        if key not in (*CODED, *FILLS)
     ]
 
 
 def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
     """Return the value of a coordinate ``time`` with one element, by its units, if there is one; and notes."""
     found = near.get("time")
-    if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
+    if found is None or math.prod(found.shape) != 1 or "since" not in unit_of(found.attrs):
         return {}, []
-    about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
+    about = {"units": unit_of(found.attrs)}
+    about |= {"calendar": found.attrs["calendar"]} if "calendar" in found.attrs else {}
     import xarray as xr  # takes a second
 
     time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
@@ -180,11 +188,12 @@ def _place_of(
 
 
 def _bands_of(
-    cube: str, attributes: Mapping[str, Any], axis: str, arrays: Arrays, count: int
+    cube: str, attributes: Mapping[str, Any], axis: str, arrays: Arrays, unnamed: Sequence[int], count: int
 ) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
     """Return facts of the bands by the arrays beside a cube and by attributes; bad bands (from 0), and notes on them.
 
-    Both have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``.
+    Both have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``. ``unnamed``
+    is the shape of a cube whose axes have no names.
     """
     fields: dict[str, Any] = {}
     notes: list[str] = []
@@ -195,13 +204,10 @@ def _bands_of(
         is_centre = CENTRES.fullmatch(letters(word)) is not None
         of_bands = is_centre or WIDTHS.fullmatch(letters(word)) or letters(word) in GOOD_BANDS
         if of_bands and _is_line(arrays, name, count):
-            fields = {word: values_of(one), f"{word} units": _unit(one.attrs)} | fields
+            fields = {word: values_of(one), f"{word} units": unit_of(one.attrs)} | fields
         elif is_centre:
-            notes.append(f"the array {name} is left out: it has {one.dtype} of shape {one.shape} for {count} bands")
-    if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
-        values = values_of(arrays[axis]).astype(np.float64).ravel()
-        if are_wavelengths(values):
-            fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
+            doubt = f"it has {one.dtype} of shape {one.shape} for {count} bands"
+            notes.append(f"the array {name} is left out: {doubt}{axis_hint(unnamed, math.prod(one.shape))}")
     usable = {
         key: value
         for key, value in attributes.items()
@@ -209,6 +215,8 @@ def _bands_of(
     }
     names = _names_of(arrays, (axis, "band_names", "band_name"), count)
     found = bands_of_fields(usable | fields, names, cube or "the file")
+    if found.wavelength_nm is None and _is_line(arrays, axis, count) and (np.diff(values_of(arrays[axis])) != 1).any():
+        notes.append(f"the coordinate {axis} has no unit of a length, such as nm, and is not read as wavelengths")
     return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
 
 
@@ -272,10 +280,6 @@ def _is_line(arrays: Arrays, name: str, count: int) -> bool:
 
 def _word(name: str) -> str:
     return name.rpartition("/")[2].lower()
-
-
-def _unit(attributes: Mapping[str, Any]) -> str:
-    return str(attributes.get("units", attributes.get("unit", ""))).strip().lower()
 
 
 def _check_picture(shape: tuple[int, ...], where: object) -> None:

@@ -5,9 +5,12 @@ The size that a file claims is checked against its bytes and the machine before 
 
 from __future__ import annotations
 
+import logging
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -61,6 +64,38 @@ def check_memory(where: object, needed: int) -> None:
         )
 
 
+_HEARD: ContextVar[list[logging.LogRecord] | None] = ContextVar("heard", default=None)
+
+
+class _Listener(logging.Handler):
+    """Keep the log of an image library while a reader of this thread uses it; pass on the rest."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        heard = _HEARD.get()
+        if heard is None:
+            logging.getLogger().handle(record)
+        else:
+            heard.append(record)
+
+
+for _library in (logging.getLogger("PIL"), logging.getLogger("rasterio")):
+    _library.addHandler(_Listener())
+    _library.propagate = False
+
+
+@contextmanager
+def library_log() -> Iterator[list[logging.LogRecord]]:
+    """Keep what Pillow and rasterio say off the terminal, and return their log; a call within another adds to it."""
+    heard: list[logging.LogRecord] = [] if (outer := _HEARD.get()) is None else outer
+    token = _HEARD.set(heard)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="PIL|rasterio")
+            yield heard
+    finally:
+        _HEARD.reset(token)
+
+
 @contextmanager
 def reading(path: Path, kind: str, cure: str = "copy it again") -> Iterator[None]:
     """Turn any error of a decoder into a SceneError with the file's name and kind."""
@@ -108,6 +143,7 @@ class CubeSource:
     white_ms: float | None = None  # exposure of the white frame at the gain of the lines; None: that of every line
     taken: Taken = field(default_factory=Taken)
     nodata: float | None = None
+    packed_nodata: float | None = None  # no-data value that was compared before the file's scale
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value; some, not all
@@ -131,11 +167,14 @@ def check_cube_source(source: CubeSource) -> None:
 
 
 def unpacked(
-    raw: NDArray[Any], scale: float | NDArray[np.float64], offset: float | NDArray[np.float64], fill: float | None
+    raw: NDArray[Any],
+    scale: float | NDArray[np.float64],
+    offset: float | NDArray[np.float64],
+    fill: float | NDArray[Any] | None,
 ) -> NDArray[np.float32]:
     """Return ``raw * scale + offset`` (..., band) as float32, NaN where raw is ``fill``.
 
-    Scale and offset are one number, or one for each band.
+    Scale, offset and fill are one number, or one for each band.
     """
     values = (raw * np.asarray(scale, np.float64) + offset).astype(np.float32)
     if fill is not None:

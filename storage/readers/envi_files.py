@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
+from spectralzoom.pipeline.envi_headers import EnviHeader, header_text, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
 from spectralzoom.pipeline.frame_indices import FRAME_INDEX, FrameIndex, LineTimes, parse_frame_index, times_of_lines
@@ -111,14 +111,9 @@ def load_envi_header(path: Path) -> EnviHeader:
     """Read one header file (SceneError: there is no such file, or it is no usable ENVI header)."""
     is_there(path)
     try:
-        content = path.read_bytes()
+        return parse_envi_header(header_text(path.read_bytes()), str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error}; name an ENVI header") from error
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
-    return parse_envi_header(text, str(path))
 
 
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
@@ -132,20 +127,31 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     source = replace(source, geobox=geobox, notes=(*source.notes, *where))
     if not scaled:
         return source
-    fields = cube.header.fields
-    bands = source.shape[2]
-    factor = finite_number(fields.get("reflectance scale factor", "")) or 0.0
-    gain, offset = _numbers(fields, "data gain values", bands, 1.0), _numbers(fields, "data offset values", bands, 0.0)
-    if factor > 0:
-        gain, offset = np.full(bands, 1 / factor), np.zeros(bands)
-    return source if (gain == 1).all() and not offset.any() else rescaled(source, gain, offset)
+    return _scaled(source, cube.header.fields)
+
+
+def _scaled(source: CubeSource, fields: Mapping[str, str]) -> CubeSource:
+    """Return a cube with the first of the header's scales as its values, and a note on the others."""
+    count = source.shape[2]
+    factor = _numbers(fields, "reflectance scale factor", 1, 1.0)[0]
+    scales = {"reflectance scale factor": (np.full(count, 1 / factor if factor > 0 else 1.0), np.zeros(count))}
+    for kind in ("data reflectance", "data"):
+        gain, offset = f"{kind} gain values", f"{kind} offset values"
+        scales[gain] = _numbers(fields, gain, count, 1.0), _numbers(fields, offset, count, 0.0)
+    first, *others = [key for key, one in scales.items() if (one[0] != 1).any() or one[1].any()] or list(scales)[:1]
+    notes = [f"{key} of the header is not applied: {first} is" for key in others]
+    fill, ignored = None, fields.get("data ignore value", "")
+    if ignored and source.nodata is None and numbers_of_list(ignored, 1) is None:
+        fill = numbers_of_list(ignored, count)
+        notes += [] if fill is not None else [f"data ignore value = {ignored!r} is no number, and is not read"]
+    return rescaled(replace(source, notes=(*source.notes, *notes)), *scales[first], fill)
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:
     """Return the numbers of a list in a header, one a band; the default where there is none. SceneError: others."""
     found = numbers_of_list(fields[name], count) if fields.get(name) else np.full(count, default)
     if found is None or not np.isfinite(found).all():
-        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} numbers; correct the header")
+        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} as numbers; correct it")
     return found
 
 

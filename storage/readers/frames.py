@@ -84,7 +84,7 @@ def load_frame(path: Path, kind: str, shape: tuple[int, int], bands: Bands) -> F
     frame = values[None] if values.ndim == 2 else values
     count = frame.shape[-1]
     reference = numbers_of_list(fields.get("white_reference", ""), count)
-    order, notes = match_bands(bands_of_lists(fields, count, where), bands, where, "the cube")
+    order, notes = match_bands(bands_of_lists(fields, count, where)[1], bands, where, "the cube")
     if order is not None:
         frame, reference = frame[..., order], None if reference is None else reference[order]
         taken = replace(taken, notes=(*taken.notes, *notes), cut=len(order) < count)

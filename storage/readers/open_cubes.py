@@ -150,6 +150,8 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
         settings = SceneSettings()  # of some bands only
     if stated is None and settings.wavelengths_nm is None and settings.wavelengths_file is None:
         return source
-    found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
+    found = settle_wavelengths(
+        path, range(count), count, stated=stated, settings=settings, known=Bands(), shape=source.shape
+    )
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))

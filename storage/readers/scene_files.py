@@ -105,7 +105,9 @@ def open_scene_file(
     stated = wavelengths is not None or settings.wavelengths_nm is not None or settings.wavelengths_file is not None
     known = [band for band in range(count) if stated or band not in source.bands.unknown]
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands, known)
-    light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
+    light = settle_wavelengths(
+        file, chosen, count, stated=wavelengths, settings=settings, known=source.bands, shape=source.shape
+    )
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
     if keep:
@@ -315,13 +317,15 @@ def _find_gaps(
     chosen = values.bands
     missing = np.zeros((height, width), np.bool_)
     seen = np.zeros(len(chosen), np.bool_)
-    filled_px = void = infinite = absent = 0
+    filled_px = void = infinite = absent = after_scale = 0
     source, dark = values.source, np.zeros(height, np.bool_)
     for rows in cuts(height, BLOCK_LINES):
         picked, block, empty = values.converted(rows.start, rows.stop)
         if source.dark is not None:
             dark[rows] = dark_lines(source, source.read(rows.start, rows.stop))
         void += 0 if empty is None else int(np.count_nonzero(empty))
+        if (packed := values.source.packed_nodata) is not None:
+            after_scale += int(np.count_nonzero(np.isclose(block, packed, rtol=1e-6, atol=0)))
         if beyond_range(picked) is not None:
             found = find_beyond(picked if empty is None else np.where(empty, picked.dtype.type(0), picked))
             if found is not None:
@@ -348,6 +352,11 @@ def _find_gaps(
         notes.append(
             f"{void} samples are {values.nodata:g}, which is taken for no data; if it is a value, state another number"
             f" as nodata in a {SETTINGS_NAME}"
+        )
+    if after_scale and not absent:
+        notes.append(
+            f"no sample has the file's no-data value {packed:g} before scaling, and {after_scale} have it after; if"
+            f" these are no data, write nodata = {packed:g} into a {SETTINGS_NAME}"
         )
     if infinite:
         notes.append(f"{infinite} infinite samples count as missing")

@@ -238,5 +238,5 @@ def test_gains_and_offsets_of_bands_are_applied(tmp_path: Path) -> None:
     header.write_text(text + "data gain values = {0.5, 2}\ndata offset values = {1, 0}\n")
     assert open_cube_source(path).read(0, 1).tolist() == [[[1, 2], [2, 6], [3, 10]]]
     header.write_text(text + "data gain values = {0.5}\n")
-    with pytest.raises(SceneError, match="expected 2 numbers; correct the header"):
+    with pytest.raises(SceneError, match="expected 2 as numbers; correct it"):
         open_cube_source(path)
