@@ -30,6 +30,7 @@ class Observer:
     note: Callable[[str], None] = lambda text: None  # assumptions and warnings
     say: Callable[[str], None] = lambda text: None  # state of a device before its first line
     log: Callable[[str], None] = lambda text: None  # one line for each finished stage
+    carry: Callable[[Callable[[], Any]], Any] = lambda work: work()  # calls the work of a flow
 
 
 _terminal: ContextVar[Observer | None] = ContextVar("observer", default=None)
