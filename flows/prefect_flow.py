@@ -21,7 +21,7 @@ from spectralzoom.flows.publish.publishing import RunRef, outcome
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.survey import survey_field
-from spectralzoom.flows.tasks.observer import say_state
+from spectralzoom.flows.tasks.observer import current_observer, say_state
 from spectralzoom.flows.tasks.visit import name_of_flow_run
 
 
@@ -52,7 +52,7 @@ def survey(settings: Settings) -> RunRef:
     ------
     PipelineError : what is wrong, what is allowed, and what to do.
     """
-    run = survey_field(settings)
+    run = cast(RunRef, current_observer().carry(lambda: survey_field(settings)))
     if not inside_flow():
         return run
     return cast(RunRef, Completed(message=outcome(run), data=run))  # Prefect returns its data to the caller

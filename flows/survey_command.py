@@ -6,8 +6,9 @@ import atexit
 import gc
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -22,7 +23,15 @@ from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
 from spectralzoom.flows.survey import carry_out, survey_field
-from spectralzoom.flows.tasks.local_server import ServerUnavailable, local_server
+from spectralzoom.flows.tasks.local_server import (
+    BOUNDED,
+    QUIET,
+    ServerUnavailable,
+    configured,
+    local_server,
+    server_answers,
+    silence_of,
+)
 from spectralzoom.flows.tasks.observer import Observer, observed_by
 from spectralzoom.flows.tasks.scene import farm_refusal
 from spectralzoom.flows.tasks.scores import warnings_of
@@ -32,7 +41,41 @@ from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.store import Archive
 from spectralzoom.storage.whole_files import locked, remove
 
-ANSWERED_WITHIN_S, RECORDED_WITHIN_S = 10.0, 5.0
+STARTED_WITHIN_S, RECORDED_WITHIN_S = 10.0, 5.0
+MOST_LETTERS = 120  # of an error of Prefect
+
+
+@dataclass
+class FlowWork:
+    """Call the work of a flow, and keep its outcome where Prefect's server cannot take it."""
+
+    run: RunRef | None = None
+    error: BaseException | None = None
+
+    def __call__(self, work: Callable[[], RunRef]) -> RunRef:
+        """Return the run of the work. Raises ServerUnavailable: the server no longer answers; else as the work."""
+        try:
+            self.run = work()
+        except BaseException as error:
+            self.error = error
+            raise
+        if not server_answers():  # Prefect would try to record the end for longer
+            raise ServerUnavailable("no answer")
+        return self.run
+
+    def without_server(self, settings: Settings, error: Exception, note: Callable[[str], None]) -> RunRef:
+        """Return the run of a flow that Prefect ended with an error, carried out without it if need be.
+
+        Raises what the work raised.
+        """
+        if self.error is not None:
+            raise self.error
+        ends = "it continues with --engine plain" if self.run is None else "the run is published"
+        lines = str(error).splitlines() or [type(error).__name__]
+        note(
+            f"Prefect's server does not answer as expected ({lines[0][:MOST_LETTERS]}), and misses this survey: {ends}"
+        )
+        return survey_field(settings) if self.run is None else self.run
 
 
 def run_survey(settings: Settings, console: Console, *, verbose: bool = False, summary: bool = True) -> Published:
@@ -51,8 +94,9 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
         def warn(text: str) -> None:
             show_warnings([text], console)
 
-        with observed_by(Observer(progress.watch, note, warn, progress.say)):
-            run = _survey(settings, console)
+        work = FlowWork()
+        with observed_by(Observer(progress.watch, note, warn, progress.say, carry=work)):
+            run = _survey(settings, console, work, note)
     if run.stopped is not None:
         raise run.stopped
     published = Published(load_receipt(run.folder), run.folder)
@@ -64,8 +108,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
     return published
 
 
-def _survey(settings: Settings, console: Console) -> RunRef:
-    """Run the flow on a server of this process or at PREFECT_API_URL; without Prefect where that fails.
+def _survey(settings: Settings, console: Console, work: FlowWork, note: Callable[[str], None]) -> RunRef:
+    """Run the flow on a server of this process or at PREFECT_API_URL; without Prefect where that fails or stops.
 
     Inside another flow its tasks become tasks of that flow. Without a stage to make, only the run is published.
     """
@@ -73,15 +117,19 @@ def _survey(settings: Settings, console: Console) -> RunRef:
         return run
     use_one_thread()
     if settings.engine != "plain" and not inside_flow():
-        from spectralzoom.flows.prefect_flow import survey  # Prefect takes a second
-
         try:
             with _prefect_server(settings.out):
+                from spectralzoom.flows.prefect_flow import survey  # Prefect takes a second, and reads settings once
+
                 state = survey(settings, return_state=True)
                 _wait_until_recorded(state.state_details.flow_run_id)
                 return state.result()
         except ServerUnavailable as error:
+            if work.run is not None:
+                return work.without_server(settings, error, note)
             console.print(f"[yellow]{escape(str(error))}; the survey runs with --engine plain[/]")
+        except Exception as error:
+            return work.without_server(settings, error, note)
     return survey_field(settings)
 
 
@@ -105,19 +153,16 @@ def _prefect_server(out: str) -> Iterator[None]:
 
     A second survey of the archive has a temporary folder of its own. Raises ServerUnavailable.
     """
-    if (named := os.environ.get("PREFECT_API_URL")) is not None:
-        import httpx
-
-        try:
-            httpx.get(f"{named.rstrip('/')}/health", timeout=ANSWERED_WITHIN_S)  # any answer, also a refusal
-        except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise ServerUnavailable(
-                f"no Prefect server answers at {named}, which PREFECT_API_URL names ({error}): start it, or unset that"
-            ) from error
-        yield
-        return
     root = Archive.open(out).root
     home = root / ".prefect"
+    if (named := os.environ.get("PREFECT_API_URL")) is not None:
+        if (why := silence_of(named, STARTED_WITHIN_S)) is not None:
+            raise ServerUnavailable(
+                f"no Prefect server answers at {named}, which PREFECT_API_URL names ({why}): start it, or unset that"
+            )
+        with configured(home, BOUNDED | QUIET):
+            yield
+        return
     with locked(root / ".locks" / "prefect.lock", wait=False) as is_held:
         if not is_held:
             home = root / f".prefect-{os.getpid()}"

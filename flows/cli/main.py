@@ -7,8 +7,10 @@ import gc
 import importlib.metadata
 import importlib.resources
 import io
+import logging
 import os
 import sys
+from contextlib import suppress
 
 from cyclopts import App, CycloptsError, UnknownOptionError
 
@@ -24,6 +26,7 @@ from spectralzoom.flows.terminal.progress import say, stderr
 from spectralzoom.pipeline.errors import SettingsError
 
 INTERRUPTED = 130
+SENT_WITHIN_S = 3.0
 VERBS = {  # verb: module of its function, loaded on demand
     "survey": "spectralzoom.flows.cli.survey_verbs",
     "simulate": "spectralzoom.flows.cli.simulate_command",
@@ -56,9 +59,24 @@ def main(arguments: list[str] | None = None) -> None:
             setattr(sys, name, open(os.devnull, "r+"))  # noqa: PTH123, SIM115
         elif isinstance(stream, io.TextIOWrapper) and stream.writable():  # a terminal may lack a character
             stream.reconfigure(errors="replace")
+    logging.raiseExceptions = False  # else Prefect prints each log that a lost server does not take
     gc.set_threshold(10_000, 20, 20)  # with Python's own, garbage collection takes a third of the time of imports
     with terminable(last=arguments is None):
-        sys.exit(_run(sys.argv[1:] if arguments is None else arguments))
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+        if arguments is None and "prefect.events.worker" in sys.modules:
+            _leave_server(code)
+        sys.exit(code)
+
+
+def _leave_server(code: int) -> None:
+    """Send Prefect's last events and logs; exit at once with a code where its server does not take them."""
+    from spectralzoom.flows.tasks.local_server import sent
+
+    if not sent(SENT_WITHIN_S):  # Python would wait for Prefect's threads, which try for minutes
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError):
+                stream.flush()
+        os._exit(code)
 
 
 def _run(arguments: list[str]) -> int:

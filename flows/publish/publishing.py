@@ -21,6 +21,7 @@ from spectralzoom.flows.settings.values import KEEP_SIGNAL
 from spectralzoom.flows.stage import Stores, inside_flow, task_in_flow
 from spectralzoom.flows.stages.condense import raw_differs
 from spectralzoom.flows.stages.score import load_plan
+from spectralzoom.flows.tasks.local_server import server_answers
 from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.runs import Catalogue
@@ -97,7 +98,7 @@ def clear_intermediate(archive: Archive, plan: SurveyPlan, products: Products) -
 
 def _show_artifact(name: str, archive: str, published: Published) -> None:
     """Create the artifact of a run in the present flow: score, picture, findings, and where its files are."""
-    if not inside_flow():
+    if not inside_flow() or not server_answers():
         return
     key = re.sub("[^a-z0-9]", "-", name.lower()).strip("-")
     where = f"{archive}/runs/{published.folder.name}"

@@ -14,12 +14,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from contextvars import copy_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 from spectralzoom.flows.terminal.processes import cache_folder, place_pages
@@ -27,7 +27,7 @@ from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.storage.whole_files import aside, check_no_link, files_in, remove, write_new
 
 HOST = "127.0.0.1"
-STARTED_WITHIN_S, ENDED_WITHIN_S, LOGGED_WITHIN_S = 120.0, 10.0, 10.0
+STARTED_WITHIN_S, ENDED_WITHIN_S, SENT_WITHIN_S, ANSWERED_WITHIN_S = 120.0, 10.0, 10.0, 5.0
 CONSOLE = "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL"
 QUIET = {  # no requests to other machines, no output on the terminal
     "server.analytics_enabled": False,
@@ -39,23 +39,26 @@ QUIET = {  # no requests to other machines, no output on the terminal
 }
 
 
+BOUNDED = {"client.max_retries": 1, "api.request_timeout": ANSWERED_WITHIN_S}  # of a survey that can do without
+
+
 class ServerUnavailable(SettingsError):  # noqa: N818 - a survey runs without it
     """No Prefect server can be started or reached."""
 
 
 @contextmanager
-def configured(home: Path, **own: Any) -> Iterator[None]:
-    """Configure Prefect for a block, which passes it on to its processes: quiet, with ``home`` for its files.
+def configured(home: Path, usual: Mapping[str, Any] = QUIET, **own: Any) -> Iterator[None]:
+    """Configure Prefect for a block, which passes it on to its processes: ``usual``, with ``home`` for its files.
 
     Settings of the user are kept, but for ``own``. Raises as `close_folder`.
     """
+    is_chosen = CONSOLE in os.environ
+    os.environ.setdefault(CONSOLE, "CRITICAL")  # Prefect reads this one from the environment alone, at its import
     from prefect.settings import temporary_settings
 
     close_folder(home)
-    is_chosen = CONSOLE in os.environ
-    os.environ.setdefault(CONSOLE, "CRITICAL")  # Prefect reads this one from the environment alone
     try:
-        with temporary_settings(own | {"flows.heartbeat_frequency": None}, {**QUIET, "home": home}):
+        with temporary_settings(own | {"flows.heartbeat_frequency": None}, {**usual, "home": home}):
             yield
     finally:
         if not is_chosen:
@@ -103,7 +106,6 @@ def _running(listening: socket.socket, *, schedules: bool) -> Iterator[None]:
     """Run the configured server for the block on a socket; it refuses other names of this machine in requests."""
     import uvicorn
     from fastapi.middleware.trustedhost import TrustedHostMiddleware
-    from prefect.logging.handlers import APILogWorker
     from prefect.server.api.server import create_app
 
     app = TrustedHostMiddleware(create_app(final=schedules, ephemeral=not schedules), [HOST, "localhost"])
@@ -119,9 +121,37 @@ def _running(listening: socket.socket, *, schedules: bool) -> Iterator[None]:
     try:
         yield
     finally:
-        APILogWorker.drain_all(timeout=LOGGED_WITHIN_S)
+        sent(SENT_WITHIN_S)
         server.should_exit = True
         thread.join(ENDED_WITHIN_S)
+
+
+def sent(within_s: float) -> bool:
+    """End Prefect's workers, and return whether each has sent its events and logs within so many seconds."""
+    from prefect.events.worker import EventsWorker
+    from prefect.logging.handlers import APILogWorker
+
+    ends = [cast(Any, worker.drain_all(timeout=within_s)) for worker in (EventsWorker, APILogWorker)]
+    return not any(end.not_done for end in ends)
+
+
+def silence_of(address: str, within_s: float = ANSWERED_WITHIN_S) -> str | None:
+    """Return why the Prefect server at an address does not answer; None where it does, with a refusal too."""
+    import httpx
+
+    try:
+        httpx.get(f"{address.rstrip('/')}/health", timeout=within_s)
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        return str(error) or type(error).__name__
+    return None
+
+
+def server_answers() -> bool:
+    """Return whether the configured Prefect server answers within seconds; also where none is named."""
+    from prefect.settings import PREFECT_API_URL
+
+    address = PREFECT_API_URL.value()
+    return address is None or silence_of(address) is None
 
 
 def private_files(home: Path) -> str:

@@ -31,6 +31,7 @@ class Observer:
     warn: Callable[[str], None] = lambda text: None  # warnings about the map, before it is drawn
     say: Callable[[str], None] = lambda text: None  # state of a device before its first line
     log: Callable[[str], None] = lambda text: None  # one line for each finished stage
+    carry: Callable[[Callable[[], Any]], Any] = lambda work: work()  # calls the work of a flow
 
 
 _terminal: ContextVar[Observer | None] = ContextVar("observer", default=None)

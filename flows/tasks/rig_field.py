@@ -7,12 +7,13 @@ import hashlib
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.stage import inside_flow
+from spectralzoom.flows.tasks.local_server import server_answers
 from spectralzoom.flows.tasks.observer import current_observer
 from spectralzoom.pipeline.errors import RigError
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT
@@ -52,13 +53,14 @@ class RigHold:
         """Lock the rig, unless this survey has it. Raises RigError: another survey uses the rig.
 
         Inside a flow, the survey first waits for the global concurrency limit ``rig`` of the Prefect server, if there
-        is one.
+        is one and the server answers.
         """
         if self._taken or self.port is None:
             return
-        while inside_flow():  # signals are handled between tries
+        while inside_flow() and server_answers():  # signals are handled between tries
             from prefect.concurrency.sync import concurrency
 
+            self._held.enter_context(suppress(Exception))  # the server frees the limit of one that cannot leave
             try:
                 limit = concurrency(RIG_LIMIT, occupy=1, lease_duration=LEASE_S, timeout_seconds=TRY_S)
                 self._held.enter_context(limit)
