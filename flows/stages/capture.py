@@ -6,6 +6,7 @@ import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import cast
@@ -15,6 +16,7 @@ import numpy as np
 from spectralzoom.flows.frame import FieldView
 from spectralzoom.flows.stage import Output, Unkeyed, stage
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
+from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
 from spectralzoom.pipeline.signal.condense import LineStatistics
@@ -27,6 +29,7 @@ from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.store import Ref
 
 RAW, RAW_VERSION = "capture", 15
+SAVED_S = "saved_s"  # fact of a simulated capture, for its receipt
 KEPT = "source"  # folder of a source's own files within a capture's spool
 MADE_BY = ("pipeline/simulator", "pipeline/rig", "pipeline/capture", "storage/arrays/cubes.py")
 
@@ -100,6 +103,10 @@ class SweepRecorder:
 
                 self._sweep(opened, sweep, found, taken)
                 before += sweep.lines
+        if self.effects is not None and isinstance(source, SimulatedSource):
+            with suppress(PipelineError):  # only the effects that were left out cannot be rendered
+                exact = chosen_effects(self.effects, exact=True)
+                self.out.facts[SAVED_S] = source.saved_seconds(exact, request.sweeps)
         np.savez(self.out.path / STATISTICS, allow_pickle=False, **found.arrays())
         if (kept / RECORD).exists():
             shutil.copyfile(kept / RECORD, self.out.path / RECORD)
