@@ -88,7 +88,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         zoomed = plan_survey(open_field(settings.but(zoom=ALWAYS), planning=True))
     whole = plan.settings.but(extent=WHOLE)
     uniform = replace(plan, settings=whole, passes=replace(passes, plain=True), extent=None)
-    work = uniform.work_done(uniform.likely_patches).total  # of each uniform scan
+    work = uniform.work_done(uniform.likely_readings[0]).total  # of each uniform scan
     best = None if passes.plain else plan.scans.best_in_time(passes.coarse_s + passes.fine_s)
     drawn = stores.rows[segment.name].ref if segment.name in stores.rows else None
     warnings = map_warnings(plan, drawn if drawn is not None and stores.has(drawn) else None)
@@ -117,7 +117,7 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "estimate": estimate_survey(plan, fine, unscored),
     }
     if passes.plain and plan.chooses:  # expected, of a uniform scan that is segmented in part
-        content["kept"] = plan.reading_figures(plan.likely_patches)
+        content["kept"] = plan.reading_figures(plan.likely_readings[0])
     return content
 
 

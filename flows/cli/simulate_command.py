@@ -16,7 +16,7 @@ from spectralzoom.flows.publish.receipt_table import print_effects
 from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
-from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse
+from spectralzoom.flows.stages.capture import SAVED_S, SweepRequest, capture_coarse
 from spectralzoom.flows.stages.effects import choose_effects, load_manifest
 from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.flows.tasks.observer import tidy_up
@@ -140,7 +140,7 @@ def _record(
         "bytes_stored": listed_bytes(read_manifest(raw.path)),
         "effects_store": effects.uri,
         "effects": manifest["effects"],
-        "effects_total": manifest["total"],
+        "effects_total": {**manifest["total"], SAVED_S: stores.total(SAVED_S)},
         "path": str(raw.path),
     }
 

@@ -49,7 +49,7 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
     if field.prior is not None:
         prior = {"run": field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
     if plan.chooses and (plan.passes.plain or plan.least_gain is not None):
-        kept = plan.reading_figures(read_in_full(products.attention, products.class_map))
+        kept = plan.reading_figures(read_in_full(products.attention, products.class_map), fine.changed)
     warnings = map_warnings(plan, products.class_map)
     unscored = no_expected_score(warnings, int(np.count_nonzero(drawn.classes != UNLABELLED)))
     return {

@@ -183,10 +183,10 @@ def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any]
     unit = UNIT_NAMES[total["unit"]]
     tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
     bound = "without a bound" if total["bound"] is None else f"at most {total['bound']:.2g} {unit}"
+    saved = f" Saved processor time: about {format_seconds(total['saved_s'])}." if total["saved_s"] > 0 else ""
     console.print(
         f"Effects computed: {total['on']} of {total['on'] + total['off']} (asked: {escape(str(total['asked']))}, "
-        f"tolerance {tolerance} {unit}). Change of a stored number by the others: {bound}. "
-        f"Saved processor time: about {format_seconds(max(total['saved_s'], 0.0))}."
+        f"tolerance {tolerance} {unit}). Change of a stored number by the others: {bound}.{saved}"
     )
 
 

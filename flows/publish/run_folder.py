@@ -26,6 +26,7 @@ from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.values import KEEP_SIGNAL, RASTER
 from spectralzoom.flows.stage import Row, Stores
+from spectralzoom.flows.stages.capture import SAVED_S
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
 from spectralzoom.flows.stages.score import READING, SCORES, load_plan, read_in_full
@@ -109,7 +110,7 @@ def make_receipt(
         accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
         training_scene=seen_in_training(field.scene, field.described),
         effects=effects.get("effects"),
-        effects_total=effects.get("total"),
+        effects_total=effects and {**effects["total"], SAVED_S: stores.total(SAVED_S)},
         products={**places, **{name: f"{uri}/{name}" for name in files}},
         control=None if control is None else control_figures(control),
         **find_out(plan, products),

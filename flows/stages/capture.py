@@ -15,6 +15,7 @@ import numpy as np
 from spectralzoom.flows.frame import FieldView
 from spectralzoom.flows.stage import Output, Unkeyed, stage
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
+from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, exposing
 from spectralzoom.pipeline.signal.condense import LineStatistics
@@ -29,6 +30,7 @@ from spectralzoom.storage.store import Ref
 from spectralzoom.storage.whole_files import make_folder, read_own, write_new
 
 RAW, RAW_VERSION = "capture", 15
+SAVED_S = "saved_s"  # fact of a simulated capture, for its receipt
 KEPT = "source"  # folder of a source's own files within a capture's spool
 MADE_BY = ("pipeline/simulator", "pipeline/rig", "pipeline/capture", "storage/arrays/cubes.py")
 
@@ -102,6 +104,10 @@ class SweepRecorder:
 
                 self._sweep(opened, sweep, found, taken)
                 before += sweep.lines
+        if self.effects is not None and isinstance(source, SimulatedSource):
+            with suppress(PipelineError):  # only the effects that were left out cannot be rendered
+                exact = chosen_effects(self.effects, exact=True)
+                self.out.facts[SAVED_S] = source.saved_seconds(exact, request.sweeps)
         np.savez(self.out.path / STATISTICS, allow_pickle=False, **found.arrays())
         with suppress(FileNotFoundError):
             write_new(self.out.path / RECORD, read_own(kept / RECORD))
