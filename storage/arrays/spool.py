@@ -30,7 +30,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 from urllib.parse import quote
 
 import numpy as np
@@ -58,7 +58,7 @@ class Spool:
         self._head = head
         self._seed = zlib.crc32(head)
         self._size = _FACTS.size + _CRC.size + 2 * shape[0] * shape[1]  # of a record
-        self._file: BinaryIO | None = None
+        self._file: IO[Any] | None = None
 
     @classmethod
     def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
@@ -248,7 +248,7 @@ class FetchedFiles:
             return b""
         with _unread(path), open_own(path) as file:
             file.seek(start)
-            return file.read(max(stop - start, 0))
+            return bytes(file.read(max(stop - start, 0)))
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end. Raises NotKept: the disk refuses; a part that was written is removed again."""
