@@ -4,8 +4,8 @@ A camera's number is ``bias + gain * exposure * (dark current + light)``. White 
 to gain times exposure, and is scaled by the stated ratio. A dark frame is not scaled: how much of it is bias, which
 does not depend on the exposure, is not known.
 
-Every other key that both headers have is compared, unless it describes the file, time, place or state of a capture.
-Where one that the numbers depend on differs, the frame is refused. Another one is named in a note.
+Every other key that both headers have is compared if its values look like settings: numbers, or a word or two. Where
+one that the numbers depend on differs, the frame is refused. Any other one is named in a note.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import finite_number
-from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.errors import SceneError, list_some
 
 SAME = 1e-3  # largest relative difference of equal exposures, which cameras round
 MOST_DARK_ERROR = 0.05  # of white that the dark current of another exposure may stand for
+MOST_NAMED = 24  # keys of a note
 WILD_RATIO = 100.0  # of two exposures of one camera; units that are confused differ by a thousand
 TO_MS = {"ns": 1e-6, "us": 1e-3, "ms": 1.0, "s": 1e3}
 _WORDS = {"ns": "nanosec", "us": "µs μs usec microsec", "ms": "msec millisec", "s": "sec"}
@@ -42,22 +43,15 @@ _AREA = re.compile(r".*(?:(?:aoi|roi|window).*(?:left|top|offset|start)|\b[hv](?
 _FIXED = re.compile(  # the numbers depend on it
     r"(?!data .*gain values).*(?:(?<!\ba)gain|bin(?:n(?:ed|ing)|s?\b)|accum|co ?add|\btdi\b|\biso\b).*"
 )
-_OF_CAPTURE = re.compile(  # words of keys that describe the file, time, place or state of a capture
-    r"(?!.*(?:serial|averag|mode|format|readout|expos|integrat|dwell)).*(?:file|path|folder|name|label|descri|comment|note|history|version"
-    r"|ware|user|operator|project|byte|header|data (?:type|ignore|gain|offset|refl)|interleave|wavelength|fwhm"
-    r"|band|bbl|scale factor|stretch|default|plot|class|legend|spectra|\btype|samples?\b|pixel ?size|reference|target"
-    r"|time|date|stamp|clock|hour|\bday|duration|period|\bfps|rate\b|speed|frequency|interval|start\b|stop\b|\bend\b"
-    r"|count|number|index|sequence|total|frames?\b|lines?\b|scans?\b|background|\brun|session|mission|flight|capture id"
-    r"|gps|latitude|longitude|\blat\b|\blon\b|altitude|elevation|azimuth|zenith|heading|\broll|\bpitch|yaw|tilt|angle"
-    r"|rotation|orientation|direction|position|location|distance|height|coord|projection|\bmap|\bgeo|utm|stage|mirror"
-    r"|encoder|motor|\bsite|\bfield|cloud|\bsun|solar|weather|wind\b|temp(?:erature)?\b|humid|pressure|volt|current"
-    r"|battery|vacuum|\bmean|\bmedian|\bstd|\bmin|\bmax|\brms|snr|error|quality|dropped|\blost|missing|saturat|status"
-    r"|usage|checksum|hash|\bmd5).*"
+_OF_FORMAT = re.compile(  # fields of the ENVI format that its reader applies, or that lay out the file
+    "samples|lines|bands|interleave|(?:data|file|sensor) type|byte order|header offset|file compression|[xyz] start|bbl"
+    "|(?:major|minor) frame offsets|default (?:bands|stretch)|z plot range|map info|reflectance scale factor|classes"
+    "|data (?:ignore value|gain values|offset values)|wavelength|fwhm"
 )
 _OF_LIGHT = re.compile(r".*(?:shutter|lamp|light|illumin|\bled\b|\bcap\b|\blid\b).*")  # off for a dark frame
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 _NUMBERS = rf"{_NUMBER}(?:[\s,;x*]+{_NUMBER}){{0,7}}"
-_SETTING = re.compile(rf"{_NUMBERS} ?[a-zµ%°]{{0,8}}|(?=.{{1,24}}$)[a-z0-9][a-z0-9+-]*(?: [a-z0-9][a-z0-9+-]*)?")
+_SETTING = re.compile(rf"{_NUMBERS} ?[a-zµ%°]{{0,8}}|(?=.{{1,24}}$)[a-z][a-z0-9+-]*(?: [a-z0-9][a-z0-9+-]*)?")
 _VALUE = re.compile(
     r"(?:(?P<over>1) ?/ ?)?(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)"
 )
@@ -150,7 +144,7 @@ class _Reader:
             self._add_time(name, value, match)
         elif _FIXED.fullmatch(name) or _AREA.fullmatch(name):
             self._put(self.frame, name, _setting_text(value))
-        elif _OF_CAPTURE.fullmatch(name) is None and _SETTING.fullmatch(text := _setting_text(value)):
+        elif _OF_FORMAT.fullmatch(name) is None and _SETTING.fullmatch(text := _setting_text(value)):
             self.others.setdefault(name, text)
 
     def _add_time(self, name: str, value: str, match: re.Match[str]) -> None:
@@ -272,14 +266,13 @@ def _compared_alone(dark: Taken, white: Taken, cube: Taken) -> list[str]:
 
 
 def _differing(frame: Taken, cube: Taken, kind: str) -> list[str]:
-    """Return a note on keys of both headers that look like settings and differ, other than those of `_check_same`."""
+    """Return a note on all other keys of both headers whose values look like settings and differ."""
     both = {key: (one, cube.others.get(key, one)) for key, one in frame.others.items()}
     unlit = [key for key in both if kind == "dark" and _OF_LIGHT.fullmatch(key)]
-    texts = [f"{key} = {one}, not {other}" for key, (one, other) in both.items() if one != other and key not in unlit]
-    what = f"{frame.where} was taken with other settings than {cube.where} ({'; '.join(texts)})"
-    return [f"{what}: numbers are used as they are; if one changes them, give a frame of the same settings"] * bool(
-        texts
-    )
+    texts = [f"{key} {one} and {other}" for key, (one, other) in both.items() if one != other and key not in unlit]
+    what = f"{frame.where} and {cube.where} differ in {list_some(texts, MOST_NAMED)}"
+    advice = "numbers are used as they are; if one of these changes them, give a frame of the same settings"
+    return [f"{what}: {advice}"] if texts else []
 
 
 def check_parts(one: Taken, first: Taken) -> None:

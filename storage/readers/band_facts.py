@@ -394,7 +394,7 @@ def _bands_of_colours(names: Sequence[str | None], where: str, colours: Sequence
         shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
         doubt = f"the band names {shown} do not give each band a length with its unit, or a known colour of its own"
         return Bands(notes=() if bare.all() else (doubt,))
-    others = [at for at in np.flatnonzero(~np.isnan(flags) & (flags != nm)) if colours[at] != "gray"]
+    others = [at for at in np.flatnonzero(~np.isnan(flags) & (flags != nm)).tolist() if colours[at] != "gray"]
     if others and not default:
         said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
         return Bands(notes=(said,))
