@@ -25,6 +25,7 @@ from zarr.registry import register_codec
 
 LIMITED = "spectralzoom.limited"  # the codec that stands for a packer in metadata
 PACKERS = ("blosc", "zstd", "gzip", "zlib", "bz2", "lz4")
+_DECODERS = {packer: numcodecs.get_codec({"id": packer}).decode for packer in ("blosc", "zstd", "lz4")}
 _ZSTD = 0xFD2FB528  # with which frames begin
 
 
@@ -40,7 +41,7 @@ def unpack(packer: str, packed: Any, size: int) -> NDArray[np.uint8]:
         with gzip.open(io.BytesIO(data)) if packer == "gzip" else bz2.open(io.BytesIO(data)) as file:
             plain = file.read(size + 1)
     elif _stated_size(packer, data) in (None, size):  # numcodecs fills an array exactly where no size is stated
-        plain = numcodecs.get_codec({"id": packer}).decode(data, np.empty(size, np.uint8))
+        plain = _DECODERS[packer](data, np.empty(size, np.uint8))
     if len(plain) != size:
         raise ValueError(f"a chunk packed by {packer} has not the {size} bytes that its array declares")
     return np.frombuffer(plain, np.uint8)
