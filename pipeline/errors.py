@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Callable, Sequence
 
 _LAYOUT = "\n\t"  # control characters that stay
+MOST_LETTERS = 1500  # of a message
 _DIRECTION = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
 _UNSEEN = "\u00ad\u061c\u200b\u200e\u200f\u2060\ufeff"  # marks of direction, and characters without width
 _SUSPECT = re.compile(r"[^\n\t\x20-\x7e\u00a1-\u00ac\u00ae-\u02ff\u0370-\u058f\u2010-\u2027\u2030-\u205e\u4e00-\u9fff]")
@@ -22,6 +23,13 @@ def visible(text: str, escaped: Callable[[str], str] = lambda one: one.encode("u
     Line ends, tabs and the letters of all scripts stay, also the joiners that some scripts need.
     """
     return _SUSPECT.sub(lambda found: found[0] if is_visible(found[0]) else escaped(found[0]), text)
+
+
+def shortened(text: str, most: int = MOST_LETTERS) -> str:
+    """Return a text without the middle of what exceeds so many characters."""
+    if len(text) <= most:
+        return text
+    return f"{text[: most * 2 // 3]} [... {len(text) - most} characters ...] {text[-most // 3 :]}"
 
 
 def is_visible(character: str) -> bool:
@@ -61,13 +69,13 @@ def disk_advice(error: OSError) -> str | None:
 class PipelineError(Exception):
     """Base of every error with a message for the user; ``exit_code`` is that of the process.
 
-    Text of files and devices in the message is escaped by `visible`.
+    Text of files and devices in the message is escaped by `visible`, and a long message is without its middle.
     """
 
     exit_code = 1
 
     def __str__(self) -> str:
-        return visible(super().__str__())
+        return shortened(visible(super().__str__()))
 
 
 class SettingsError(PipelineError, ValueError):

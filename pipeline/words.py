@@ -6,7 +6,10 @@ import re
 from contextlib import suppress
 from datetime import UTC, datetime
 
+from spectralzoom.pipeline.errors import is_visible
+
 YEARS = range(1900, 2201)
+MOST_NAME = 255  # characters of a field's name, as of a file's
 PART, CLEARED = UNFINISHED = (".part", ".cleared")  # ends of names of folders that are not complete
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 _DAY = re.compile(r"^\d{4}-\d\d-\d\d(?!\d)")
@@ -14,8 +17,14 @@ _SCHEDULER = re.compile(r"threads|processes|(tcp|tls)://([^\s/:]+|\[[0-9a-fA-F:]
 
 
 def is_name(name: str) -> bool:
-    """Return whether this can be the name of a field, a stage, a store or a run."""
+    """Return whether this can be the name of a stage, a store or a run."""
     return _NAME.fullmatch(name) is not None and not name.endswith(UNFINISHED)
+
+
+def is_field_name(name: str) -> bool:
+    """Return whether this can be the name of a field: letters of any script, spaces and marks, on one line."""
+    shown = all(is_visible(one) and one not in "/\n\t" for one in name)
+    return shown and len(name) <= MOST_NAME and any(map(str.isalnum, name))
 
 
 def is_scheduler(text: str) -> bool:

@@ -27,6 +27,7 @@ import shlex
 import stat
 import tempfile
 import time
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -741,8 +742,15 @@ def is_archive(address: str | Path) -> bool:
 
 
 def run_stem(name: str) -> str:
-    """Return a survey's name as it stands in the name of a run's folder, behind the time."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
+    """Return a field's name for files and folders: A-Z, a-z, 0-9, '_' and '-', at most 60 characters.
+
+    A name that is not of this form loses accents and other characters, and a part of its hash follows.
+    """
+    ascii_only = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode("ascii")
+    stem = re.sub(r"[^A-Za-z0-9_-]+", "-", ascii_only).strip("-")[:60]
+    if stem == name and re.search(r"-[0-9a-f]{8}$", name) is None:
+        return stem
+    return f"{stem[:51]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}".lstrip("-")
 
 
 def lies_ahead(name: str, created: str, *, warns: bool = False) -> bool:

@@ -11,12 +11,14 @@ import logging
 import os
 import sys
 from contextlib import suppress
+from functools import partial
 
 from cyclopts import App, CycloptsError, UnknownOptionError
 
 from spectralzoom.flows.terminal.processes import (
     TERMINATED,
     Terminated,
+    answered,
     format_failure,
     place_caches,
     send_no_analytics,
@@ -27,6 +29,7 @@ from spectralzoom.pipeline.errors import SettingsError
 
 INTERRUPTED = 130
 SENT_WITHIN_S = 3.0
+STOPPING = "stopping after the present block; what is stored is kept"
 VERBS = {  # verb: module of its function, loaded on demand
     "survey": "spectralzoom.flows.cli.survey_verbs",
     "simulate": "spectralzoom.flows.cli.simulate_command",
@@ -61,11 +64,11 @@ def main(arguments: list[str] | None = None) -> None:
             stream.reconfigure(errors="replace")
     logging.raiseExceptions = False  # else Prefect prints each log that a lost server does not take
     gc.set_threshold(10_000, 20, 20)  # with Python's own, garbage collection takes a third of the time of imports
-    with terminable(last=arguments is None):
+    with terminable(last=arguments is None), answered(partial(stderr.print, STOPPING, highlight=False)):
         code = _run(sys.argv[1:] if arguments is None else arguments)
-        if arguments is None and "prefect.events.worker" in sys.modules:
-            _leave_server(code)
-        sys.exit(code)
+    if arguments is None and "prefect.events.worker" in sys.modules:
+        _leave_server(code)
+    sys.exit(code)
 
 
 def _leave_server(code: int) -> None:

@@ -30,9 +30,10 @@ from spectralzoom.flows.tasks.rig_field import RIG_LIMIT
 from spectralzoom.flows.terminal.processes import DONE
 from spectralzoom.flows.terminal.progress import show_text
 from spectralzoom.pipeline.errors import ArchiveError, NoSceneYet, PipelineError, SettingsError
-from spectralzoom.storage.store import Archive
+from spectralzoom.storage.store import Archive, run_stem
 from spectralzoom.storage.whole_files import locked
 
+NOT_IN_PREFECT = "/%&<>"  # not allowed in names of deployments
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -76,7 +77,7 @@ def serve(
             return held.enter_context(locked(archives[out] / ".locks" / f"{name}.lock", wait=False))
 
         for settings in served.values():
-            if not hold(settings.out, f"serve-{settings.name}"):
+            if not hold(settings.out, f"serve-{run_stem(str(settings.name))}"):
                 raise ArchiveError(f"another serve surveys {settings.name} into {settings.out}: stop that one first")
         deployments = [survey_deployment(file, settings, schedule) for file, settings in served.items()]
         deployments += [reprocess_deployment(out) for out in archives if hold(out, "serve")]  # one serve has it
@@ -102,12 +103,12 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> dict[Path, Set
     fields: dict[str, tuple[Path, Settings]] = {}
     for file in files:
         given = load_settings(file, {"out": out})
-        name = given.name or file.stem
+        settings = load_settings(file, {"out": str(Path(given.out).absolute()), "name": given.name or file.stem})
+        name = str(settings.name)
         if name in fields:
             raise SettingsError(
                 f'{fields[name][0]} and {file} are both called {name}: give one of them another name = "..."'
             )
-        settings = load_settings(file, {"out": str(Path(given.out).absolute()), "name": name})
         try:
             dry_run(settings)
         except NoSceneYet as error:
@@ -120,8 +121,9 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> dict[Path, Set
 
 def survey_deployment(file: Path, settings: Settings, schedule: Any) -> Any:
     """Return a field's deployment of the flow `survey`; a run that is due during another is cancelled."""
+    name = str(settings.name)
     return survey.to_deployment(
-        str(settings.name),
+        run_stem(name) if {*name} & {*NOT_IN_PREFECT} else name,
         schedule=schedule,
         paused=False,
         parameters={"settings": {"settings_file": str(file), "name": settings.name, "out": settings.out}},

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -15,6 +16,7 @@ from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RIG_FIELD
 from spectralzoom.pipeline.errors import BudgetError, SettingsError
 from spectralzoom.pipeline.toml_files import read_toml
 
+OF_A_SCENE = "scene.toml"
 FLAG = "flag"  # origin of a setting that no file has
 PATHS = ("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "weights", "area", "plots")
 Schema = dict[str, Any]  # of one setting, in JSON: its type, limits, default and help
@@ -75,13 +77,16 @@ def read_file(path: str | Path | None) -> tuple[dict[str, Any], dict[str, str]]:
     """
     if path is None:
         return {}, {}
+    scene = f"; a scene is given as: spectralzoom survey --scene {quote(str(path))}"
+    hint = "" if Path(path).suffix == ".toml" else scene
+    if Path(path).name == OF_A_SCENE:
+        raise SettingsError(f"{path} describes a scene: give the scene's file as --scene, or name settings otherwise")
     try:
         table = anchor_paths(read_toml(Path(path)), Path(path).parent)
     except FileNotFoundError:
-        raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
+        raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none{hint}") from None
     except ValueError as error:
-        scene = f"; a scene is given as --scene {path}" if Path(path).suffix != ".toml" else ""
-        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8{scene}") from None
+        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8{hint}") from None
     return table, dict.fromkeys(_keys(table), str(path))
 
 

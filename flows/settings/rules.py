@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
-from spectralzoom.flows.settings.load import place_of
+from spectralzoom.flows.settings.load import OF_A_SCENE, place_of
 from spectralzoom.flows.settings.values import (
     ALWAYS,
     AUTO,
@@ -131,6 +132,11 @@ def _scene_errors(settings: Settings, at: Callable[[str], str]) -> Iterator[str]
     """Yield errors: settings that the scene cannot have."""
     scene = settings.scene
     bands, wavelengths = settings.bands, settings.wavelengths
+    if Path(scene).suffix.lower() == ".toml":
+        right = f"settings as: spectralzoom survey {quote(scene)}"
+        if Path(scene).name == OF_A_SCENE:
+            right = f"its scene: --scene {quote(str(Path(scene).parent))}"
+        yield f"{at('scene')} = {scene!r} is TOML and no scene; give {right}"
     if (settings.policy == "mask") != (settings.mask is not None):
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
         yield f"{wants}: got policy = {settings.policy!r}, mask = {settings.mask!r}; give both or neither"

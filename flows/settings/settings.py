@@ -305,7 +305,7 @@ class Settings(BaseModel):
     def ends_unread(self) -> bool:
         """Return whether a survey without weights ends before a network reads its mosaic."""
         without = self.weights is None and self.scene not in BUILT_IN_SCENES
-        return without and self.until is not None and self.plain
+        return without and self.until is not None and self.plain and self.seconds is None
 
     @property
     def on_hardware(self) -> bool:

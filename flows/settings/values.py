@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -20,7 +21,7 @@ from spectralzoom.pipeline.simulator.effects.probe import Unit
 from spectralzoom.pipeline.simulator.render import BY_NAME
 from spectralzoom.pipeline.simulator.scenes.built_in import BUILT_IN_NAMES
 from spectralzoom.pipeline.simulator.selection.choice import named_effects
-from spectralzoom.pipeline.words import YEARS, is_name, is_scheduler, moment_of
+from spectralzoom.pipeline.words import MOST_NAME, YEARS, is_field_name, is_scheduler, moment_of
 
 BUILT_IN_SCENES = BUILT_IN_NAMES
 RIG_FIELD = "field"  # scene in front of a rig or in a recording: only its size and bands are known
@@ -34,6 +35,7 @@ WHOLE, PART = "whole", "part"  # of the setting `extent`
 KEEP_SIGNAL, KEEP_RAW = "signal", "raw"
 _BYTES = TypeAdapter(ByteSize)
 _DATE = re.compile(r"\d{1,4}([./-])\d{1,2}\1\d{1,4}(\s|$)|\d{4}-\d\d-\d\d(?!\d)")
+_NUMBER_AND_UNIT = re.compile(r"\s*([-+0-9.e]+)\s*(nm|[uµμ]m|micro[a-z]*)?\s*")
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,13 @@ class Tolerance:
 
 
 def parse_name(value: object) -> str:
-    """Return a name that is also valid as a file name."""
-    name = parse_text(value)
-    if not is_name(name):
-        raise ValueError(f"must be a name of letters, digits, '_', '-' and '.', got {value!r}")
+    """Return a name in any script, in Unicode's composed form; folders have its `run_stem`."""
+    name = unicodedata.normalize("NFC", parse_text(value).strip())
+    if not is_field_name(name):
+        raise ValueError(
+            f"must be a name of at most {MOST_NAME} characters with a letter or digit, without '/', line ends and "
+            f"unseen characters, got {value!r}"
+        )
     return name
 
 
@@ -163,7 +168,10 @@ def parse_wavelengths(value: object) -> tuple[float, ...]:
     for item in _items(value):
         wave = _to_float(item)
         if wave is None or not low <= wave <= high:
-            raise ValueError(f"must each be a number from {low} to {high} nm, got {item!r}")
+            found = _NUMBER_AND_UNIT.fullmatch(str(item).lower())
+            nm = 0.0 if found is None else (_to_float(found[1]) or 0.0) * (1 if found[2] == "nm" else 1000)
+            hint = f"; if it means {nm:g} nm, write {nm:g}" if low <= nm <= high else ""
+            raise ValueError(f"must each be a number of nm from {low} to {high}, without a unit, got {item!r}{hint}")
         waves.append(wave)
     if not waves:
         raise ValueError(f"must list wavelengths in nm, such as 660,800; got {value!r}")

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from spectralzoom.flows.settings.load import FLAG, flag_of
+from spectralzoom.flows.settings.rules import mistakes
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES
 from spectralzoom.models.network.machine import choose_device
@@ -87,10 +89,19 @@ def weights_path(settings: Settings) -> Path:
     if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know farm, scouting and trial only;"
-            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors. A mosaic of"
-            " one pass needs none: --until mosaic --scan-step 1"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors{_unread(settings)}"
         )
     return shipped_weights()
+
+
+def _unread(settings: Settings) -> str:
+    """Return the flags by which these settings need no weights, as a sentence behind another; empty without any."""
+    for flags in ({"until": "mosaic"}, {"until": "mosaic", "scan_step": 1}):
+        asked = settings.but(**flags)
+        stated = dict.fromkeys((*settings.model_fields_set, *flags), FLAG)
+        if asked.ends_unread and not any(mistakes(asked, stated)):
+            return f". A mosaic needs none: {' '.join(f'{flag_of(name)} {value}' for name, value in flags.items())}"
+    return ""
 
 
 def shipped_weights() -> Path:

@@ -12,7 +12,7 @@ import signal
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -20,6 +20,7 @@ from types import FrameType
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError, SettingsError, disk_advice
 
 DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
+AT_ONCE_S = 0.3
 TERMINATED = 128 + signal.SIGTERM  # the exit code that a shell reports after SIGTERM
 
 
@@ -31,7 +32,7 @@ class Terminated(KeyboardInterrupt):
 def terminable(*, last: bool = False) -> Iterator[None]:
     """Raise `Terminated` in the main thread on SIGTERM while the block runs; do nothing in other threads.
 
-    After the ``last`` block of a process SIGTERM is ignored, so that the exit code stays.
+    After the ``last`` block of a process SIGTERM is ignored, so that the exit code stays, and Ctrl-C ends it at once.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -41,6 +42,36 @@ def terminable(*, last: bool = False) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN if last else before)
+        if last:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@contextmanager
+def answered(answer: Callable[[], None]) -> Iterator[None]:
+    """Call ``answer`` in a thread where the block has not ended a moment after Ctrl-C or SIGTERM.
+
+    Python writes a signal into a pipe at once, and raises it in the main thread only after the call that runs there.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ended, (reading, writing) = threading.Event(), os.pipe()
+    os.set_blocking(writing, False)
+
+    def listen() -> None:
+        while signals := os.read(reading, 1):
+            if signals[0] in (signal.SIGINT, signal.SIGTERM) and not ended.wait(AT_ONCE_S):
+                return answer()
+        return None
+
+    threading.Thread(target=listen, daemon=True).start()
+    before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(before)
+        os.close(writing)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

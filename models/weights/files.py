@@ -286,7 +286,8 @@ def describe_weights(path: Path) -> Description:
     """
     if not path.is_file():
         what = f"the weights {path} are a folder, expected a file" if path.is_dir() else f"no weights at {path}"
-        raise WeightsError(f"{what}; train some with: spectralzoom train DATASET -o FILE.safetensors")
+        advice = "give others as --weights, or train some with: spectralzoom train DATASET -o FILE.safetensors"
+        raise WeightsError(f"{what}; {advice}")
     anew = "leave out --weights for the built-in scenes, or train anew: spectralzoom train DATASET -o FILE"
     about = read_about(path, FORMAT, f"{anew}.safetensors")
     with refusing(path):
