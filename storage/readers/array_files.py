@@ -284,7 +284,7 @@ def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     named: Any = getattr(array.metadata, "dimension_names", None) or about.pop("_ARRAY_DIMENSIONS", ())
     fill = about.get("_FillValue")
     kind = array.dtype.kind
-    if kind == "f" and re.fullmatch("[A-Za-z0-9+/]{11}=", str(fill)):  # a double by xarray
+    if kind == "f" and isinstance(fill, str) and re.fullmatch("[A-Za-z0-9+/]{11}=", fill):  # a double of xarray
         about["_FillValue"] = float(struct.unpack("<d", base64.standard_b64decode(fill))[0])
     elif fill is None and array.metadata.zarr_format == 2 and named and kind in "buif" and array.fill_value is not None:
         about["_FillValue"] = float(array.fill_value)  # xarray's of v2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:5000])
 
 
-NOISY = {
+NOISY: dict[str, Callable[[Path], None]] = {
     "seven bands": tiff_of,
     "wrong tag": lambda path: tiff_of(path, extratags=[(320, "H", 2, (1, 2), True)]),
     "overview": with_overview,

@@ -170,11 +170,11 @@ def by_band_tiff(folder: Path, fills: Any) -> Path:
 @pytest.mark.parametrize("kind", ["TIFF", "ENVI"])
 def test_each_band_has_its_own_nodata_value(tmp_path: Path, kind: str, fills: Any) -> None:
     """That of one band is a value in the others, and another one changes the hash."""
+    raw: Any = NUMBERS * 100
     if kind == "TIFF":
         path = by_band_tiff(tmp_path, fills)
         raw = np.moveaxis(np.arange(24).reshape(2, 3, 4) * 100, 0, -1)
     else:
-        raw = NUMBERS * 100
         listed = ", ".join("nan" if fill is None else f"{fill}" for fill in fills)
         path = write_envi(tmp_path, raw.astype(np.int16), data_ignore_value=f"{{{listed}}}")
     scene = load_scene_file(path, wavelengths=[500, 600])
