@@ -67,7 +67,7 @@ THIRD = np.where(np.arange(40) < 10, 3, KINDS)  # with 0, 3 and 5
         (np.where(KINDS == 0, 300, KINDS.astype(np.int32)), "npy", "", ""),
         (np.where(THIRD == 0, -1, THIRD.astype(np.int16)), "npy", "", "label 0 is no class, 50.0% of the pixels are"),
     ],
-    ids=str,
+    ids=["array", "floats", "picture", "colours", "named", "named colours", "unlabelled", "others", "negative"],
 )
 def test_the_sentence_of_a_file(tmp_path: Path, labels: np.ndarray, ending: str, toml: str, words: str) -> None:
     """Arrays and pictures, numbers and colours, with and without names; every label another than 0 needs no words."""
