@@ -29,10 +29,10 @@ class FileNumbers:
         """Read the rows of a part, and cut its other axes (SceneError: the file ends before)."""
         rows, *rest = part if isinstance(part, tuple) else (part,)
         shape, offset = self.shape, self.offset
-        if isinstance(rows, slice):
+        if isinstance(rows, slice) and rows.step in (None, 1):
             first, stop, _ = rows.indices(shape[0])
             shape, offset = (max(stop - first, 0), *shape[1:]), offset + first * self.strides[0]
-            part = slice(None, None, rows.step), *rest
+            part = slice(None), *rest
         with self.path.open("rb") as file:
             return np.asarray(self._block(file, offset, shape, self.strides)[part])
 

@@ -89,7 +89,7 @@ def scene_entries(folder: Path) -> list[Path]:
 
 def image_folder(folder: Path) -> Path:
     """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
-    inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
+    inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and is_there(entry) and entry.is_dir())
     return min(inner, key=lambda entry: entry.name != "images", default=folder)
 
 
@@ -173,8 +173,8 @@ def _labels_near(folder: Path) -> tuple[list[Path], list[Path]]:
     They lie in the folder or in folders of labels there, and beside it if it has images.
     """
     around = [folder, folder.parent] if is_image_folder(folder) else [folder]
-    inside = [one for place in around for one in sorted(place.iterdir()) if one.name.lower() in WORDS and one.is_dir()]
-    inside = [one for one in inside if one != folder]
+    named = [one for place in around for one in sorted(place.iterdir()) if one.name.lower() in WORDS and is_there(one)]
+    inside = [one for one in named if one.is_dir() and one != folder]
     pictures = [entry for entry in scene_entries(folder) if is_label_name(entry)]
     pictures += [entry for place in inside for entry in scene_entries(place)]
     visible = [entry for place in [*around, *inside] for entry in sorted(place.glob("[!.]*"))]

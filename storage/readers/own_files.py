@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.cube_sources import reading
-from spectralzoom.storage.readers.user_files import is_there
+from spectralzoom.storage.readers.user_files import first_there, is_there
 
 _OF_TIFF = (".ovr", ".msk")  # endings of files beside an image, which GDAL opens by their content
 
@@ -31,16 +31,22 @@ def check_sidecars(image: Path, driver: str) -> None:
     """
     rasterio = importlib.import_module("rasterio")
     with os.scandir(image.parent) as entries:
-        beside = {one.name: one.is_file() for one in entries if one.name != image.name and not one.is_dir()}
-    for path in map(image.with_name, beside):
+        plain = {image.with_name(one.name): one.is_file(follow_symlinks=False) for one in entries}
+    strange = any(not is_plain and not (path.is_file() or path.is_dir()) for path, is_plain in plain.items())
+    for path in plain:
         name = path.name.casefold()
         own = name.startswith(f"{image.name.casefold()}.") or Path(name).stem == image.stem.casefold()
-        if own and name.endswith(_OF_TIFF) and is_there(path):
+        if own and path != image and name.endswith(_OF_TIFF) and first_there([path]):
+            _check_wanted(path, "GTiff", strange)
             with reading(path, "TIFF", "move it elsewhere"), rasterio.open(path, driver="GTiff") as file:
                 check_overviews(file, path)
-    if not all(beside.values()):
-        for path in _opened_with(image, driver):
-            is_there(path)
+    _check_wanted(image, driver, strange)
+
+
+def _check_wanted(image: Path, driver: str, strange: bool) -> None:
+    """Refuse what GDAL opens with an image and is no file (SceneError); only ``strange`` folders have such."""
+    for path in _opened_with(image, driver) if strange else ():
+        is_there(path)
 
 
 def _opened_with(image: Path, driver: str) -> set[Path]:

@@ -56,21 +56,25 @@ class OpenedFiles:
             time.sleep(grain_ns / SECOND_NS)
 
     def digest(self, path: Path) -> str:
-        """Return the SHA-256 of a file's content, and keep it."""
-        self.digests[path] = sha256(path)
-        return self.digests[path]
+        """Return the SHA-256 of a file's content since it was noted, and keep it (FileChangedError)."""
+        found = sha256(path)
+        self._check(path)
+        self.digests[path] = found
+        return found
 
     def check(self) -> None:
-        """Raise FileChangedError if a file has changed; only rights and other names (links) may have."""
-        for path, stamp in self.stamps.items():
-            now = _stamp(path)
-            if now[:-1] != stamp[:-1] or (now != stamp and self.digests.get(path) != sha256(path)):
-                raise FileChangedError(
-                    f"{path} changed while it was read; run the survey again when nothing writes to it"
-                )
-            self.stamps[path] = now
+        """Raise FileChangedError if a file has changed."""
+        for path in self.stamps:
+            self._check(path)
         for part in self.parts:
             part.check()
+
+    def _check(self, path: Path) -> None:
+        """Check a file; only rights and other names (links) of one with a digest may have changed."""
+        now, stamp = _stamp(path), self.stamps[path]
+        if now[:-1] != stamp[:-1] or (now != stamp and self.digests.get(path) != sha256(path)):
+            raise FileChangedError(f"{path} changed while it was read; run the survey again when nothing writes to it")
+        self.stamps[path] = now
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -119,15 +123,16 @@ def _stamp(path: Path) -> tuple[int, ...]:
 def is_there(path: Path, *, noted: bool = True) -> bool:
     """Return whether a file or folder has this name, before a reader opens it; `reading_files` notes it.
 
-    Raises SceneError: it is a link that leads nowhere, or a pipe, socket or device, whose reading may never end.
+    Raises SceneError: a link leads nowhere, or it is a pipe, a socket or a device, whose reading may never end.
     """
     try:
         mode = path.stat().st_mode
     except OSError as error:
         if not isinstance(error, FileNotFoundError | NotADirectoryError) and error.errno != ELOOP:
             raise
-        if path.is_symlink():
-            where = f"{path} is a link that leads nowhere, to {path.readlink()}"
+        led = next((one for one in (path, *path.parents) if one.is_symlink() and not one.exists()), None)
+        if led is not None:
+            where = f"{led} is a link that leads nowhere, to {led.readlink()}"
             raise SceneError(f"{where}; correct it, mount the disk, or remove the link") from None
         return False
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
