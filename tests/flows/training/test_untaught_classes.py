@@ -117,5 +117,5 @@ def test_evaluation_and_surveys_name_classes_that_weights_never_draw(tmp_path: P
     assert content["support"]["weed"] == 9
     assert {row["per_class_iou"]["weed"] for row in content["rows"]} == {0.0}
     asked = {"scene": str(folder / "001.npy"), "source": "raster", "weights": str(fold.out), "out": str(tmp_path / "o")}
-    notes = " ".join(open_field(load_settings(None, asked)).notes)
-    assert "classes without a training pixel, which are never drawn: weed" in notes
+    warned = " ".join(open_field(load_settings(None, asked)).warnings)
+    assert "classes without a training pixel, which are never drawn: weed" in warned
