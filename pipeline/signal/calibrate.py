@@ -272,7 +272,7 @@ def find_bad_elements(dark: NDArray[np.floating], white: NDArray[np.floating]) -
 def check_frames(
     where: str, dark: NDArray[np.floating], white: NDArray[np.floating], full_scale_dn: float | None = None
 ) -> list[str]:
-    """Return a note where elements of a white frame are at the full scale of a converter.
+    """Return a note where elements of a white frame are at the full scale of a converter; ``where`` begins messages.
 
     This is that of the camera, or the largest number of 8 to 16 bits. Raises SceneError: the white frame has no light
     beside the dark one, as where they are exchanged.
@@ -282,7 +282,7 @@ def check_frames(
     if not np.maximum(light, 0).sum() > LEAST_LIGHT * np.maximum(-light, 0).sum():
         brighter = 100 * np.mean(light > 0)
         raise SceneError(
-            f"{where}: the white frame is not brighter than the dark one ({brighter:.0f} % of its elements are); "
+            f"{where}the white frame is not brighter than the dark one ({brighter:.0f} % of its elements are); "
             "exchange them if they are swapped, or give others"
         )
     most = float(white[known].max())
@@ -290,7 +290,7 @@ def check_frames(
     if not any(abs(most - scale) < 0.5 for scale in scales):
         return []
     full = 100 * float(np.mean(white[known] >= most - 0.5))
-    what = f"{where}: the white frame is at full scale ({most:g} DN) in {full:.2g} % of the elements"
+    what = f"{where}the white frame is at full scale ({most:g} DN) in {full:.2g} % of the elements"
     return [f"{what}: if it is saturated, values there are too high, and a darker one is needed"]
 
 

@@ -119,7 +119,7 @@ def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     white_ms = None
     if len(frames) == 2:
         white_ms, more = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
-        notes += [*more, *check_frames(source.name, frames["dark"].values, frames["white"].values)]
+        notes += [*more, *check_frames(f"{source.name}: ", frames["dark"].values, frames["white"].values)]
     else:
         notes = [f"{note} is not used: values over white need a dark and a white frame" for note in notes]
         notes += [] if all_alike(lines_ms) else [f"numbers of {span_text(lines_ms)} are not scaled to one exposure"]

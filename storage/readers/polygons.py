@@ -102,7 +102,7 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
         _check_coordinates(table)
         valid = table.geometry.is_valid
         whole = [one if one.is_valid else polygons_of(shapely.make_valid(one)) for one in table.geometry.force_2d()]
-    except ZoneError:
+    except PipelineError:
         raise
     except (OSError, ValueError, RuntimeError, *OF_LIBRARIES) as error:
         raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None

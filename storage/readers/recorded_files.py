@@ -175,7 +175,7 @@ def references_of(
         )
     dark = found.get("dark", np.zeros(frame, np.float32))
     white = found.get("white", np.full(frame, white_dn, np.float32))
-    more = check_frames(name, dark, white, white_dn)
+    more = check_frames(f"{name}: ", dark, white, white_dn)
     notes += more if "white" in found else []
     bad: NDArray[Any] = found.get("bad", np.zeros(frame, np.float32))
     if measured and "bad" not in found:

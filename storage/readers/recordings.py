@@ -109,7 +109,7 @@ def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
             raise IncompleteStoreError(f"{path}/dn lacks {lost} of its chunks, whose lines would be 0; copy it again")
     notes = [RESTORED] if any(isinstance(cube, RestoredCube) for cube in cubes) else []
     sweeps = tuple(
-        replace(one, read=opened.guarded(one.read))
+        replace(one, read_lines=opened.guarded(one.read_lines))
         for one in (_stored_sweep(path, cube, notes) for path, cube in zip(stores, cubes, strict=True))
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])

@@ -172,7 +172,7 @@ def as_references(
     values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
     stated = {kind: (one.mean, one.taken) for kind, one in (("dark", dark), ("white", white)) if one.taken.exposures}
     try:
-        notes = check_frames("references", dark.mean, white.mean, full_scale_dn)
+        notes = check_frames("", dark.mean, white.mean, full_scale_dn)
         found = References(dark.mean, white.mean, values, find_bad_elements(dark.mean, white.mean) | dark.stuck)
         if exposure_ms is not None and stated:
             white_ms, more = match_exposures(stated, Taken(), np.array([exposure_ms]), stated=True)

@@ -87,7 +87,7 @@ def test_cascade_table_keeps_the_range_of_its_scenes() -> None:
     """Three scenes of 1, 2 and 4 patches above 0.2 give their median, fewest and most; a record keeps all columns."""
     none = np.zeros((2, 8), np.uint8)
     gains = [np.where(np.arange(4) < count, 0.3, 0.0) for count in (2, 4, 1)]
-    scenes = [placement.ReadTwice(none, none, none, gain, SceneGrid(2, 8, 2)) for gain in gains]
+    scenes = [placement.ReadTwice(none, none, gain, none, SceneGrid(2, 8, 2)) for gain in gains]
     table = placement.CascadeTable.read(asdict(placement.CascadeTable.judged(scenes, 2)))
     assert table.fractions_at(0.2) == pytest.approx([0.5, 0.25, 1.0])
     assert table.fractions_at(0.45) == [0, 0, 0]

@@ -66,7 +66,10 @@ def test_saving_twice_gives_equal_files(saved: Path, tmp_path: Path):
 
 def test_the_error_of_a_missing_file_says_how_to_make_one(tmp_path: Path):
     """The error names the path and the training command."""
-    with pytest.raises(WeightsError, match=r"no weights at .*gone.safetensors; train some with: spectralzoom train"):
+    with pytest.raises(
+        WeightsError,
+        match=r"no weights at .*gone.safetensors; give others as --weights, or train some with: spectralzoom train",
+    ):
         load_weights(tmp_path / "gone.safetensors")
 
 
@@ -209,7 +212,9 @@ def test_a_flipped_bit_of_a_tensor_is_found(saved: Path):
     raw = bytearray(saved.read_bytes())
     raw[-4] ^= 1
     saved.write_bytes(raw)
-    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written; restore"):
+    with pytest.raises(
+        WeightsError, match=r"is damaged, or changed while it was read: tensor \S+ is not what was written; restore"
+    ):
         load_weights(saved)
 
 

@@ -217,10 +217,10 @@ def test_a_white_frame_at_full_scale_is_noted(most: float, camera: float | None)
     """The full scale is that of the camera, or of any number of bits; the note has the fraction of elements."""
     white = np.full((10, 10), most)
     white[:, :5] -= 0.6
-    (note,) = check_frames("scan", np.full(white.shape, 60.0), white, camera)
+    (note,) = check_frames("scan: ", np.full(white.shape, 60.0), white, camera)
     assert "scan: the white frame is at full scale" in note
     assert "in 50 % of the elements" in note
-    assert check_frames("scan", np.full(white.shape, 60.0), white - 2, camera) == []
+    assert check_frames("scan: ", np.full(white.shape, 60.0), white - 2, camera) == []
 
 
 @pytest.mark.parametrize("hot", [0, 1])
@@ -230,11 +230,11 @@ def test_frames_without_light_between_them_are_refused(hot: int) -> None:
     white[:hot, 0] = 60000
     for one in (dark, dark[::-1]):
         with pytest.raises(SceneError, match="scan: the white frame is not brighter than the dark one"):
-            check_frames("scan", one, dark)
+            check_frames("scan: ", one, dark)
     with pytest.raises(SceneError, match=r"not brighter than the dark one \(\d % of its elements are\); exchange them"):
-        check_frames("scan", white, dark)
+        check_frames("scan: ", white, dark)
     white[:, :7] = dark[:, :7] - 10
-    assert check_frames("scan", dark, white) == []
+    assert check_frames("scan: ", dark, white) == []
 
 
 def test_too_many_bad_elements_are_refused() -> None:

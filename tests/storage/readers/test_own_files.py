@@ -45,8 +45,8 @@ def envi_by_data(here: Path) -> Opened:
 def headwall(here: Path) -> Opened:
     write_part(here, "raw_0", CUBE)
     (here / "frameIndex_0.txt").write_text("".join(f"{frame}\t{1000 + frame}\n" for frame in range(6)))
-    for kind in ("dark", "white"):
-        write_cube(here / f"{kind}Reference.hdr", CUBE[:1], "u2")
+    for kind, level in (("dark", 0), ("white", 1000)):
+        write_cube(here / f"{kind}Reference.hdr", CUBE[:1] * 0 + level, "u2")
     return lambda: open_cube_source(here)
 
 
