@@ -188,7 +188,7 @@ def _cure(data: TrainingData, weights: Sequence[Candidate]) -> str:
     names = [*data.files.files] if data.files else []
     held = [name for name in names if any(name in one.split.get("held_out", ()) for one in weights)]
     zero = [cure for name in weights[0].described.class_names if (cure := zero_cure(name))]
-    way = "Judge by another scene, or by pixels that the training had no label of: --labels FILE"
+    way = "Judge by another scene, or by other labelled pixels of it: --labels FILE"
     if held:
         way = f"Judge by frames that were held out: --frames {','.join(held)}"
     elif len(names) > 1 and data.files:

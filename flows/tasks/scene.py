@@ -121,8 +121,8 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
     )
     values = map_values(file.class_values)
     zero = [name for name, value in zip(file.class_names, file.class_values, strict=True) if value in (0, (0, 0, 0))]
-    more = {"pixel_m": file.pixel_m, "class_values": values, "zero_class": "".join(zero)}
-    return replace(scene, regridded=file.regridded, content=file.content, **more)
+    scene = replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m)
+    return replace(scene, class_values=values, zero_class="".join(zero))
 
 
 def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:

@@ -125,5 +125,5 @@ def test_the_last_line_says_it_and_evaluate_says_what_to_do(tmp_path: Path, caps
     with pytest.raises(SceneError) as refused:
         evaluate_weights(str(path), EvaluateFlags(weights=(out,), labels=str(tmp_path / "test.npy")))
     told = str(refused.value)
-    assert "Judge by another scene, or by pixels that the training had no label of: --labels FILE" in told
+    assert "Judge by another scene, or by other labelled pixels of it: --labels FILE" in told
     assert "write unlabelled = 0 into a scene.toml beside the scene, and train again" in told
