@@ -208,7 +208,9 @@ def test_a_flipped_bit_of_a_tensor_is_found(saved: Path):
     raw = bytearray(saved.read_bytes())
     raw[-4] ^= 1
     saved.write_bytes(raw)
-    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written; restore"):
+    with pytest.raises(
+        WeightsError, match=r"is damaged, or changed while it was read: tensor \S+ is not what was written; restore"
+    ):
         load_weights(saved)
 
 
