@@ -110,7 +110,7 @@ def test_an_overexposed_white_frame_is_named():
     assert notes == []
     source.references(FINE)
     assert [note.partition(" in ")[0] for note in notes] == [
-        f"{rig.camera.captures[1]}: the white frame is at full scale"
+        f"{rig.camera.captures[1]}: the white frame is at full scale (4095 DN)"
     ]
 
 
