@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 
 from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError, list_some
 from spectralzoom.pipeline.words import is_name, moment_of
+from spectralzoom.storage.receipts import receipt_problem
 from spectralzoom.storage.store import (
     CAPTURED,
     LATEST,
@@ -122,9 +123,11 @@ def read_run(folder: Path) -> Run:
         problem = f"{RECEIPT} {found}" if found else None
         try:
             receipt = {} if problem else json.loads((folder / RECEIPT).read_bytes())
+            wrong = receipt_problem(receipt) if receipt else None
+            problem = f"{RECEIPT}: {wrong}" if wrong else problem
         except (OSError, ValueError, RecursionError) as error:
             problem = f"{RECEIPT} cannot be read: {error}"
-    return Run(folder, facts, _as(dict, receipt), problem)
+    return Run(folder, facts, _as(dict, receipt) if problem is None else {}, problem)
 
 
 class Catalogue(NamedTuple):
@@ -216,6 +219,8 @@ def verify_everything(
         done += listed_bytes(manifest)
         with refusals(archive.root, "read the archive", every=True):
             problems = list(problems_of(archive.root / uri, every_byte=True))
+            if not problems and uri.startswith("runs/"):
+                problems += filter(None, [read_run(archive.root / uri).problem])
         if is_known(archive.root / uri) or uri in named:  # else gc has removed it since
             found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     what = "expected a folder with a manifest; take it out of the archive"

@@ -27,7 +27,7 @@ from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
-from spectralzoom.storage.store import MANIFEST, Archive, check_store, is_archive, try_manifest
+from spectralzoom.storage.store import MANIFEST, Archive, check_store, damage, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256
 
 SAME_PERIOD = 0.01
@@ -331,8 +331,10 @@ def _run_with_cubes(address: str | Path) -> tuple[Archive, Run, list[Path]] | No
     archive = Archive.open(place, create=False, write=False)
     for folder in [archive.run_folder(name)] if name else archive.past_runs():
         run = read_run(folder)
+        if name and run.problem is not None:
+            raise damage(folder, run.problem)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
-    which = f"the run {name}" if name else "no run"
-    raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")
+    which = f"the run {name} has no" if name else "no run has"
+    raise ArchiveError(f"{archive.name}: {which} raw cubes; survey into the archive first, or name another run")
