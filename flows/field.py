@@ -21,6 +21,7 @@ from spectralzoom.flows.tasks.rig_field import RigHold, rig_source
 from spectralzoom.flows.tasks.scene import (
     check_labels,
     check_scene_there,
+    darkness,
     farm_refusal,
     for_rig,
     judged_labels,
@@ -28,9 +29,14 @@ from spectralzoom.flows.tasks.scene import (
     open_scene,
     scene_of_visit,
 )
-from spectralzoom.flows.tasks.survey_model import SurveyModel, beyond_training, other_unit, training_note, weights_path
+from spectralzoom.flows.tasks.survey_model import (
+    SurveyModel,
+    beyond_training,
+    other_unit,
+    training_warning,
+    weights_path,
+)
 from spectralzoom.flows.tasks.zones import SurveyZones, open_zones, place_of_field
-from spectralzoom.models.evaluation.expected_scores import MapScores
 from spectralzoom.models.network.machine import choose_device
 from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.reading.regions import Region, plan_regions
@@ -70,7 +76,7 @@ class Field:
     raster: RasterPixels | None  # of a scene that needs no capture
     prior: Prior | None  # prior map
     notes: tuple[str, ...]
-    outside: bool  # of the conditions of the training
+    warnings: tuple[str, ...]  # about the map, before it is drawn
     refused: str | None  # why this machine cannot run a survey that is only planned
 
     @property
@@ -114,9 +120,10 @@ class Field:
         return None if self.prior is None else self.described.reader
 
     @property
-    def map_scores(self) -> MapScores | None:
-        """Return the calibration of expected scores; None where the weights have none, or outside of their training."""
-        return None if self.outside else self.described.map_scores
+    def mapped_px(self) -> int:
+        """Return the pixels that can have a class: those with data within the zones."""
+        without = [one for one in (self.scene.missing, self.zones.left_out) if one is not None]
+        return int(np.count_nonzero(~np.logical_or.reduce([np.zeros(self.scene.shape, np.bool_), *without])))
 
     @property
     def view(self) -> FieldView:
@@ -177,9 +184,10 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     raster = None if pixels is None else RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
     outside = beyond_training(settings, scene, model.described, model.trained_on) if model.reads else []
-    if raster is not None and not planning:
-        raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
+    if raster is not None:
         outside += other_unit(raster, scene.wavelength_nm, model.load()) if model.reads else []
+        if not planning:
+            raster.rows_at_once(settings.memory)  # raises an error where one row of patches does not fit
     archive = Archive(Path(settings.out).absolute())
     name = settings.name or Path(scene.name).stem
     label_notes = check_labels(scene, model.described) if model.reads else ()
@@ -206,8 +214,8 @@ def open_field(settings: Settings, *, planning: bool = False) -> Field:
         hold=hold,
         raster=raster,
         prior=prior,
-        notes=(*notes, *zones.notes, *prior_notes, *training_note(outside, model.path), *label_notes),
-        outside=bool(outside),
+        notes=(*notes, *zones.notes, *prior_notes, *label_notes),
+        warnings=(*darkness(settings), *training_warning(outside, model.path)),
         refused=refused,
     )
 

@@ -31,12 +31,13 @@ from spectralzoom.models.network.spectral import LineSpec
 from spectralzoom.models.policies.placement import CascadeTable
 from spectralzoom.models.policies.policies import GLANCING_POLICIES
 from spectralzoom.models.reading.prior_map import EVERY_PX
-from spectralzoom.models.weights.files import CASCADE
+from spectralzoom.models.weights.files import BY_LAW, CASCADE
 from spectralzoom.pipeline.capture.recorded_passes import recorded_fine_ms, recorded_fine_pass
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.geometry.scan import Sweep
+from spectralzoom.pipeline.planning.coverage import patches_shown
 from spectralzoom.pipeline.planning.fine_pass import FinePlan, SecondPass
-from spectralzoom.pipeline.planning.uniform_scans import ScanPerformance
+from spectralzoom.pipeline.planning.uniform_scans import MIOU, ScanPerformance
 from spectralzoom.pipeline.rectify.placed import PixelGrid, place
 from spectralzoom.pipeline.rectify.region import MosaicWork, plan_tiles
 from spectralzoom.pipeline.signal.subspace import SMOOTH
@@ -81,7 +82,9 @@ class SurveyPlan:
         """Return the table of losses; None without an accepted loss, or where the weights have no table or network."""
         described = self.field.described
         content = described.record.get(CASCADE) if self.settings.expected_loss and described.config.corrected else None
-        return None if content is None else CascadeTable.read(content)
+        if content is None:
+            return None
+        return CascadeTable.read({**content, **content.get(BY_LAW, {}).get(self.settings.law, {})})
 
     @property
     def chooses(self) -> bool:
@@ -219,30 +222,47 @@ class SurveyPlan:
             pixels += -(-grid.height // EVERY_PX) * -(-grid.width // EVERY_PX)
         return replace(done, detail=done.detail + self.field.reader.sizes.multiply_adds(pixels))
 
-    def reading_figures(self, patch_index: NDArray[np.integer]) -> dict[str, Any]:
+    def reading_figures(self, read: NDArray[np.intp], changed: NDArray[np.intp] | None = None) -> dict[str, Any]:
         """Return limits, patches and multiply-adds of the full network, for receipts."""
         settings = self.settings
         everything = self.field.kept_patches
         return {
             "asked": {"macs": settings.macs, "least_gain": self.least_gain, "expected_loss": settings.expected_loss},
-            "patches": len(patch_index),
+            "patches": len(read),
             "of_patches": len(everything),
             "multiply_adds": {
-                "done": self.work_done(patch_index).total,
+                "done": self.work_done(read, changed).total,
                 "everything": self.costs.of_map(everything).total,
             },
         }
 
     @property
-    def likely_patches(self) -> NDArray[np.intp]:
-        """Return as many patches as are expected to be read at full resolution, or as the budget pays for."""
-        if self.budget is not None:
-            return self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel())  # all gain the same
+    def likely_readings(self) -> tuple[NDArray[np.intp], ...]:
+        """Return as many patches as are expected to be read at full resolution, or as the budget pays for.
+
+        Those that other scenes need are followed by the fewest and the most that one of them needs.
+        """
+        if self.budget is not None:  # all gain the same
+            return (self.budget.choose(np.full(self.budget.costs.grid.patch_shape, np.inf).ravel()),)
         cascade = self.cascade
         least = self.least_gain
         kept = self.field.kept_patches
         every = np.intersect1d(kept, self.scanned.patch_index) if self.part else kept
-        return every if cascade is None or least is None else every[: round(cascade.fraction_at(least) * len(every))]
+        if cascade is None or least is None:
+            return (every,)
+        return tuple(every[: round(one * len(every))] for one in cascade.fractions_at(least))
+
+    @property
+    def likely_changed(self) -> NDArray[np.intp] | None:
+        """Return the patches of which a second pass shows a part if all of them gain alike; None for a uniform scan."""
+        second, record, patches = self.second_pass, self.scan_record, self.field.grid.every_patch()
+        if second is None:
+            return None
+        alike = np.isin(patches, self.field.kept_patches) / len(patches)
+        fine = second.by_score(alike)
+        if record is not None:
+            fine = second.best(record, lambda *scan: alike * record.expected(*scan)[MIOU])
+        return np.flatnonzero(patches_shown(fine.sweeps, self.field.grid, second.camera))
 
 
 def plan_survey(opened: Field) -> SurveyPlan:
@@ -297,6 +317,7 @@ def _extent(opened: Field) -> tuple[PassLayout, ExtentChoice | None, Settings, t
         seconds=settings.seconds,
         max_age=settings.max_age,
         left_out=np.logical_or.reduce(masks) if masks else None,
+        scored=not opened.warnings,
     )
     return layout, extent, settings, (note,)
 

@@ -41,6 +41,8 @@ class Output:
     path: Path  # a folder to write into
     report: Report
     spool: Path  # a folder, not made yet, that outlives a killed process; removed once the store is published
+    note: Callable[[str], None] = lambda text: None  # assumptions, for the terminal
+    facts: dict[str, float] = field(default_factory=dict)  # about this run, for its receipt: not in the store
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,7 @@ class Row:
     peak_rss_bytes: int | None = None
     bytes_in: int | None = None
     bytes_out: int | None = None
+    facts: Mapping[str, float] = field(default_factory=dict)  # of `Output`
 
 
 class Stores:
@@ -162,6 +165,7 @@ class Stores:
         dry: bool = False,
         watch: Callable[[str, str, str, float], None] = lambda *_: None,  # name, title, state and progress (0..1)
         log: Callable[[str], None] = lambda text: None,
+        note: Callable[[str], None] = lambda text: None,
         finish: Callable[[Path], None] = lambda folder: None,  # called with the folder of each store that was built
     ) -> None:
         self.archive = archive
@@ -169,13 +173,17 @@ class Stores:
         self.dry = dry
         self.rows: dict[str, Row] = {}
         self.bytes_written = 0
-        self._watch, self._log, self._finish = watch, log, finish
+        self._watch, self._log, self._note, self._finish = watch, log, note, finish
         self._cleared: dict[Ref, Callable[[], object]] = {}  # makes each again
 
     @property
     def refs(self) -> list[Ref]:
         """Return the stores of all stages."""
         return [row.ref for row in self.rows.values()]
+
+    def total(self, fact: str) -> float:
+        """Return the sum of a fact of the stages that ran."""
+        return sum(row.facts.get(fact, 0.0) for row in self.rows.values())
 
     def has(self, ref: Ref) -> bool:
         """Return whether a store has its files; in a dry run some have not been made."""
@@ -214,25 +222,26 @@ class Stores:
         with suppress(OSError):  # Linux: reset the peak
             Path("/proc/self/clear_refs").write_text("5")
         wall_s, cpu_s = time.perf_counter(), time.process_time()
+        facts: dict[str, float] = {}
         try:
-            built = self._build(request, ref)
+            built = self._build(request, ref, facts)
         except BaseException:
             self._watch(request.stage.name, request.stage.title, "failed", 0.0)
             raise
         row = self._row(request, ref)
         if built:  # else another process has made it meanwhile
             wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-            row = replace(row, state="ran", wall_s=wall_s, cpu_s=cpu_s, peak_rss_bytes=peak_bytes())
+            row = replace(row, state="ran", wall_s=wall_s, cpu_s=cpu_s, peak_rss_bytes=peak_bytes(), facts=facts)
         return self._record(row)
 
-    def _build(self, request: Request, ref: Ref) -> bool:
+    def _build(self, request: Request, ref: Ref, facts: dict[str, float]) -> bool:
         made = request.stage
         spool = self.archive.root / "spool" / ref.key
         report = partial(self._watch, made.name, made.title, "running")
         report(0.0)
 
         def build(folder: Path) -> None:
-            request.build(Output(folder, report, spool))
+            request.build(Output(folder, report, spool, self._note, facts))
             self._finish(folder)
             self.bytes_written += bytes_in(spool)
 

@@ -55,9 +55,13 @@ def carry_out(plan: SurveyPlan, started: datetime) -> RunRef:
     observer = current_observer()
     archive = Archive.open(plan.settings.out)
     archive.reclaim()  # remove incomplete stores of killed runs
+    for warning in plan.field.warnings:
+        observer.warn(warning)
     for note in plan.notes:
         observer.note(note)
-    stores = Stores(archive, name=plan.field.name, watch=observer.watch, log=observer.log, finish=tidy_up)
+    stores = Stores(
+        archive, name=plan.field.name, watch=observer.watch, log=observer.log, note=observer.note, finish=tidy_up
+    )
     with archive.in_use(), plan.pool.open(), plan.field.hold:
         try:
             products = run_stages(stores, plan)

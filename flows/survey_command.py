@@ -16,8 +16,6 @@ from rich.console import Console
 from rich.markup import escape
 
 from spectralzoom.flows.archive.plan_command import dry_run
-from spectralzoom.flows.field import open_field
-from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.publish.publishing import RunRef
 from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.publish.receipt_table import print_summary
@@ -36,7 +34,8 @@ from spectralzoom.flows.tasks.local_server import (
 )
 from spectralzoom.flows.tasks.observer import Observer, observed_by
 from spectralzoom.flows.tasks.scene import farm_refusal
-from spectralzoom.flows.terminal.progress import StageProgress
+from spectralzoom.flows.tasks.scores import warnings_of
+from spectralzoom.flows.terminal.progress import StageProgress, show_warnings
 from spectralzoom.models.network.machine import give_back_freed_memory, keep_freed_memory, use_one_thread
 from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.store import Archive
@@ -92,8 +91,11 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
         def note(text: str) -> None:
             console.print(f"[dim]note: {escape(text)}[/]", soft_wrap=True)
 
+        def warn(text: str) -> None:
+            show_warnings([text], console)
+
         work = FlowWork()
-        with observed_by(Observer(progress.watch, note, progress.say, carry=work)):
+        with observed_by(Observer(progress.watch, note, warn, progress.say, carry=work)):
             run = _survey(settings, console, work, note)
     if run.stopped is not None:
         raise run.stopped
@@ -101,6 +103,8 @@ def run_survey(settings: Settings, console: Console, *, verbose: bool = False, s
     if summary:
         print_summary(published.receipt, console, verbose=verbose)
         console.print(f"Report: {escape(str(published.folder / 'report.html'))}", soft_wrap=True)
+    else:
+        show_warnings(warnings_of(published.receipt), console)
     return published
 
 
@@ -140,8 +144,6 @@ def _publish_stored(settings: Settings) -> RunRef | None:
     plan, stores = dry_run(settings)
     if any(row.state != "cached" for row in stores.rows.values()) or "PREFECT_API_URL" in os.environ:
         return None
-    if plan.field.raster is not None:  # notes on its unit need values and weights
-        plan = plan_survey(open_field(settings))
     return carry_out(plan, started)
 
 

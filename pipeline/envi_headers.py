@@ -21,6 +21,14 @@ DATA_TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 6: "c8", 9: "c16", 12
 OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
 
 
+def header_text(content: bytes) -> str:
+    """Return the text of a header in UTF-8, or else Latin-1."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
 def split_header(text: str, where: str) -> tuple[dict[str, str], dict[str, str]]:
     """Return the fields, and the settings in comments: keys in lower case, values without the outer braces.
 

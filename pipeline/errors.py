@@ -94,6 +94,10 @@ class SceneError(PipelineError, ValueError):
     """A scene, label or mask file cannot be used."""
 
 
+class FileChangedError(SceneError):
+    """A file changed while it was read."""
+
+
 class NotRecordedError(SceneError):
     """A requested line is not part of the recording."""
 

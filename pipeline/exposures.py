@@ -1,25 +1,30 @@
-"""Read and compare the exposure, gain and binning of cubes and reference frames.
+"""Read and compare the settings that the headers of cubes and reference frames state.
 
 A camera's number is ``bias + gain * exposure * (dark current + light)``. White above its own dark frame is proportional
 to gain times exposure, and is scaled by the stated ratio. A dark frame is not scaled: how much of it is bias, which
 does not depend on the exposure, is not known.
+
+Every other key that both headers have is compared if its values look like settings: numbers, or a word or two. Where
+one that the numbers depend on differs, the frame is refused. Any other one is named in a note.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spectralzoom.pipeline.envi_headers import finite_number
-from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.errors import SceneError, list_some
 
 SAME = 1e-3  # largest relative difference of equal exposures, which cameras round
 MOST_DARK_ERROR = 0.05  # of white that the dark current of another exposure may stand for
+MOST_NAMED = 24  # keys of a note
+WILD_RATIO = 100.0  # of two exposures of one camera; units that are confused differ by a thousand
 TO_MS = {"ns": 1e-6, "us": 1e-3, "ms": 1.0, "s": 1e3}
 _WORDS = {"ns": "nanosec", "us": "µs μs usec microsec", "ms": "msec millisec", "s": "sec"}
 _UNITS = {word: unit for unit, words in _WORDS.items() for word in (unit, *words.split())}
@@ -33,8 +38,20 @@ _TIME = re.compile(
     rf"s? ?(?:times?|period|duration|(?P<speed>speed))? ?(?P<detector>\d?){_UNIT}"
 )
 _GAIN = re.compile(r"(?:(?:camera|sensor|detector|analog|analogue|digital|em) )?gain ?(?P<detector>\d?)" + _UNIT)
-_FRAME = re.compile(r"(?:.* )?binning.*|aoi (?:left|top)")
-_MODE = re.compile(r"(?:.* )?gain ?(?:mode|setting|state|level|stage|index)|(?:preamp|conversion) ?gain|iso(?: .*)?")
+_UNIT_KEY = re.compile(r"(?:units? of )?(?P<of>.+?) ?units?|units? of (?P<other>.+)")
+_AREA = re.compile(r".*(?:(?:aoi|roi|window).*(?:left|top|offset|start)|\b[hv](?:img|roi)\d?\b).*")
+_FIXED = re.compile(  # the numbers depend on it
+    r"(?!data .*gain values).*(?:(?<!\ba)gain|bin(?:n(?:ed|ing)|s?\b)|accum|co ?add|\btdi\b|\biso\b).*"
+)
+_OF_FORMAT = re.compile(  # fields of the ENVI format that its reader applies, or that lay out the file
+    "samples|lines|bands|interleave|(?:data|file|sensor) type|byte order|header offset|file compression|[xyz] start|bbl"
+    "|(?:major|minor) frame offsets|default (?:bands|stretch)|z plot range|map info|reflectance scale factor|classes"
+    "|data (?:ignore value|gain values|offset values)|wavelength|fwhm"
+)
+_OF_LIGHT = re.compile(r".*(?:shutter|lamp|light|illumin|\bled\b|\bcap\b|\blid\b).*")  # off for a dark frame
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
+_NUMBERS = rf"{_NUMBER}(?:[\s,;x*]+{_NUMBER}){{0,7}}"
+_SETTING = re.compile(rf"{_NUMBERS} ?[a-zµ%°]{{0,8}}|(?=.{{1,24}}$)[a-z][a-z0-9+-]*(?: [a-z0-9][a-z0-9+-]*)?")
 _VALUE = re.compile(
     r"(?:(?P<over>1) ?/ ?)?(?P<number>[-+]?[\d.]+(?:,\d+)?(?:e[-+]?\d+)?|[-+]?(?:nan|inf))\s*(?P<unit>[a-zµμ]*)"
 )
@@ -48,9 +65,11 @@ class Taken:
     exposures: Mapping[str, float] = field(default_factory=dict)  # [ms], by the number of the detector
     times: Mapping[str, float] = field(default_factory=dict)  # exposures without a unit, by their key
     gains: Mapping[str, tuple[float, str]] = field(default_factory=dict)  # number and unit (dB, x or none), by key
-    frame: Mapping[str, str] = field(default_factory=dict)  # settings that are compared as texts, by key
+    frame: Mapping[str, str] = field(default_factory=dict)  # settings that have to be equal, as texts, by key
+    others: Mapping[str, str] = field(default_factory=dict)  # other keys that look like settings
     notes: tuple[str, ...] = ()
     conflicts: tuple[str, ...] = ()  # keys that contradict each other
+    cut: bool = False  # bands of a larger frame were picked by their wavelengths, so that areas may differ
 
     @property
     def exposure_ms(self) -> float | None:
@@ -78,66 +97,108 @@ class Taken:
 def taken_with(where: str, *headers: Mapping[str, object]) -> Taken:
     """Return what headers (fields, comments, attributes) of one file state; messages call it ``where``.
 
-    Keys are those of several makes, with the unit in key or value; ``description`` may hold keys, too. An exposure that
-    cannot be read is kept as a text, with a note.
+    Keys are those of several makes, with the unit in key, value or a key of its own; ``description`` may hold keys,
+    too. An exposure that cannot be read is kept as a text, with a note.
     """
-    exposures: dict[str, tuple[str, float]] = {}
-    times: dict[str, float] = {}
-    gains: dict[str, tuple[float, str]] = {}
-    frame: dict[str, str] = {}
-    notes: list[str] = []
-    conflicts: list[str] = []
     every = [(key, str(value)) for header in headers for key, value in header.items()]
     about = "\n".join(value for key, value in every if key == "description")
-    pairs = re.split(r"[\n;]|,(?=\s*[^\W\d][^,;=:\n]*[=:])", about)
-    for key, value in (*every, *(re.split("[=:]", pair, maxsplit=1) for pair in pairs if re.search("[=:]", pair))):
-        name = re.sub(r"[\s_.,/]+", " ", key.lower()).strip()
-        if _FRAME.fullmatch(name):
-            conflicts += _put(frame, name, ", ".join(re.findall(r"[\d.]+", value)) or value.strip().lower())
-        elif _MODE.fullmatch(name):
-            conflicts += _put(frame, name, value.strip().lower())
-        elif (match := _GAIN.fullmatch(name)) is not None:
-            number, unit = _number(value, match)
+    parts = (re.split("[=:]", part, maxsplit=1) for part in re.split(r"[\n;]|,(?=\s*[^\W\d][^,;=:\n]*[=:])", about))
+    every += [(pair[0], pair[1]) for pair in parts if len(pair) == 2]
+    named = [(re.sub(r"[\s_.,/]+", " ", key.lower()).strip(), value) for key, value in every]
+    found = _Reader(where)
+    for name, value in named:
+        if (of := _UNIT_KEY.fullmatch(name)) is not None and (word := value.lower().strip(" []()")):
+            found.units[of["of"] or of["other"]] = _UNITS.get(word, word)
+    for name, value in named:
+        if _UNIT_KEY.fullmatch(name) is None:
+            found.add(name, value)
+    exposures = {detector: ms for detector, (_, ms) in found.exposures.items()}
+    times = {} if exposures else found.times
+    texts = tuple(found.notes), tuple(found.conflicts)
+    return Taken(where, exposures, times, found.gains, found.frame, found.others, *texts)
+
+
+@dataclass
+class _Reader:
+    """The keys of one file, sorted by kind."""
+
+    where: str
+    units: dict[str, str] = field(default_factory=dict)  # of keys, by their names
+    exposures: dict[str, tuple[str, float]] = field(default_factory=dict)
+    times: dict[str, float] = field(default_factory=dict)
+    gains: dict[str, tuple[float, str]] = field(default_factory=dict)
+    frame: dict[str, str] = field(default_factory=dict)
+    others: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    conflicts: list[str] = field(default_factory=list)
+
+    def add(self, name: str, value: str) -> None:
+        """Add a key, by its name in small letters with single spaces."""
+        if (match := _GAIN.fullmatch(name)) is not None:
+            number, unit = self._number(value, match)
             if number is None or unit not in ("dB", "x", "") or (unit == "x" and number <= 0):
-                conflicts += _put(frame, name, value.strip().lower())
+                self._put(self.frame, name, _setting_text(value))
             else:
-                conflicts += _put(gains, name[: match.end("detector")].strip(), (number, unit))
+                self._put(self.gains, name[: match.end("detector")].strip(), (number, unit))
         elif (match := _TIME.fullmatch(name)) is not None:
-            number, unit = _number(value, match)
-            unit = unit or _OWN_UNIT.get(match["name"] if match["speed"] is None else "", "")
-            if number is None and not re.search(r"\d|nan|inf", value.lower()):
-                continue  # the state of a shutter
-            if number is None or number <= 0 or unit not in ("" if match["speed"] is None else "s", *TO_MS):
-                conflicts += _put(frame, name, value.strip().lower())
-                notes.append(f"{where}: {name} = {value.strip()[:40]} is no exposure that can be read, and is left out")
-            elif not unit:
-                conflicts += _put(times, name, number)
-            else:
-                ms = number * TO_MS[unit]
-                other, known = exposures.setdefault(match["detector"], (name, ms))
-                if not all_alike([ms, known]):
-                    conflicts.append(f"{other} of {known:g} ms and {name} of {ms:g} ms")
-    found = {detector: ms for detector, (_, ms) in exposures.items()}
-    return Taken(where, found, {} if found else times, gains, frame, tuple(notes), tuple(conflicts))
+            self._add_time(name, value, match)
+        elif _FIXED.fullmatch(name) or _AREA.fullmatch(name):
+            self._put(self.frame, name, _setting_text(value))
+        elif _OF_FORMAT.fullmatch(name) is None and _SETTING.fullmatch(text := _setting_text(value)):
+            self.others.setdefault(name, text)
+
+    def _add_time(self, name: str, value: str, match: re.Match[str]) -> None:
+        number, unit = self._number(value, match)
+        unit = unit or _OWN_UNIT.get(match["name"] if match["speed"] is None else "", "")
+        if number is None and not re.search(r"\d|nan|inf", value.lower()):
+            return  # the state of a shutter
+        if number is None or number <= 0 or unit not in ("" if match["speed"] is None else "s", *TO_MS):
+            self._put(self.frame, name, f"{value.strip().lower()} {self._unit_of(match)}".strip())
+            text = f"{name} = {value.strip()[:40]} is no exposure that can be read, and is left out"
+            self.notes.append(f"{self.where}: {text}")
+        elif not unit:
+            self._put(self.times, name, number)
+        else:
+            ms = number * TO_MS[unit]
+            other, known = self.exposures.setdefault(match["detector"], (name, ms))
+            if not all_alike([ms, known]):
+                self.conflicts.append(f"{other} of {known:g} ms and {name} of {ms:g} ms")
+
+    def _put(self, table: dict[str, Any], name: str, value: Any) -> None:
+        """Add an entry to a table; one that the table has with another value is a conflict."""
+        if table.setdefault(name, value) != value:
+            self.conflicts.append(f"{name} of {table[name]} and of {value}")
+
+    def _unit_of(self, key: re.Match[str]) -> str:
+        """Return the unit of a key that another key states, such as ``exposure units``; empty without one."""
+        words = {word.removesuffix("s") for word in key[0].split()}
+        name = str(key.groupdict().get("name", "gain")).strip()
+        for of, unit in self.units.items():
+            stated = {word.removesuffix("s") for word in of.split()}
+            if stated <= words or name in stated:
+                return unit
+        return ""
+
+    def _number(self, value: str, key: re.Match[str]) -> tuple[float | None, str]:
+        """Return the number of a value, None if there is none, and its unit as in the value, the key or its own key."""
+        match = _VALUE.fullmatch(value.strip().lower())
+        if match is None:
+            return None, ""
+        of_key = key["unit"] or key["word"] or key["end"]
+        units = {_UNITS.get(word, word) for word in (match["unit"], of_key, self._unit_of(key)) if word}
+        number = finite_number(match["number"].replace(",", "."))
+        if match["over"] is not None:  # 1/100, of seconds if no unit is stated
+            number = 1 / number if number else None
+            units = units or {"s"}
+        return number, " and ".join(sorted(units))
 
 
-def _put(table: dict[str, Any], name: str, value: Any) -> list[str]:
-    """Add an entry to a table, and return a text if it has another one."""
-    return [] if table.setdefault(name, value) == value else [f"{name} of {table[name]} and of {value}"]
-
-
-def _number(value: str, key: re.Match[str]) -> tuple[float | None, str]:
-    """Return the number of a value, None if there is none, and its unit as in the value, else in the key."""
-    match = _VALUE.fullmatch(value.strip().lower())
-    if match is None:
-        return None, ""
-    of_key = key["unit"] or key["word"] or key["end"]
-    units = {_UNITS.get(word, word) for word in (match["unit"], of_key) if word}
-    number = finite_number(match["number"].replace(",", "."))
-    if match["over"] is not None:  # 1/100, of seconds if no unit is stated
-        number = 1 / number if number else None
-        units = units or {"s"}
-    return number, " and ".join(sorted(units))
+def _setting_text(value: str) -> str:
+    """Return a value as it is compared: numbers of a list, decimals to four digits, or text in small letters."""
+    text = " ".join(value.lower().strip(" {}()[]\"'").split())
+    if re.fullmatch(_NUMBERS, text) is None:
+        return text
+    return ", ".join(number if number.isdigit() else f"{float(number):.4g}" for number in re.findall(_NUMBER, text))
 
 
 def all_alike(values: Iterable[float]) -> bool:
@@ -160,7 +221,8 @@ def _exposure_at_gain(frame: Taken, cube: Taken, usual_ms: float, *, stated: boo
     ratios.
     """
     for key in sorted(frame.settings.keys() & cube.settings.keys() - (frame.gains.keys() & cube.gains.keys())):
-        _check_same(frame, cube, key, frame.settings[key], cube.settings[key])
+        if not (frame.cut and _AREA.fullmatch(key)):
+            _check_same(frame, cube, key, frame.settings[key], cube.settings[key])
     gain = 1.0
     for key in sorted(frame.gains.keys() & cube.gains.keys()):
         (one, unit), (other, unit_of_cube) = frame.gains[key], cube.gains[key]
@@ -195,6 +257,24 @@ def _check_same(frame: Taken, cube: Taken, key: str, one: str, other: str) -> No
         raise SceneError(f"{both}; give a frame taken with the cube's own settings{unit}")
 
 
+def _compared_alone(dark: Taken, white: Taken, cube: Taken) -> list[str]:
+    """Return a note on settings of both frames that the cube does not state (SceneError: the numbers depend on one)."""
+    for key in sorted((dark.settings.keys() & white.settings.keys()) - cube.settings.keys()):
+        _check_same(white, dark, key, white.settings[key], dark.settings[key])
+    others = {key: one for key, one in dark.others.items() if key not in cube.others}
+    return _differing(replace(dark, others=others), white, "dark")
+
+
+def _differing(frame: Taken, cube: Taken, kind: str) -> list[str]:
+    """Return a note on all other keys of both headers whose values look like settings and differ."""
+    both = {key: (one, cube.others.get(key, one)) for key, one in frame.others.items()}
+    unlit = [key for key in both if kind == "dark" and _OF_LIGHT.fullmatch(key)]
+    texts = [f"{key} {one} and {other}" for key, (one, other) in both.items() if one != other and key not in unlit]
+    what = f"{frame.where} and {cube.where} differ in {list_some(texts, MOST_NAMED)}"
+    advice = "numbers are used as they are; if one of these changes them, give a frame of the same settings"
+    return [f"{what}: {advice}"] if texts else []
+
+
 def check_parts(one: Taken, first: Taken) -> None:
     """Refuse a part of a cube with another gain or binning than the first (SceneError)."""
     mine, other = ({**taken.gains, **taken.frame, **taken.times} for taken in (one, first))
@@ -206,7 +286,9 @@ def check_parts(one: Taken, first: Taken) -> None:
 
 def _alone(one: Taken, other: Taken) -> list[str]:
     """Return a note on the gains, modes and binning that one header states and the other does not."""
-    keys = (key for key in one.settings if key not in other.settings and not _TIME.fullmatch(key))
+    keys = (
+        key for key in one.settings if key not in other.settings and not (_TIME.fullmatch(key) or _AREA.fullmatch(key))
+    )
     texts = ", ".join(f"{key} = {one.settings[key]}" for key in keys)
     return [f"{one.where} states {texts}, {other.where} does not: the same is assumed"] if texts and other.where else []
 
@@ -234,18 +316,22 @@ def match_exposures(
     found: dict[str, float] = {}
     for kind in sorted(frames.keys() & {"dark", "white"}):
         frame = frames[kind][1]
-        notes += [*frame.notes, *_alone(frame, cube), *_alone(cube, frame)]
+        notes += [*frame.notes, *_alone(frame, cube), *_alone(cube, frame), *_differing(frame, cube, kind)]
         ms = _exposure_at_gain(frame, cube, usual, stated=stated)
         both = f"{frame.where} was taken with {frame.text}, the lines with {lines}"
         if ms is not None:
             found[kind] = ms
+            if kind == "white" and max(float((lines_ms / ms).max()), float((ms / lines_ms).max())) >= WILD_RATIO:
+                raise SceneError(f"{both}: they differ more than {WILD_RATIO:g} times; correct the number or its unit")
             scaled = kind == "white" and not all_alike([ms, *lines_ms])
             notes += [f"{both}: values are scaled by the ratio"] if scaled else []
         elif kind == "white" and stated and not all_alike([usual, *lines_ms]):
             found[kind] = usual
-            notes.append(f"{both}: {usual:g} ms is assumed")
+            notes.append(f"{both}: {usual:g} ms is assumed, and values are scaled by the ratio to each line")
         else:
             notes.append(f"{both}: the same exposure is assumed")
+    if {"dark", "white"} <= frames.keys():
+        notes += _compared_alone(frames["dark"][1], frames["white"][1], cube)
     white_ms = found.get("white")
     if "dark" in found and not all_alike([found["dark"], white_ms or usual, *lines_ms]):
         notes.append(_dark_note(frames, found["dark"], white_ms or usual, lines_ms, lines))

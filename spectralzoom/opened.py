@@ -125,6 +125,13 @@ class OpenedRun:
         return found.receipt
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about the map: reasons to expect a poorer one. It then has no expected score."""
+        from spectralzoom.flows.tasks.scores import warnings_of
+
+        return tuple(warnings_of(self.receipt))
+
+    @property
     def report(self) -> Path:
         """Path of the report, one HTML file."""
         return self._archive.locate(f"runs/{self.name}/report.html")
@@ -255,7 +262,8 @@ class OpenedRun:
     def __repr__(self) -> str:
         score = (self.receipt.get("accuracy") or {}).get("miou")
         known = "" if score is None else f", mIoU {100 * score:.1f}"
-        return f"<run {self.name} of {self._archive.name}{known}>"
+        warned = "".join(f", warning: {one}" for one in self.warnings)
+        return f"<run {self.name} of {self._archive.name}{known}{warned}>"
 
 
 def open_labelled(path: Path) -> xarray.Dataset:

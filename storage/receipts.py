@@ -158,6 +158,7 @@ class Areas(_Part):
 class ReceiptFields(_Part):
     """All fields of a receipt; those from ``field`` to ``pixels`` are findings, each present only if it applies."""
 
+    warnings: list[str] | None = None  # about the map, whose score then is not predicted
     survey: Name
     source: Name
     scene: Address
@@ -190,7 +191,7 @@ class ReceiptFields(_Part):
     zones: Facts | None = None  # where zones leave something out: what is kept
     plots: list[Facts] | None = None  # where plots are given: ground, classes, confidence of each
     unlike: Facts | None = None  # distances of mean and spectra from the training, where it is unlike that
-    expected: Facts | None = None  # what the map is likely to score, by its own probabilities; mIoU and error
+    expected: Facts | None = None  # mIoU and error of the map by its own probabilities, or why it is not predicted
     pixels: dict[Name, Count] | None = None  # where some have no value, no reading or no class: how many
     products: dict[Name, Address]
 

@@ -10,10 +10,10 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -26,7 +26,9 @@ from spectralzoom.storage.store import (
     RESTS_ON,
     Archive,
     ancestors,
+    conflicts,
     descendants,
+    digest_of,
     file_problem,
     inputs_first,
     is_known,
@@ -37,7 +39,7 @@ from spectralzoom.storage.store import (
     try_manifest,
     uri_of,
 )
-from spectralzoom.storage.whole_files import entries, refusals
+from spectralzoom.storage.whole_files import entries, read_own, refusals
 
 RECEIPT = "receipt.json"
 _WITH_TIME = re.compile(r"\s*[\dW-]+[^\d-]\d\d")  # a date and an hour, in ISO 8601
@@ -114,20 +116,22 @@ def _as(kind: Any, value: Any) -> Any:
     return value if isinstance(value, kind) else kind()
 
 
-def read_run(folder: Path) -> Run:
-    """Return one run by its manifest and receipt, damaged or not."""
+def read_run(folder: Path, digests: Callable[[Path], str | None] = digest_of) -> Run:
+    """Return one run by its manifest and receipt, damaged or not; ``digests`` has those of the stores beside it."""
     facts, problem = try_manifest(folder)
     receipt: Any = {}
     if RECEIPT in facts["files"]:
         found = file_problem(folder / RECEIPT, *facts["files"][RECEIPT])
         problem = f"{RECEIPT} {found}" if found else None
         try:
-            receipt = {} if problem else json.loads((folder / RECEIPT).read_bytes())
-            wrong = receipt_problem(receipt) if receipt else None
-            problem = f"{RECEIPT}: {wrong}" if wrong else problem
+            receipt = {} if problem else json.loads(read_own(folder / RECEIPT))
+            if wrong := receipt_problem(receipt) if receipt else None:
+                receipt, problem = {}, f"{RECEIPT}: {wrong}"
         except (OSError, ValueError, RecursionError) as error:
-            problem = f"{RECEIPT} cannot be read: {error}"
-    return Run(folder, facts, _as(dict, receipt) if problem is None else {}, problem)
+            receipt, problem = {}, f"{RECEIPT} cannot be read: {error}"
+    root = folder.parents[1]
+    problem = problem or next(iter(conflicts(facts, lambda uri: digests(root / uri), str(root))), None)
+    return Run(folder, facts, _as(dict, receipt), problem)
 
 
 class Catalogue(NamedTuple):
@@ -140,7 +144,9 @@ class Catalogue(NamedTuple):
     def read(cls, archive: Archive) -> Catalogue:
         """Read every manifest and receipt of an archive once; damaged ones have a ``problem``."""
         stores = {uri: one for uri, one in archive.manifests().items() if uri.startswith("stages/")}
-        runs = [run for run in map(read_run, archive.runs()) if run.problem is None or run.folder.exists()]
+        digests = cache(digest_of)
+        read = (read_run(folder, digests) for folder in archive.runs())
+        runs = [run for run in read if run.problem is None or run.folder.exists()]
         return cls(stores, sorted(runs, key=lambda run: (run.created, run.folder.name)))
 
     def named_by(self, uri: str) -> list[Run]:
@@ -188,6 +194,10 @@ def find_product(catalogue: Catalogue, text: str) -> str | Run:
     raise NoRunError(f"{text!r} is no product, store or run of this archive; there is {known}")
 
 
+def _runs_of(known: Iterable[str]) -> list[str]:
+    return [uri for uri in known if uri.startswith("runs/")]
+
+
 # --- verification -----------------------------------------------------------------------------------------------------
 
 
@@ -212,7 +222,7 @@ def verify_everything(
     known = archive.manifests()
     total, done = sum(map(listed_bytes, known.values())) or 1, 0
     needed = {one: (uri, "was made of it") for uri, manifest in known.items() for one in manifest["inputs"]}
-    named = {one: (uri, "names it") for uri, manifest in known.items() for one in manifest[RESTS_ON]}
+    named = {one: (uri, "names it") for uri in _runs_of(known) for one in known[uri][RESTS_ON]}
     found: list[Finding] = []
     for uri, manifest in known.items():
         progress(uri, done / total)
@@ -306,7 +316,7 @@ def _damaged(archive: Archive, findings: Sequence[Finding], raw_too: bool) -> Cl
 def _unnamed(archive: Archive, keep_days: float, raw_too: bool) -> Clearance:
     """Plan the removal of stores that no run names, and of leftovers; young stores stay with their inputs."""
     known = archive.manifests()
-    named = {uri for one in known.values() for uri in one[RESTS_ON]}
+    named = {one for uri in _runs_of(known) for one in known[uri][RESTS_ON]}
     spared: dict[str, str] = {}
     for uri in known:
         if uri in named or uri.startswith("runs/"):

@@ -10,8 +10,8 @@
 
 A folder is written under another name (``.part``), synced, and renamed; to delete it, it is renamed first. So a kill at
 any moment leaves either the whole store or a leftover that `Archive.reclaim` removes. Published files never change.
-Every opening of a store compares the sizes of its files, and the SHA-256 of all but the chunks of arrays. Chunks have a
-checksum of their own.
+Every opening of a store compares the names and sizes of its files, the SHA-256 of all but the chunks of arrays, and the
+digests of its inputs. Chunks have a checksum of their own.
 """
 
 from __future__ import annotations
@@ -44,18 +44,23 @@ from spectralzoom.pipeline.words import CLEARED, PART, UNFINISHED, is_name
 from spectralzoom.storage.whole_files import (
     aside,
     bytes_in,
+    check_no_link,
     entries,
     files_in,
     is_folder,
     locked,
+    make_folder,
+    open_own,
+    read_own,
     refusals,
     remove,
     sha256,
     sync,
+    write_new,
 )
 
 MANIFEST = "manifest.json"
-RESTS_ON = "rests_on"  # of a run's manifest: address of every store below it -> SHA-256 of its manifest.json
+RESTS_ON = "rests_on"  # of a manifest: address of each input, for a run of every store below it -> `manifest_digest`
 LATEST = "latest"
 KEY_LENGTH = 20
 SECOND = len("20261120T101701")  # of a run's name: when it was begun
@@ -140,7 +145,7 @@ def uri_of(address: str) -> str | None:
 
 def write_table(path: Path, content: Mapping[str, Any]) -> None:
     """Write plain values in their own order; numpy's numbers become floats."""
-    path.write_text(json.dumps(content, indent=1, default=float) + "\n")
+    write_new(path, json.dumps(content, indent=1, default=float) + "\n")
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -152,7 +157,7 @@ def read_table(path: Path) -> dict[str, Any]:
     problem = "is in no manifest" if entry is None else file_problem(path, *entry)
     if problem is not None:
         raise damage(path.parent, f"{path.name} {problem}")
-    return cast(dict[str, Any], json.loads(path.read_bytes()))
+    return cast(dict[str, Any], json.loads(read_own(path)))
 
 
 # --- manifests --------------------------------------------------------------------------------------------------------
@@ -163,9 +168,9 @@ _EMPTY: Mapping[str, Any] = {"files": {}, "params": {}, "inputs": [], RESTS_ON: 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
     """Write the manifest of a folder, with sizes and hashes of its files beside ``facts``."""
-    files = {name: [one.st_size, sha256(folder / name)] for name, one in sorted(files_in(folder).items())}
+    files = {name: [one.st_size, sha256(folder / name, open_own)] for name, one in sorted(files_in(folder).items())}
     created = datetime.now(UTC).isoformat()  # to the microsecond: no two stores have one manifest
-    (folder / MANIFEST).write_text(manifest_text({"created": created, **facts, "files": files}))
+    write_new(folder / MANIFEST, manifest_text({"created": created, **facts, "files": files}))
 
 
 def manifest_text(content: Mapping[str, Any]) -> str:
@@ -194,10 +199,18 @@ def parse_manifest(written: bytes) -> dict[str, Any]:
             raise ValueError(f"it lists {name!r}, which is no file of this folder")
         if not (isinstance(entry, list) and [type(one) for one in entry] == [int, str]):
             raise ValueError(f"it gives no size and hash of {name!r}")
+    if not all(isinstance(one, str) for one in content[RESTS_ON].values()):
+        raise ValueError(f"its {RESTS_ON} has a digest that is no text")
     for uri in (*content["inputs"], *content[RESTS_ON]):
         if not isinstance(uri, str) or uri_of(uri) != uri:
             raise ValueError(f"it names {uri!r}, which is no store")
     return content
+
+
+def manifest_digest(content: Mapping[str, Any]) -> str:
+    """Return a hash of a manifest without its time: equal for stores of equal files that were made of equal inputs."""
+    facts = {name: value for name, value in content.items() if name != "created"}
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
 def is_cleared(folder: Path) -> bool:
@@ -225,7 +238,7 @@ def manifest_bytes(folder: Path) -> bytes:
     try:
         if not stat.S_ISREG(path.lstat().st_mode):  # a pipe would be waited for
             raise ValueError("it is no file of its own")
-        return path.read_bytes()
+        return read_own(path)
     except FileNotFoundError:
         if path == manifest_path(folder):
             raise
@@ -241,7 +254,7 @@ def try_manifest(folder: Path) -> tuple[dict[str, Any], str | None]:
     except FileNotFoundError:
         problem = f"{MANIFEST} is missing" if folder.is_dir() else "it is not there"
     except OSError as error:
-        problem = f"{manifest_path(folder).name} cannot be read: {error.strerror}"
+        problem = f"{manifest_path(folder).name} cannot be read: {error.strerror or error}"
     except ValueError as error:
         problem = f"{manifest_path(folder).name} is damaged: {error}"
     return dict(_EMPTY), problem
@@ -263,10 +276,10 @@ def file_problem(path: Path, size: int, digest: str | None, about: os.stat_resul
             return "is no file of its own, but a link, folder or pipe"
         if about.st_size != size:
             return f"has {about.st_size} bytes, expected {size}"
-        changed = digest is not None and sha256(path) != digest
+        changed = digest is not None and sha256(path, open_own) != digest
         return "has changed since it was published (its SHA-256 differs)" if changed else None
     except OSError as error:
-        return "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        return "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror or error}"
 
 
 def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
@@ -287,13 +300,30 @@ def problems_of(folder: Path, *, every_byte: bool) -> list[str]:
 def _differences(folder: Path, manifest: Mapping[str, Any], problem: str | None, *, every_byte: bool) -> list[str]:
     if problem is not None or is_cleared(folder):
         return [problem] if problem is not None else []
-    there, found = files_in(folder), []
+    root = _root_of(folder)
+    there, found = files_in(folder), conflicts(manifest, lambda uri: digest_of(root / uri), str(root))
     for name, (size, digest) in manifest["files"].items():
         own = None if _CHUNK.fullmatch(name) and not every_byte else digest
         problem = file_problem(folder / name, size, own, there[name]) if name in there else "is missing"
         found += [f"{name} {problem}"] if problem else []
-    extra = sorted(there.keys() - {MANIFEST, *manifest["files"]}) if every_byte else []
+    extra = sorted(there.keys() - {MANIFEST, *manifest["files"]})
     return found + [f"{name} is not in the manifest: take it out of the archive" for name in extra]
+
+
+def conflicts(manifest: Mapping[str, Any], digest: Callable[[str], str | None], place: str) -> list[str]:
+    """Return a problem for each input that ``place`` has with another digest than a manifest states."""
+    found = ((uri, stated, digest(uri)) for uri, stated in manifest[RESTS_ON].items())
+    return [
+        f"it was made of {uri} with digest {stated[:12]}, but {place} has another {uri}, with digest {there[:12]}"
+        for uri, stated, there in found
+        if stated and there and there != stated
+    ]
+
+
+def digest_of(folder: Path) -> str | None:
+    """Return the digest of a store, whose files may be cleared; None if it is not there or its manifest is damaged."""
+    content, problem = try_manifest(folder)
+    return None if problem else manifest_digest(content)
 
 
 def check_store(folder: Path, *, every_byte: bool = False) -> None:
@@ -301,9 +331,9 @@ def check_store(folder: Path, *, every_byte: bool = False) -> None:
 
     Raises IncompleteStoreError: it is missing, or a file differs; ArchiveError: it is no folder of the archive.
     """
-    path, root = (Path(os.path.realpath(one)) for one in (folder, _root_of(folder)))  # a link to itself stays
-    if folder.is_file() or (not folder.is_symlink() and not path.is_relative_to(root)):
-        raise ArchiveError(f"{folder} is a file, or a link leads out of the archive to it; expected a folder there")
+    check_no_link(folder.absolute().parent, _root_of(folder))
+    if folder.is_file():
+        raise ArchiveError(f"{folder} is a file, expected the folder of a store or run; take it out of the archive")
     for problem in problems_of(folder, every_byte=every_byte):
         raise damage(folder, problem)
 
@@ -349,8 +379,9 @@ class Archive:
             )
         with refusals(path, "use the archive", every=True):
             for part in (path, *(path / name for name in ("stages", "runs", "spool", ".locks"))):
-                if (part.exists() and not part.is_dir()) or (part.is_symlink() and part != path):
-                    kind = "a link" if part.is_symlink() else "a file"
+                check_no_link(part, path)
+                if not part.is_dir() and os.path.lexists(part):
+                    kind = "a link that leads to no folder" if part.is_symlink() else "a file"
                     raise ArchiveError(
                         f"{part} is {kind}, expected a folder for the archive; choose another, or move it"
                     )
@@ -446,7 +477,7 @@ class Archive:
                 same = (old in (None, try_manifest(path)) for path, old in zip(paths, before, strict=True))
                 if any(map(is_cleared, paths)) or not all(same):
                     raise ArchiveError(f"another survey has cleared an input of {stage} meanwhile; repeat the command")
-            return facts
+            return {**facts, RESTS_ON: {one.uri: digest_of(self.root / one.uri) or "" for one in inputs}}
 
         with refusals(self.root, "write to the archive"), self._locked(f"{stage}-{ref.key}"):
             if self.find(stage, ref.key) is not None:  # another process was first
@@ -473,6 +504,7 @@ class Archive:
         damaged.
         """
         final = self.root / ref.uri
+        check_no_link(final.parent, self.root)
         with (
             refusals(self.root, "clear up the archive", every=True),
             self._locked(f"{ref.stage}-{ref.key}", wait=wait) as held,
@@ -486,6 +518,7 @@ class Archive:
     def discard(self, uri: str) -> bool:
         """Remove a store, a run or a leftover; False where another process holds it, or the disk refuses."""
         path = self.root / uri
+        check_no_link(path.parent, self.root)
         with self._locked(_lock_name(path), wait=False) as held:
             if held:
                 remove(_beside(path))
@@ -611,12 +644,12 @@ class Archive:
         return found
 
     def manifest_hashes(self, refs: Iterable[Ref]) -> dict[str, str]:
-        """Return the SHA-256 of the manifests of stores and all their inputs, and so of every byte, by address."""
+        """Return the digests of stores and all their inputs, and so of every byte, by address."""
         found: dict[str, str] = {}
         waiting = [ref.uri for ref in refs]
         while waiting:
             if (uri := waiting.pop()) not in found and is_known(self.root / uri):
-                found[uri] = hashlib.sha256(manifest_bytes(self.root / uri)).hexdigest()
+                found[uri] = digest_of(self.root / uri) or ""
                 waiting += try_manifest(self.root / uri)[0]["inputs"]
         return dict(sorted(found.items()))
 
@@ -656,7 +689,8 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
     removed the folder.
     """
     part = aside(final)
-    part.mkdir(parents=True)
+    make_folder(final.parent, _root_of(final))
+    part.mkdir()
     descriptor = os.open(part, os.O_RDONLY)  # while it is open, no other folder gets its number
     try:
         facts = build(part)
@@ -683,9 +717,9 @@ def publish(final: Path, build: Callable[[Path], Mapping[str, Any] | None]) -> b
 
 def _write_beside(folder: Path, manifest: bytes) -> None:
     """Write the manifest of a store that is to be cleared."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent, _root_of(folder))
     part = aside(folder)
-    part.write_bytes(manifest)
+    write_new(part, manifest)
     sync(part)
     part.replace(_beside(folder))
     sync(folder.parent)

@@ -1,10 +1,12 @@
 """Read and write the files of an archive, of exports and of settings: errors with advice, names, syncing, locks.
 
 A file or folder is written aside, under a name that ends in ``.part``, and gets its name only when it is complete.
+Files of an archive are opened by `open_own`, which follows no link.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import json
@@ -13,10 +15,12 @@ import math
 import os
 import secrets
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import IO, Any
 
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError, disk_advice, visible
 from spectralzoom.pipeline.words import PART
@@ -80,6 +84,67 @@ def is_folder(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink()
 
 
+def check_no_link(path: Path, root: Path) -> None:
+    """Raise ArchiveError where a name between an archive and a path in it is a link; ``stages`` alone may be one."""
+    for part in (path, *path.parents):
+        if part == root:
+            return
+        if part.is_symlink() and part != root / "stages":
+            raise _link_refusal(part)
+
+
+def open_own(path: Path, mode: str = "rb", buffering: int = -1) -> IO[Any]:
+    """Open a file of an archive. Neither it nor its folder may be a link, and it is never a pipe.
+
+    Raises ArchiveError: one of them is a link; OSError: as `open`.
+    """
+    return open(path, mode, buffering, None if "b" in mode else "utf-8", opener=_without_links)
+
+
+def _without_links(name: str, flags: int) -> int:
+    path = Path(name)
+    try:
+        above = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            descriptor = os.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=above)
+        finally:
+            os.close(above)
+    except OSError as error:
+        if link := next((one for one in (path.parent, path) if one.is_symlink()), None):
+            raise _link_refusal(link) from error
+        error.filename = name  # that of the descriptor is relative to the folder
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is no file of its own", name)
+    return descriptor
+
+
+def read_own(path: Path) -> bytes:
+    """Return the content of a file of an archive. Raises as `open_own`."""
+    with open_own(path) as file:
+        return bytes(file.read())
+
+
+def write_new(path: Path, content: bytes | str) -> None:
+    """Write a new file of an archive. Raises FileExistsError: the name is taken, also by a link that leads nowhere."""
+    with open_own(path, "xb") as file:
+        file.write(content if isinstance(content, bytes) else content.encode())
+
+
+def make_folder(path: Path, root: Path) -> None:
+    """Make a folder in an archive, and those above it. Raises ArchiveError: one of them is a link."""
+    check_no_link(path, root)
+    path.mkdir(parents=True, exist_ok=True)
+
+
+def _link_refusal(path: Path) -> ArchiveError:
+    return ArchiveError(
+        f"{path} is a link, and in an archive only the archive itself and its folder stages may be one; remove the "
+        "link, or put what it leads to in its place"
+    )
+
+
 def remove(path: Path) -> None:
     """Remove a folder, file or link if it exists: first its name, in one step; what the disk keeps is left."""
     away = path
@@ -109,9 +174,9 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's content, in hex."""
-    with path.open("rb") as file:
+def sha256(path: Path, opened: Callable[[Path, str], Any] = Path.open) -> str:
+    """Return the SHA-256 of a file's content, in hex; `open_own` opens a file of an archive."""
+    with opened(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -127,7 +192,7 @@ def locked(path: Path, *, wait: bool = True, shared: bool = False) -> Iterator[b
         with refusals(path, "lock", every=True), suppress(BlockingIOError):
             path.parent.mkdir(parents=True, exist_ok=True)
             while not is_held:
-                file = opened.enter_context(open(path, "a", opener=_not_by_link))
+                file = opened.enter_context(open_own(path, "a"))
                 try:
                     fcntl.flock(file, kind | fcntl.LOCK_NB)
                 except BlockingIOError:
@@ -137,10 +202,6 @@ def locked(path: Path, *, wait: bool = True, shared: bool = False) -> Iterator[b
                     fcntl.flock(file, kind)
                 is_held = path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())  # else gc removed it
         yield is_held
-
-
-def _not_by_link(name: str, flags: int) -> int:
-    return os.open(name, flags | os.O_NOFOLLOW, 0o644)
 
 
 # --- single files -----------------------------------------------------------------------------------------------------

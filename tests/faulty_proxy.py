@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
+from time import sleep
 from urllib.parse import urlsplit
 
 ANSWERS = {  # answered without asking the server
@@ -34,7 +35,10 @@ class _Handler(BaseHTTPRequestHandler):
             return
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         fault = self.server.choose(self.command, self.path)
-        if fault == "reset":
+        if fault == "stall":
+            sleep(STALLED_S)
+            self.close_connection = True
+        elif fault == "reset":
             self._reset()
         elif fault in ANSWERS:
             status, text = ANSWERS[fault]
@@ -84,6 +88,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing."""
 
 
+STALLED_S = 60.0  # without an answer, on an open connection
 _OWN = ("content-length", "connection", "transfer-encoding", "keep-alive")
 
 

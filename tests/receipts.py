@@ -31,6 +31,8 @@ def comparable(receipt: Receipt) -> dict[str, Any]:
         _without(stage, (*OF_ONE_RUN, *(("bytes_out",) if stage["name"] == "evaluate" else ())))
         for stage in receipt["stages"]
     ]
+    if receipt["effects_total"] is not None:
+        same["effects_total"] = _without(receipt["effects_total"], ("saved_s",))
     same["data_bytes"] = {name: receipt["data_bytes"][name] for name in ("captured", "reference")}
     return same | {"products": sorted(receipt["products"])}
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 from rich.console import Console
+from rich.markup import escape
 
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson
 from spectralzoom.flows.terminal.figures import counted, format_bytes
@@ -44,7 +45,7 @@ def pull(source: BucketName, archive: ArchiveName, *, run: str | None = None, as
 
 def _report(copied: bucket.Copied, *, as_json: bool) -> int:
     put_out(asdict(copied), show_copied, as_json=as_json)
-    return PARTLY if copied.conflicts or copied.missing else DONE
+    return PARTLY if copied.conflicts or copied.missing or copied.bad_names else DONE
 
 
 def show_copied(content: Mapping[str, Any], console: Console) -> None:
@@ -60,3 +61,7 @@ def show_copied(content: Mapping[str, Any], console: Console) -> None:
         console.print(f"{uri} was not copied: the other side has another run of this name.", soft_wrap=True)
     for uri in content["missing"]:
         console.print(f"{uri}, which a copied run names, is in neither place.", soft_wrap=True)
+    for name in content["bad_names"]:
+        console.print(
+            f"{escape(name)!r} in the bucket has a name that no client can ask for: remove it.", soft_wrap=True
+        )

@@ -15,7 +15,7 @@ from spectralzoom.flows.settings.load import flag_of
 from spectralzoom.flows.settings.rules import OF_THE_PLAN
 from spectralzoom.flows.settings.settings import Settings, to_state
 from spectralzoom.flows.settings.values import ALWAYS, RECORDED
-from spectralzoom.flows.tasks.scores import score_of
+from spectralzoom.flows.tasks.scores import score_of, warnings_of
 from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
@@ -139,6 +139,7 @@ def _run_row(catalogue: Catalogue, run: Run, kept: int) -> dict[str, Any]:
         **{name: run.settings.get(name) for name in ("scene", "seed", "budget")},
         **score_of(run.receipt),
         "training_scene": run.receipt.get("training_scene"),
+        "warnings": warnings_of(run.receipt),
         "bytes": kept,
         "state": _run_state(catalogue, run),
     }
@@ -210,6 +211,8 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
     if any(run["training_scene"] and known_number(run["miou"]) is not None for run in content["runs"]):
         console.print("* on a scene that the weights were trained on", highlight=False)
+    if any(run["warnings"] for run in content["runs"]):
+        console.print("! with a warning about its map: spectralzoom explain ARCHIVE RUN", highlight=False)
     rows = [row for stage, stores in content["stages"].items() for row in _shown_stores(stage, stores)]
     columns = ("stage", "key", "version", "size", "named by")
     console.print(table(columns, rows, title="Stores", left=3, whole=WHOLE) if rows else "no stores")
@@ -222,10 +225,10 @@ def _shown_run(run: Mapping[str, Any]) -> list[str]:
     miou = known_number(run["miou"])
     asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
     state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
-    learned = "" if run["training_scene"] is None or miou is None else "*"
+    marks = ("" if run["training_scene"] is None or miou is None else "*") + "!" * bool(run["warnings"])
     return [
         *map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)),
-        format_points(miou) + learned,
+        format_points(miou) + marks,
         format_bytes(run["own_bytes"]),
         state,
     ]

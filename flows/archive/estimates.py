@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -16,6 +17,8 @@ from spectralzoom.flows.terminal.progress import table
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, raw_bytes
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
 from spectralzoom.pipeline.planning.uniform_scans import format_scan
+from spectralzoom.storage.runs import Run, read_run
+from spectralzoom.storage.store import Archive, is_archive, run_stem
 
 MOST_SCANS = 8  # in the table
 
@@ -69,21 +72,48 @@ class Estimate:
     at_most: bool = False
     at_least: bool = False
     spread: float | None = None  # a standard deviation
+    range: tuple[float, float] | None = None  # of other scenes
 
 
-def estimate_survey(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, dict[str, Any]]:
+def estimate_survey(plan: SurveyPlan, fine: FinePlan | None, unscored: str) -> dict[str, dict[str, Any]]:
     """Return what a survey would take and score, `Estimate`s by the names of `LABELS`; a raster has no seconds.
 
-    ``fine`` is the fine pass, where it is planned already.
+    ``fine`` is the fine pass, where it is planned already; ``unscored`` is why no score is expected, or empty.
     """
     camera = {} if plan.field.raster is not None else _of_camera(plan, fine)
-    expected = plan.least_gain is not None  # patches are chosen while the map is drawn
-    patch_index = fine.patch_index if fine is not None and fine.sweeps and not expected else plan.likely_patches
-    every = format_count(plan.work_done(plan.field.kept_patches).total)
-    source = f"the patches that other scenes needed; {every} with every patch" if expected else "network and field"
-    work = Estimate(plan.work_done(patch_index).total, source, fine is None and plan.chooses and not expected)
-    found = {**camera, "multiply_adds": work, "miou": _score(plan)}
+    score = Estimate(None, unscored) if unscored else _score(plan)
+    found = {**camera, "multiply_adds": _work(plan, fine), "miou": score}
     return {name: asdict(one) for name, one in found.items()}
+
+
+def _work(plan: SurveyPlan, fine: FinePlan | None) -> Estimate:
+    """Return the multiply-adds with the patches that an earlier run of the field read, or that other scenes needed."""
+    likely = plan.likely_readings
+    if plan.least_gain is None:  # patches are chosen before the map is drawn
+        patch_index = likely[0] if fine is None or not fine.sweeps else fine.patch_index
+        work = plan.work_done(patch_index, None if fine is None else fine.changed).total
+        return Estimate(work, "network and field", fine is None and plan.chooses)
+    changed, source = plan.likely_changed if fine is None else fine.changed, "the patches that other scenes needed"
+    if (run := _earlier_run(plan)) is not None:
+        likely = (plan.field.kept_patches[: run.receipt["kept"]["patches"]],)
+        source = f"the patches that {run.folder.name} read"
+    every = format_count(plan.work_done(plan.field.kept_patches, changed).total)
+    work, *ends = (plan.work_done(some, changed).total for some in likely)
+    return Estimate(work, f"{source}; {every} with every patch", range=None if len({*ends}) < 2 else (ends[0], ends[1]))
+
+
+def _earlier_run(plan: SurveyPlan) -> Run | None:
+    """Return the newest run of the same field that chose patches by the same gain."""
+    field, settings = plan.field, plan.settings
+    alike = plan.reading_figures(field.kept_patches)
+    folders = Archive(Path(settings.out).absolute()).runs() if is_archive(settings.out) else []
+    for run in (read_run(one) for one in reversed(folders) if run_stem(field.name) in one.name):
+        if (run.receipt.get("survey"), run.settings.get("seed")) == (field.name, settings.seed):
+            kept = run.receipt.get("kept")
+            same = isinstance(kept, dict) and all(kept.get(name) == alike[name] for name in ("asked", "of_patches"))
+            if same and isinstance(kept.get("patches"), int):
+                return run
+    return None
 
 
 def _of_camera(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Estimate]:
@@ -131,5 +161,7 @@ def _score(plan: SurveyPlan) -> Estimate:
 def format_estimate(name: str, one: Mapping[str, Any]) -> str:
     """Return an estimate of a name in `LABELS` as text, with its bound or spread."""
     words = LABELS[name][1](one["value"]) if one["spread"] is None else format_prediction(one["value"], one["spread"])
+    if one["range"] is not None:
+        words += f" ({' to '.join(map(LABELS[name][1], one['range']))})"
     bound = "at most {}" if one["at_most"] else "{} or more" if one["at_least"] else "{}"
     return words if one["value"] is None else bound.format(words)

@@ -14,8 +14,9 @@ from spectralzoom.flows.archive.plan_command import dry_run
 from spectralzoom.flows.archive.reprocess_command import asked_again
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson
 from spectralzoom.flows.stage import Row
+from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import DONE
-from spectralzoom.flows.terminal.progress import put_out, show_text
+from spectralzoom.flows.terminal.progress import put_out, show_text, show_warnings
 from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.storage.runs import Catalogue, Run, find_product
 from spectralzoom.storage.store import Archive, plain
@@ -48,6 +49,7 @@ def explanation(archive: Archive, product: str) -> dict[str, Any]:
     return {
         "archive": archive.name,
         "product": found.uri,
+        "warnings": warnings_of(found.receipt),
         "problem": found.problem,
         "command": command(found.settings, archive.name),
         "lineage": [_tree(catalogue, uri, shown) for uri in sorted(found.names - below)],
@@ -114,7 +116,8 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def show_explanation(content: dict[str, Any], console: Console) -> None:
-    """Print a product's lineage, and what would be made otherwise."""
+    """Print warnings about a run's map, a product's lineage, and what would be made otherwise."""
+    show_warnings(content.get("warnings", ()), console)
     for text in (content["product"], content.get("problem"), content.get("command")):
         if text:
             show_text(text, console)

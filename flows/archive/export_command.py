@@ -28,8 +28,9 @@ from spectralzoom.flows.archive.export_mosaic import export_mosaic
 from spectralzoom.flows.archive.export_values import check_doses, spectral_layers, write_areas, write_polygons
 from spectralzoom.flows.archive.merged_maps import export_merged
 from spectralzoom.flows.settings.flags import ArchiveName, AsJson, OutFile, Switch, check_outside
+from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import DONE
-from spectralzoom.flows.terminal.progress import print_json, stderr
+from spectralzoom.flows.terminal.progress import print_json, show_warnings, stderr
 from spectralzoom.pipeline.errors import ArchiveError, PipelineError, SettingsError
 from spectralzoom.pipeline.products.indices import find_index
 from spectralzoom.storage.export.image_files import Layer, write_cog
@@ -85,16 +86,18 @@ def run_export(
 ) -> dict[str, Any]:
     """Export a run (the latest if None) into ``out``, and print the files that were written.
 
-    Returns run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path relative to
-    ``out``. Raises SettingsError: a flag is wrong, there is no such run, ``out`` lies in the archive, or the run lacks
-    a product that was asked for; WavelengthError: its cube lacks bands of an index; ArchiveError: ``out`` is another
-    archive's or cannot be written; IncompleteStoreError: a store is missing or damaged.
+    Returns warnings, run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path
+    relative to ``out``. Raises SettingsError: a flag is wrong, there is no such run, ``out`` lies in the archive, or
+    the run lacks a product that was asked for; WavelengthError: its cube lacks bands of an index; ArchiveError: ``out``
+    is another archive's or cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
     doses = parse_doses(products.dose)
     indices = tuple(dict.fromkeys(map(find_index, split_names("indices", products.indices))))
     opened = open_exported(Archive.open(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)  # with links resolved: addresses are relative
     check_doses(opened, doses)
+    warned = warnings_of(opened.receipt)
+    show_warnings(warned, console)
     layers = [*map_layers(opened), *spectral_layers(opened, indices, reflectance=products.reflectance)]
     folder, polygons = out / opened.id, products.polygons or bool(doses)
     try:
@@ -123,7 +126,8 @@ def run_export(
     files = {key: f"{opened.id}/{name}" for key, name in own.items()}
     for path in (*(out / name for name in files.values()), *written):
         console.print(f"  {escape(str(path))}", soft_wrap=True)
-    return {"run": opened.id, "item": str(written[0]), "collection": str(written[1]), "placed": placed, "files": files}
+    catalogue = {"item": str(written[0]), "collection": str(written[1])}
+    return {"warnings": warned, "run": opened.id, **catalogue, "placed": placed, "files": files}
 
 
 def _asset(folder: Path, path: Path, title: str, kind: str, *roles: str, **more: Any) -> Any:
@@ -163,7 +167,8 @@ def _describe(run: ExportedRun, folder: Path, assets: Assets) -> Any:
 
     receipt = run.receipt
     start, end = (datetime.fromisoformat(text) for text in run.observed)
-    about = f"Survey of {receipt['survey']}"
+    about, warned = f"Survey of {receipt['survey']}", warnings_of(receipt)
+    words = [*map("Warning: {}".format, warned), f"{about} ({receipt['source']} source)."]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a file has no CRS: it gets no place
         item = rio_stac.create_stac_item(
@@ -173,7 +178,8 @@ def _describe(run: ExportedRun, folder: Path, assets: Assets) -> Any:
             assets=assets,
             properties={
                 "title": about,
-                "description": f"{about} ({receipt['source']} source).",
+                "description": ". ".join(words),
+                "spectralzoom:warnings": warned,
                 "instruments": [str(receipt["source"])],
                 "created": receipt["finished"],
             },

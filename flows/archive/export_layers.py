@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ from spectralzoom.flows.publish.receipt import Receipt, load_receipt
 from spectralzoom.flows.settings.flags import Switch, split_list
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RIG
 from spectralzoom.flows.stages.ground import colours_of
+from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.tasks.visit import time_of_visit
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED
@@ -175,8 +176,14 @@ def layer_of(run: ExportedRun, product: str, *, tags: Mapping[str, str] = Mappin
         "processed": run.receipt["finished"],
         "place": ANGULAR if more["geobox"].crs is None else "map",
         **({} if run.undated else {"ACQUISITIONDATETIME": run.observed[0]}),
+        **warning_tag(warnings_of(run.receipt)),
     }
     return Layer(tags={**own, **tags}, **more)
+
+
+def warning_tag(texts: Sequence[str]) -> dict[str, str]:
+    """Return the tag of an image with these warnings about its map; none without any."""
+    return {"WARNING": "; ".join(texts)} if texts else {}
 
 
 def geobox_of(stored: StoredImage) -> GeoBox:

@@ -13,7 +13,8 @@ import numpy as np
 import shapely
 from odc.geo.geobox import GeoBox
 
-from spectralzoom.flows.archive.export_layers import ExportedRun, geobox_of, layer_of
+from spectralzoom.flows.archive.export_layers import ExportedRun, geobox_of, layer_of, warning_tag
+from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.models.evaluation.metrics import stratified_fractions
 from spectralzoom.pipeline.errors import ArchiveError, SettingsError
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts
@@ -225,7 +226,8 @@ def write_polygons(run: ExportedRun, folder: Path, doses: Mapping[str, float]) -
     try:
         with written_aside(folder, [package.name, *parts]) as aside, warnings.catch_warnings():
             warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
-            frame.to_file(aside / package.name, layer="classes", driver="GPKG")
+            about = warning_tag(warnings_of(run.receipt))
+            frame.to_file(aside / package.name, layer="classes", driver="GPKG", layer_metadata=about or None)
             frame.to_file(aside / shapefile.name, driver="ESRI Shapefile", encoding="utf-8", **day)
     except pyogrio.errors.DataSourceError as error:
         raise ArchiveError(f"{package} cannot be written: {error}; is there space on the disk?") from error

@@ -13,11 +13,12 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from spectralzoom.flows.archive.export_layers import ExportedRun, map_layers
+from spectralzoom.flows.archive.export_layers import ExportedRun, map_layers, warning_tag
 from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.settings.flags import check_outside
+from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import writing
-from spectralzoom.flows.terminal.progress import show_text
+from spectralzoom.flows.terminal.progress import show_text, show_warnings
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from spectralzoom.pipeline.ground.georeference import crs_name
 from spectralzoom.storage.export.image_files import Layer, merged_layer, write_cog
@@ -41,14 +42,16 @@ def export_merged(archive: str | Path, out: Path, console: Console) -> dict[str,
     for run, layer in zip(runs, layers, strict=True):
         _check_alike(runs[0], layers[0], run, layer)
     same = {name: text for name, text in layers[0].tags.items() if all(one.tags.get(name) == text for one in layers)}
-    tags = {**same, "runs": ", ".join(run.id for run in runs)}
+    warned = [f"{run.id}: {one}" for run in runs for one in warnings_of(run.receipt)]
+    show_warnings(warned, console)
+    tags = {**same, "runs": ", ".join(run.id for run in runs), **warning_tag(warned)}
     with writing(out), TemporaryDirectory(prefix="spectralzoom-") as scratch, console.status(f"writing {path.name}"):
         out.mkdir(parents=True, exist_ok=True)
         write_cog(path, replace(merged_layer(layers, Path(scratch)), title="Class map", tags=tags))
     if left_out:
         console.print(f"[dim]note: runs without a CRS, left out: {escape(', '.join(left_out))}[/]", soft_wrap=True)
     console.print(f"  {escape(str(path))}", soft_wrap=True)
-    return {"file": str(path), "runs": [run.id for run in runs]}
+    return {"warnings": warned, "file": str(path), "runs": [run.id for run in runs]}
 
 
 def _newest_runs(archive: Archive, note: Callable[[str], None]) -> tuple[list[ExportedRun], list[str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -14,19 +15,20 @@ from rich.markup import escape
 from spectralzoom.flows.archive.estimates import LABELS, estimate_survey, format_estimate, scan_table
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import SurveyPlan, plan_survey
-from spectralzoom.flows.publish.findings import field_figures
+from spectralzoom.flows.publish.findings import field_figures, map_warnings, no_expected_score
 from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.flags import NO_FLAGS, AsJson, HelpAll, SurveyFlags, by_setting, print_every_flag
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.settings.values import ALWAYS, WHOLE
 from spectralzoom.flows.stage import Stores
 from spectralzoom.flows.stages.score import load_plan, score
+from spectralzoom.flows.stages.segment import segment
 from spectralzoom.flows.survey import run_stages
 from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.recorded_field import usual_of_recording
 from spectralzoom.flows.terminal.figures import format_count
 from spectralzoom.flows.terminal.processes import DONE
-from spectralzoom.flows.terminal.progress import put_out, table
+from spectralzoom.flows.terminal.progress import put_out, show_warnings, table
 from spectralzoom.pipeline.errors import PipelineError, SurveyStopped
 from spectralzoom.pipeline.geometry.scan import exposing
 from spectralzoom.pipeline.planning.fine_pass import FinePlan
@@ -86,43 +88,52 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         zoomed = plan_survey(open_field(settings.but(zoom=ALWAYS), planning=True))
     whole = plan.settings.but(extent=WHOLE)
     uniform = replace(plan, settings=whole, passes=replace(passes, plain=True), extent=None)
-    work = uniform.work_done(uniform.likely_patches).total  # of each uniform scan
+    work = uniform.work_done(uniform.likely_readings[0]).total  # of each uniform scan
     best = None if passes.plain else plan.scans.best_in_time(passes.coarse_s + passes.fine_s)
+    drawn = stores.rows[segment.name].ref if segment.name in stores.rows else None
+    warnings = map_warnings(plan, drawn if drawn is not None and stores.has(drawn) else None)
+    unscored = no_expected_score(warnings, field.mapped_px)
+    figures = partial(as_figures, scored=not unscored, multiply_adds=work)
     rows = [
         {"stage": row.name, "state": row.state, "key": row.ref.key or None, "why": row.why}
         for row in stores.rows.values()
     ]
     content = {
+        "warnings": warnings,
         "archive": settings.out,
         "stages": rows,
         "to_make": sum(row["state"] != "cached" for row in rows),
         "refused": field.refused,  # why this machine would refuse the survey
         "notes": list(plan.notes),
         "scans": {
-            "taken": as_figures(plan.scans.chosen, multiply_adds=work),
-            "reference": as_figures(plan.scans.reference, multiply_adds=work),
-            "best_in_time": as_figures(best, multiply_adds=work),
+            "taken": figures(plan.scans.chosen),
+            "reference": figures(plan.scans.reference),
+            "best_in_time": figures(best),
             "at_most": plan.budget is not None,  # the scores are of maps with everything read
-            "candidates": [as_figures(one, multiply_adds=work) for one in frontier(plan.scans.offered)],
-            "two_passes": None if zoomed is None else _two_passes(zoomed, fine if zoomed is plan else None, plan),
+            "candidates": [figures(one) for one in frontier(plan.scans.offered)],
+            "two_passes": None if zoomed is None else _two_passes(zoomed, fine, plan, unscored),
         },
         "field": field_figures(plan, fine),
-        "estimate": estimate_survey(plan, fine),
+        "estimate": estimate_survey(plan, fine, unscored),
     }
     if passes.plain and plan.chooses:  # expected, of a uniform scan that is segmented in part
-        content["kept"] = plan.reading_figures(plan.likely_patches)
+        content["kept"] = plan.reading_figures(plan.likely_readings[0])
     return content
 
 
-def _two_passes(zoomed: SurveyPlan, fine: FinePlan | None, taken: SurveyPlan) -> dict[str, Any]:
-    """Return the first pass and the estimates of two passes, and whether the survey takes them."""
+def _two_passes(zoomed: SurveyPlan, fine: FinePlan | None, taken: SurveyPlan, unscored: str) -> dict[str, Any]:
+    """Return the first pass and the estimates of two passes, and whether the survey takes them with ``fine``."""
+    fine = fine if zoomed is taken else None
     first = zoomed.passes.coarse[0]
     exposure_ms = exposing(zoomed.field.camera, first).exposure_ms
-    return {"taken": zoomed is taken, "step": first.step, "exposure_ms": exposure_ms, **estimate_survey(zoomed, fine)}
+    return {"taken": zoomed is taken, "step": first.step, "exposure_ms": exposure_ms} | estimate_survey(
+        zoomed, fine, unscored
+    )
 
 
 def show_plan(content: dict[str, Any], console: Console) -> None:
-    """Print the forecast as a table."""
+    """Print the warnings and the forecast as a table."""
+    show_warnings(content["warnings"], console)
     rows = [
         [row["stage"], f"[{COLOURS[row['state']]}]{row['state']}[/]", escape(shorten(row["why"], MOST_LETTERS))]
         for row in content["stages"]

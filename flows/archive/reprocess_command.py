@@ -23,7 +23,7 @@ from spectralzoom.flows.stages.capture import capture_coarse, capture_fine
 from spectralzoom.flows.survey_command import run_survey
 from spectralzoom.flows.tasks.recorded_field import open_recorded, recorded_scene
 from spectralzoom.flows.tasks.scene import open_map, open_scene
-from spectralzoom.flows.tasks.scores import score_of
+from spectralzoom.flows.tasks.scores import score_of, warnings_of
 from spectralzoom.flows.terminal.figures import counted, format_points, format_seconds
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import put_out, show_text, stderr
@@ -105,7 +105,8 @@ def reprocess_fields(
             console.print(f"[bold]reprocess {escape(title)}[/]", soft_wrap=True)
             begun = time.perf_counter()
             row = {"field": called(run), "scene": run.settings.get("scene"), "old": old, "new": None}
-            row |= {"state": "failed", "message": None, **_scores(run.receipt, "before"), **_scores({}, "after")}
+            row |= {"state": "failed", "message": None, "warnings": warnings_of(run.receipt)}
+            row |= {**_scores(run.receipt, "before"), **_scores({}, "after")}
             try:
                 settings = _settings_of(catalogue, run, str(archive), weights, pool, renewed)
                 if settings is None:
@@ -114,7 +115,9 @@ def reprocess_fields(
                     row |= {"state": "would run"}
                 else:
                     folder = run_survey(settings, console).folder
-                    row |= {"new": folder.name, "state": "ran", **_scores(read_run(folder).receipt, "after")}
+                    receipt = read_run(folder).receipt
+                    row |= {"new": folder.name, "state": "ran", **_scores(receipt, "after")}
+                    row |= {"warnings": warnings_of(receipt)}
                     renewed[old] = folder.name
             except PipelineError as error:
                 row |= {"message": str(error)}
@@ -153,7 +156,7 @@ def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
 
 
 def _format_row(row: Mapping[str, Any]) -> str:
-    text = f"{row['field']} ({row['old']}) {row['state']}"
+    text = "".join(f"Warning: {one}. " for one in row["warnings"]) + f"{row['field']} ({row['old']}) {row['state']}"
     if row["state"] != "ran":
         return text + (f": {row['message']}" if row["message"] else "")
     text += f": {row['new']}, {format_seconds(row['seconds'])}"

@@ -34,7 +34,8 @@ def reprocess(archive: str, field: str | None = None, weights: str | None = None
     refused = [f"{row['field']}: {row['message']}" for row in rows if row["state"] == "failed"]
     if refused and len(refused) == len(rows):
         raise ArchiveError(f"no field could be reprocessed: {'; '.join(refused)}")
-    return f"some fields failed: {'; '.join(refused)}" if refused else "done"
+    warned = [f"Warning: {row['field']}: {one}" for row in rows for one in row["warnings"]]
+    return ". ".join([*warned, f"some fields failed: {'; '.join(refused)}" if refused else "done"])
 
 
 def reprocess_deployment(archive: str) -> Any:

@@ -16,11 +16,11 @@ from spectralzoom.flows.publish.receipt_table import print_effects
 from spectralzoom.flows.settings.flags import NO_SIMULATION_FLAGS, AsJson, SimulationFlags, Switch, by_setting
 from spectralzoom.flows.settings.settings import Settings, load_settings
 from spectralzoom.flows.stage import Stores
-from spectralzoom.flows.stages.capture import SweepRequest, capture_coarse
+from spectralzoom.flows.stages.capture import SAVED_S, SweepRequest, capture_coarse
 from spectralzoom.flows.stages.effects import choose_effects, load_manifest
 from spectralzoom.flows.tasks.capture_plan import PassLayout
 from spectralzoom.flows.tasks.observer import tidy_up
-from spectralzoom.flows.tasks.scene import farm_refusal, open_scene
+from spectralzoom.flows.tasks.scene import darkness, farm_refusal, open_scene
 from spectralzoom.flows.terminal.figures import counted, format_bytes, format_seconds
 from spectralzoom.flows.terminal.progress import StageProgress, print_json, stderr
 from spectralzoom.models.network.machine import keep_freed_memory
@@ -95,7 +95,7 @@ def open_simulation(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
             f"{settings.scene} has {scene.filled_px} pixels without a finite value, and a simulation needs one "
             "everywhere; fill or crop it, or choose other --bands"
         )
-    return scene, notes
+    return scene, (*darkness(settings), *notes)
 
 
 def scan(stores: Stores, settings: Settings, scene: RasterScene, sweeps: Sequence[Sweep]) -> tuple[Ref, Ref]:
@@ -140,7 +140,7 @@ def _record(
         "bytes_stored": listed_bytes(read_manifest(raw.path)),
         "effects_store": effects.uri,
         "effects": manifest["effects"],
-        "effects_total": manifest["total"],
+        "effects_total": {**manifest["total"], SAVED_S: stores.total(SAVED_S)},
         "path": str(raw.path),
     }
 

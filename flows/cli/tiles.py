@@ -10,7 +10,7 @@ from spectralzoom.flows.publish.run_folder import Published
 from spectralzoom.flows.settings.settings import Settings
 from spectralzoom.flows.settings.values import BUILT_IN_SCENES, RASTER, SIM
 from spectralzoom.flows.tasks.scene import DATE, check_scene_there
-from spectralzoom.flows.tasks.scores import format_prediction
+from spectralzoom.flows.tasks.scores import format_prediction, warnings_of
 from spectralzoom.flows.terminal.figures import format_percent, format_points, format_seconds, spaced
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.arrays.class_maps import load_class_map
@@ -52,11 +52,13 @@ def tiles_of(settings: Settings) -> list[Settings]:
 
 
 def tile_row(scene: str, published: Published, seconds: float) -> list[str]:
-    """Return the row of a surveyed tile: score by labels, else expected, else mean confidence; commonest classes."""
+    """Return the row of a surveyed tile: score by labels, else expected, warning or confidence; commonest classes."""
     receipt = published.receipt
     expected = receipt.get("expected") or {}
     if (accuracy := receipt.get("accuracy")) is not None:
         score = f"mIoU {format_points(accuracy['miou'])}"
+    elif warnings_of(receipt):
+        score = "warning"
     elif predicted := format_prediction(expected.get("miou"), expected.get("error")):
         score = f"expected mIoU {predicted}"
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -11,12 +11,21 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from spectralzoom.flows.evaluate.frames import Candidate, observe_frame, open_candidates, open_frames, sort_frames
-from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, judge_frame, summarise
+from spectralzoom.flows.evaluate.frames import (
+    ROLES,
+    VALIDATION,
+    Candidate,
+    Jobs,
+    observe_frame,
+    open_candidates,
+    open_frames,
+    sort_frames,
+)
+from spectralzoom.flows.evaluate.judge import ENDS, Choice, Row, Run, judge_frame, summarise
 from spectralzoom.flows.settings.model_flags import EvaluateFlags
 from spectralzoom.flows.terminal.figures import DASH, counted, format_count, format_percent, format_points
 from spectralzoom.flows.terminal.processes import writing
-from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, table
+from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, show_warnings, table
 from spectralzoom.flows.training.data import Report, TrainingData
 from spectralzoom.models.network.machine import choose_device, keep_freed_memory
 from spectralzoom.models.weights.files import PLAIN, load_weights
@@ -24,6 +33,10 @@ from spectralzoom.pipeline.errors import SettingsError
 from spectralzoom.storage.whole_files import to_json, write_whole
 
 SHOWN_FRACTION = 0.10  # of the patches: the nearest fraction judged is in the table of classes
+NO_HEADLINE = (
+    "no mIoU: no frame was held out of the training, which chose by the validation frames; train with some held out:"
+    " --hold-out NAMES"
+)
 CAPTION = (
     "K: fraction of the valid patches. mIoU: of the counts of all frames, mean over the classes of the labels. "
     "overall: fraction of right pixels. ±: standard deviation over weights, else over random draws. "
@@ -35,6 +48,7 @@ def run_evaluate(dataset: str, flags: EvaluateFlags, console: Console, *, as_jso
     """Judge with progress on ``console``; print the figures as a table or JSON, and write them to the folder."""
     with StageProgress(console) as progress:
         content = evaluate_weights(dataset, flags, progress.show)
+    show_warnings(content["warnings"], console)
     put_out(content, print_evaluation, as_json=as_json)
     for line in (*(f"note: {note}" for note in content["data_notes"]), *content["files"]):
         show_text(line, console)
@@ -62,22 +76,17 @@ def evaluate_weights(
             flags.out.mkdir(parents=True, exist_ok=True)  # fails before minutes are spent
     jobs = sort_frames(data, candidates, show, named=bool(flags.frames))
     runs = _judge_frames(flags, fractions, data, candidates, jobs.frames, show)
-    content = {
+    content: dict[str, Any] = {
+        "warnings": [warning for one in candidates for warning in one.warnings],
         "dataset": data.law,
         "weights": [
             {"file": one.path.name, "key": one.described.key[:16], "frames": list(run)}
             for one, run in zip(candidates, runs, strict=True)
         ],
-        "frames": list(jobs.frames),
         "left_out": jobs.left_out,
         "settings": {"fractions": fractions, "seed": flags.seed, "camera": asdict(candidates[0].camera)},
-        **summarise(
-            [run for run in runs if run],
-            candidates[0].described.class_names,
-            fractions,
-            candidates[0].described.config.patch,
-        ),
-        "data_notes": [*data.notes, *jobs.notes, *(note for one in candidates for note in one.notes)],
+        **_by_role(runs, jobs, candidates[0], fractions),
+        "data_notes": [*data.notes, *jobs.notes],
         "files": [] if flags.out is None else [str(flags.out / "evaluation.json")],
     }
     if flags.out is not None:
@@ -90,7 +99,7 @@ def _judge_frames(
     fractions: Sequence[float],
     data: TrainingData,
     candidates: Sequence[Candidate],
-    frames: dict[str, tuple[int, ...]],
+    frames: Mapping[str, Mapping[int, str]],
     show: Report,
 ) -> list[dict[str, dict[Choice, Row]]]:
     """Judge every frame by its weights; return the rows of the frames of each of the weights."""
@@ -107,30 +116,47 @@ def _judge_frames(
     return runs
 
 
+def _by_role(runs: Sequence[Run], jobs: Jobs, first: Candidate, fractions: Sequence[float]) -> dict[str, Any]:
+    """Return the figures of the headline, none of validation frames, and ``apart`` those of the other frames."""
+    found: dict[str, dict[str, Any]] = {}
+    names, patch = first.described.class_names, first.described.config.patch
+    for role in ROLES:
+        own = [{name: run[name] for name in run if jobs.frames[name][at] == role} for at, run in enumerate(runs)]
+        if some := [run for run in own if run]:
+            frames = [name for name, roles in jobs.frames.items() if role in roles.values()]
+            found[role] = {"frames": frames, **summarise(some, names, fractions, patch)}
+    headline = next((role for role in found if role != VALIDATION), None)
+    shown = {"frames": [], "brief": {}, "rows": [], "support": {}} if headline is None else found.pop(headline)
+    return {"headline": headline, **shown, "apart": found}
+
+
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
-    """Print frames and weights, accuracy with costs, the classes, and an explanation."""
+    """Print frames and weights, rows of frames apart, accuracy with costs, the classes, and an explanation."""
     weights = content["weights"]
     named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
     left = f"; left out (training frames): {len(content['left_out'])}" if content["left_out"] else ""
-    lines = [_sentence(content["brief"], named)]
+    lines = [_sentence(content["brief"], named, content["headline"]) if content["headline"] else NO_HEADLINE]
     lines += [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
     if len(weights) > 1:
         lines += [f"  {one['file']}: {', '.join(one['frames']) or 'no frame'}" for one in weights]
+    for role, one in content["apart"].items():
+        lines += [f"  {role}: mIoU {format_points(one['rows'][-1]['miou'])} of {counted(len(one['frames']), 'frame')}"]
     for line in lines:
         show_text(line, console)
-    console.print(_accuracy(content))
-    console.print(_classes(content))
-    console.print(escape(CAPTION), soft_wrap=True, style="dim")
+    if content["headline"]:
+        console.print(_accuracy(content))
+        console.print(_classes(content))
+        console.print(escape(CAPTION), soft_wrap=True, style="dim")
 
 
-def _sentence(brief: dict[str, Any], named: str) -> str:
+def _sentence(brief: dict[str, Any], named: str, headline: str) -> str:
     """Return what to know first: the weights, the best plain classifier, and the cost of each."""
     found = {
         name: f"{format_points(one['miou'])} ({format_count(one['multiply_adds_a_pixel'])} multiply-adds a pixel)"
         for name, one in brief.items()
     }
     peer = f", the best plain classifier of single pixels {found[PLAIN]}" if PLAIN in found else ""
-    return f"mIoU: {named} {found['weights']}{peer}"
+    return f"mIoU, {headline}: {named} {found['weights']}{peer}"
 
 
 def _accuracy(content: dict[str, Any]) -> Table:

@@ -19,21 +19,24 @@ from spectralzoom.flows.training.data import (
     farm_test_data,
     open_training_data,
     untaught_note,
+    zero_cure,
 )
 from spectralzoom.models.reading.inference import CoarsePrediction, coarse_prediction_of_columns
 from spectralzoom.models.training.examples import normalised, observe_scene
 from spectralzoom.models.weights.checksummed_files import refusing
 from spectralzoom.models.weights.files import CAPTURED, Description, Weights, describe_weights
-from spectralzoom.pipeline.errors import SceneError, SettingsError
+from spectralzoom.pipeline.errors import SceneError, SettingsError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
 FARM_TEST_SCENES = 4
+HELD_OUT, OTHER_PIXELS, VALIDATION = "held out", "untrained pixels of training frames", "validation"
+ROLES = (HELD_OUT, OTHER_PIXELS, VALIDATION)  # of judged frames; one of the first two is the headline
 VALIDATED = (
     "the training chose reading, calibration and thresholds by {names}: scores of these validation frames may be too"
-    " good; --frames names others"
+    " good, and stand apart"
 )
 TAUGHT = (
     "trained pixels are left out of {names}: the other labelled ones are judged, which are no forecast for other scenes"
@@ -59,14 +62,22 @@ class Candidate:
         return cast(dict[str, Any], self.described.record.get("split", {}))
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """Return the note on classes that the weights never draw, if any."""
+    def warnings(self) -> tuple[str, ...]:
+        """Return the warning about classes that the weights never draw, if any."""
         names = self.described.untaught
         return (f"{self.path.name}: {untaught_note(names)}",) if names else ()
 
     def validated_on(self, scene: RasterScene) -> bool:
-        """Return whether the scene was one for validation."""
-        return scene.clear_key in self.split.get("validation", {}).values()
+        """Return whether the scene was one for validation, in any bands."""
+        known = self.split.get("validation", {}).values()
+        return scene.clear_key in known or any(one in self.split.get("validated", ()) for one in scene.content)
+
+    def role_of(self, scene: RasterScene) -> str | None:
+        """Return the part of a scene in the training, one of `ROLES`; None where all of it was taught."""
+        seen = seen_in_training(scene, self.described)
+        if seen == "all":
+            return None
+        return VALIDATION if self.validated_on(scene) else HELD_OUT if seen is None else OTHER_PIXELS
 
 
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
@@ -129,9 +140,9 @@ def observe_frame(
 
 @dataclass(frozen=True)
 class Jobs:
-    """Frames with the indices of their weights, and frames that all weights were trained on."""
+    """Frames with the indices of their weights and the role by each, and frames that all weights were trained on."""
 
-    frames: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    frames: dict[str, dict[int, str]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
     notes: tuple[str, ...] = ()  # on frames with a single class, without any value, or with labels of another grid
 
@@ -151,24 +162,36 @@ def sort_frames(data: TrainingData, weights: Sequence[Candidate], show: Report, 
             )
         for one in weights:
             check_labels(scene, one.described)
-        fit = tuple(at for at, one in enumerate(weights) if seen_in_training(scene, one.described) != "all")
-        if not fit:
+        roles = {at: role for at, one in enumerate(weights) if (role := one.role_of(scene))}
+        if not roles:
             jobs.left_out.append(name)
             continue
-        jobs.frames[name] = fit
-        if any(weights[at].validated_on(scene) for at in fit):
-            notes[VALIDATED].append(name)
-        if any(seen_in_training(scene, weights[at].described) for at in fit):
-            notes[TAUGHT].append(name)
+        jobs.frames[name] = roles
+        for note, role in ((VALIDATED, VALIDATION), (TAUGHT, OTHER_PIXELS)):
+            if role in roles.values():
+                notes[note].append(name)
         notes.add(name, scene)
-        labelled = labelled or bool(np.any(judged_labels(scene, weights[fit[0]].described) != UNLABELLED))
+        labelled = labelled or bool(np.any(judged_labels(scene, weights[min(roles)].described) != UNLABELLED))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
     if jobs.left_out and (named or not jobs.frames):
         raise SceneError(
-            f"no weights are left for {', '.join(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
-            "trained on these labels, and frames trained on are refused: judge by other frames, or by other labelled "
-            "pixels of them, or train with some held out: spectralzoom train ... --hold-out NAMES"
+            f"no weights are left for {list_some(jobs.left_out)}: {', '.join(str(one.path) for one in weights)} was "
+            f"trained on these labels, and frames trained on are refused. {_cure(data, weights)}"
         )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {data.law} to judge by")
     return replace(jobs, notes=tuple(notes.texts))
+
+
+def _cure(data: TrainingData, weights: Sequence[Candidate]) -> str:
+    """Return what to judge weights by that were trained on the frames."""
+    names = [*data.files.files] if data.files else []
+    held = [name for name in names if any(name in one.split.get("held_out", ()) for one in weights)]
+    zero = [cure for name in weights[0].described.class_names if (cure := zero_cure(name))]
+    way = "Judge by another scene, or by pixels that the training had no label of: --labels FILE"
+    if held:
+        way = f"Judge by frames that were held out: --frames {','.join(held)}"
+    elif len(names) > 1 and data.files:
+        path = data.files.path
+        way = f"Hold some out of a training: spectralzoom train {path} --hold-out {names[-1]} -o FILE.safetensors"
+    return "; ".join([way, *(f"label 0 was a class of the training: {one}, and train again" for one in zero)])

@@ -13,6 +13,7 @@ from spectralzoom.flows.publish.quicklook import thinned
 from spectralzoom.flows.terminal.figures import format_area, format_days, format_percent, spaced
 
 MOST, MORE = 0.7, 0.2  # of a class in a part of the field, and above the fraction of all classes there
+MIDDLE_THIRD, AROUND_MIDDLE = 1 / 6, 0.3  # of the centre of area, and of the class around the middle; sides end at 1/2
 RAREST = 3  # classes of a sentence besides the largest one
 LEAST_CLASS, LEAST_CHANGE = 0.001, 0.001  # of the field; smaller ones are likely errors of the map
 CHANGED = 2  # classes of a sentence on changes
@@ -21,8 +22,9 @@ CHANGED = 2  # classes of a sentence on changes
 def main_places(classes: NDArray[np.integer], names: Sequence[str], geobox: GeoBox | None) -> dict[str, str]:
     """Return the part of the field with most pixels of a class, in words; classes that are spread have none.
 
-    ``classes`` (y, x) are indices of ``names``, others have no class. With a ``geobox`` whose axes point east and
-    north, the words are those of the compass.
+    ``classes`` (y, x) are indices of ``names``, others have no class: places are those within the pixels with a class.
+    The third of the field with the centre of area names the place, if most of the class lies on that side. With a
+    ``geobox`` whose axes point east and north, the words are those of the compass.
     """
     thin = classes[thinned(classes)]
     y, x = np.nonzero(thin < len(names))
@@ -34,29 +36,28 @@ def main_places(classes: NDArray[np.integer], names: Sequence[str], geobox: GeoB
         compass = {axis.direction for axis in geobox.crs.proj.axis_info} >= {"east", "north"}
         a, b, _, d, e, _ = geobox.affine[:6]
         x, y = (a * x + b * y, -d * x - e * y) if compass else (x, y)
-    across, down = (2 * (at - at.min()) / (np.ptp(at) or 1) - 1 for at in (x, y))  # -1 to 1
-    middle = (abs(across) < 0.5) & (abs(down) < 0.5)
-    parts = np.stack([down < 0, down >= 0, across < 0, across >= 0, middle])
-    usual = parts.mean(axis=1)
+    extents = ((at - (at.min() + at.max()) / 2, np.ptp(at)) for at in (x, y))
+    at = np.stack([off / (size or 1) for off, size in extents])  # across and down, -1/2 to 1/2
     found = {}
     for number, name in enumerate(names):
         if (here := numbers == number).any():
-            share = parts[:, here].mean(axis=1)
-            if words := _words((share >= MOST) & (share >= usual + MORE), compass=compass):
-                found[name] = words
+            centre = at[:, here].mean(axis=1)
+            side = np.where(abs(centre) > MIDDLE_THIRD, np.sign(centre), 0)
+            inside = np.all(side[:, None] * at >= 0 if side.any() else abs(at) <= AROUND_MIDDLE, axis=0)
+            if inside[here].mean() >= max(MOST, inside.mean() + MORE):
+                found[name] = _words(*side.tolist(), compass=compass)
     return found
 
 
-def _words(most: NDArray[np.bool_], *, compass: bool) -> str:
-    """Return a place in words by whether most lies above, below, left, right, or in the middle."""
-    *sides, middle = most.tolist()
-    words = ("north", "south", "west", "east") if compass else ("top", "bottom", "left", "right")
-    named = [word for word, is_there in zip(words, sides, strict=True) if is_there]
+def _words(across: float, down: float, *, compass: bool) -> str:
+    """Return a place in words by its side across and down: -1, 1, or 0 for the middle."""
+    words = (("north", "south"), ("west", "east")) if compass else (("top", "bottom"), ("left", "right"))
+    named = [pair[side > 0] for pair, side in zip(words, (down, across), strict=True) if side]
     if not named:
-        return "in the middle" if middle else ""
+        return "in the middle"
     if compass:
         return f"in the {'-'.join(named)}"
-    return f"{'at' if any(sides[:2]) else 'on'} the {' '.join(named)}"
+    return f"{'at' if down else 'on'} the {' '.join(named)}"
 
 
 def class_sentence(receipt: Mapping[str, Any]) -> str:

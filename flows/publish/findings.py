@@ -1,4 +1,4 @@
-"""Compute the findings of a run: areas, changes, zones, plots, likeness to the training, expected score."""
+"""Compute the findings of a run: warnings, areas, changes, zones, plots, scans, expected score."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from spectralzoom.flows.stages.ground import STORE
 from spectralzoom.flows.stages.register import load_registration
 from spectralzoom.flows.stages.score import load_plan, read_in_full
 from spectralzoom.flows.stages.segment import SPECTRA
+from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.prior_maps import PRIOR_FIGURES
 from spectralzoom.flows.tasks.scores import MOST_ERROR
-from spectralzoom.flows.terminal.figures import format_points
-from spectralzoom.models.evaluation.expected_scores import expected_counts
+from spectralzoom.flows.terminal.figures import format_count, format_points
+from spectralzoom.models.evaluation.expected_scores import ENOUGH_PX, expected_counts
 from spectralzoom.models.evaluation.unlike_scenes import UNLIKE
 from spectralzoom.pipeline.capture.recorded_passes import lines_served
 from spectralzoom.pipeline.geometry.grid import UNLABELLED, cuts, patch_pixels
@@ -48,21 +49,56 @@ def find_out(plan: SurveyPlan, products: Products) -> dict[str, Any]:
     if field.prior is not None:
         prior = {"run": field.prior.run, **read_table(products.class_map.path / PRIOR_FIGURES)}
     if plan.chooses and (plan.passes.plain or plan.least_gain is not None):
-        kept = plan.reading_figures(read_in_full(products.attention, products.class_map))
+        kept = plan.reading_figures(read_in_full(products.attention, products.class_map), fine.changed)
+    warnings = map_warnings(plan, products.class_map)
+    unscored = no_expected_score(warnings, int(np.count_nonzero(drawn.classes != UNLABELLED)))
     return {
+        "warnings": warnings,
         "field": field_figures(plan, fine),
         "plan": _plan(plan, fine),
         "recording": _recording(plan, fine),
         "kept": kept,
         "prior_map": prior,
-        "extent": _extent(plan, fine) if plan.part else None,
+        "scans": _scans(plan, fine, scored=not unscored),
+        "extent": _extent(plan, fine, scored=not unscored) if plan.part else None,
         "pointing": _pointing(plan, products, fine),
         "areas": _areas(plan, products, posed, drawn),
         "ground": _ground(plan, products, posed, drawn, {} if prior is None else prior),
         **_zones(plan, drawn),
         **_map(plan, products.class_map, drawn),
+        "expected": {"not_predicted": unscored} if warnings else _expected(plan, products.class_map, unscored),
         **({} if field.raster is not None else _lines(products.mosaic)),
     }
+
+
+def map_warnings(plan: SurveyPlan, class_map: Ref | None) -> list[str]:
+    """Return the warnings about a map, also those by its spectra where it is drawn in the store ``class_map``."""
+    warnings = list(plan.field.warnings)
+    mean, spectra = (class_map and read_table(class_map.path / SPECTRA)["distances"]) or (0.0, 0.0)
+    if max(mean, spectra) > UNLIKE:
+        what = f"its mean spectrum lies {mean:.1f}" if mean >= spectra else f"its spectra lie {spectra:.1f}"
+        far = f"{what} times as far from it as any part of it from the rest"
+        warnings.append(f"the scene is unlike the training ({far}): the map may be wrong with confidence")
+    return warnings
+
+
+def no_expected_score(warnings: Sequence[str], pixels: int) -> str:
+    """Return why a map with so many ``pixels`` of a class has no expected score; empty where it may have one."""
+    if warnings:
+        return "no expected score: under a warning, neither the map's probabilities nor the weights' record predict it"
+    if pixels < ENOUGH_PX:
+        return f"no expected score: {format_count(pixels)} px have a class, fewer than {format_count(ENOUGH_PX)}"
+    return ""
+
+
+def _scans(plan: SurveyPlan, fine: FinePlan, *, scored: bool) -> dict[str, Any]:
+    """Return the uniform scans by the scan performance table, where there is one."""
+    scans = {
+        "taken": plan.scans.chosen,
+        "best_in_time": plan.scans.best_in_time(plan.passes.coarse_s + fine.seconds),
+        "reference": plan.scans.reference,
+    }
+    return {name: as_figures(scan, scored=scored) for name, scan in scans.items() if scan is not None}
 
 
 def field_figures(plan: SurveyPlan, fine: FinePlan | None) -> dict[str, Any]:
@@ -103,7 +139,8 @@ def _plan(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any]:
     facts = {"kind": fine.kind, "reason": fine.reason, "lines": fine.lines, "seconds": fine.seconds}
     if fine.kind != "lines" or not fine.sweeps:
         return facts
-    again = np.ones(plan.field.grid.patch_shape, np.uint8)
+    again = np.full(plan.field.grid.patch_shape, UNLABELLED, np.uint8)
+    again.ravel()[plan.field.kept_patches] = 1
     again.ravel()[fine.patch_index] = 0
     geobox = plan.field.scene.geobox  # patches lie as pixels do
     return {**facts, "place": main_places(again, ("again", "once"), geobox).get("again", "")}
@@ -122,12 +159,13 @@ def _recording(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any] | None:
     }
 
 
-def _extent(plan: SurveyPlan, fine: FinePlan) -> dict[str, Any]:
+def _extent(plan: SurveyPlan, fine: FinePlan, *, scored: bool) -> dict[str, Any]:
     return {
         "lines": plan.settings.extent,
         "patches_touched": len(fine.patch_index) / max(len(plan.field.kept_patches), 1),
         "uses_prior_map": plan.field.prior is not None,
         **({} if plan.extent is None else asdict(plan.extent)),
+        **({} if scored else {"expected_wrong": None}),
     }
 
 
@@ -250,10 +288,9 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
-    """Return ``unlike``, ``pixels`` and ``expected`` of the map in the store ``ref``."""
+    """Return ``unlike`` and ``pixels`` of the map in the store ``ref``."""
     spectra = read_table(ref.path / SPECTRA)
     mean, distance = spectra["distances"] or (0.0, 0.0)
-    unlike = max(mean, distance) > UNLIKE
     unclassed = drawn.classes == UNLABELLED
     if plan.field.zones.left_out is not None:
         unclassed &= ~plan.field.zones.left_out
@@ -263,20 +300,20 @@ def _map(plan: SurveyPlan, ref: Ref, drawn: ClassMap) -> dict[str, Any]:
         "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     return {
-        "unlike": {"mean": mean, "spectra": distance} if unlike else None,
+        "unlike": {"mean": mean, "spectra": distance} if max(mean, distance) > UNLIKE else None,
         "pixels": pixels if any(pixels.values()) else None,
-        "expected": None if unlike else _expected(plan, ref),
     }
 
 
-def _expected(plan: SurveyPlan, ref: Ref) -> dict[str, Any] | None:
+def _expected(plan: SurveyPlan, ref: Ref, unscored: str) -> dict[str, Any] | None:
     """Return the expected score by the map's own probabilities; None where these were never compared with labels.
 
     They were compared for maps of uniform scans segmented in full without a prior map. Pixels without a class do not
-    count. A score with too large an error is not predicted.
+    count. A score with too large an error is not predicted, nor one that is ``unscored`` for a reason.
     """
+    scores = plan.field.described.map_scores
     if (
-        plan.field.map_scores is None
+        scores is None
         or plan.field.raster is not None
         or not plan.passes.plain
         or plan.part
@@ -284,16 +321,18 @@ def _expected(plan: SurveyPlan, ref: Ref) -> dict[str, Any] | None:
         or plan.field.prior is not None
     ):
         return None
+    if unscored:
+        return {"not_predicted": unscored}
     names = plan.field.described.class_names
     store = ProbabilityStore(ref.path / "class_probabilities.zarr")
     high = SHARD_ROWS * int(np.clip(STRIP_PX // (SHARD_ROWS * store.shape[1]), 1, 4))
     strips = (store.read(rows)[0] for rows in cuts(store.shape[0], high))
     exposure_ms = (plan.settings.scan_exposure_ms or plan.field.camera.exposure_ms) * plan.field.scene.light_fraction
-    score = plan.field.map_scores.expected(expected_counts(strips, len(names)), plan.step, exposure_ms)
+    score = scores.expected(expected_counts(strips, len(names)), plan.step, exposure_ms)
     if score is None or not np.isfinite(score.miou):
         return None
     if score.error > MOST_ERROR:
-        text = f"it would be off by {format_points(score.error)} points (one standard deviation)"
+        text = f"no expected score: it would be off by {format_points(score.error)} points (one standard deviation)"
         return {"not_predicted": f"{text}; judge the map by labels"}
     of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
     return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}

@@ -22,6 +22,7 @@ from spectralzoom.flows.stage import Stores, inside_flow, task_in_flow
 from spectralzoom.flows.stages.condense import raw_differs
 from spectralzoom.flows.stages.score import load_plan
 from spectralzoom.flows.tasks.local_server import server_answers
+from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.pipeline.errors import SurveyStopped
 from spectralzoom.storage.runs import Catalogue
 from spectralzoom.storage.store import Archive, Ref
@@ -40,8 +41,11 @@ class RunRef:
 
 
 def outcome(run: RunRef) -> str:
-    """Return the address and the score of a run in a sentence, or where the survey was stopped."""
-    return str(run.stopped) if run.stopped is not None else f"{run.uri}: {format_score(load_receipt(run.folder))}"
+    """Return the address, the warnings and the score of a run in a line, or where the survey was stopped."""
+    if run.stopped is not None:
+        return str(run.stopped)
+    receipt = load_receipt(run.folder)
+    return f"{run.uri}: {'. '.join([*map('Warning: {}'.format, warnings_of(receipt)), format_score(receipt)])}"
 
 
 def publish(
@@ -102,7 +106,7 @@ def _show_artifact(name: str, archive: str, published: Published) -> None:
         text = render_markdown(
             "survey.md",
             survey=published.receipt["survey"],
-            headline=headline(published.receipt),
+            headline=[*map("Warning: {}".format, warnings_of(published.receipt)), *headline(published.receipt)],
             picture=base64.b64encode(small_jpeg((published.folder / "quicklook.png").read_bytes())).decode("ascii"),
             findings=[f"{name}: {text}" for name, text in finding_rows(published.receipt)],
             where=where,

@@ -12,7 +12,7 @@ from rich.markup import escape
 from spectralzoom.flows.publish.class_sentence import class_sentence
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.tasks.scene import TRAINING_SCENE
-from spectralzoom.flows.tasks.scores import format_prediction, format_worst_class
+from spectralzoom.flows.tasks.scores import format_prediction, format_worst_class, warnings_of
 from spectralzoom.flows.terminal.figures import (
     counted,
     format_area,
@@ -26,7 +26,7 @@ from spectralzoom.flows.terminal.figures import (
     spaced,
     three_digits,
 )
-from spectralzoom.flows.terminal.progress import table
+from spectralzoom.flows.terminal.progress import show_warnings, table
 from spectralzoom.pipeline.planning.uniform_scans import format_scan
 from spectralzoom.pipeline.simulator.selection.choice import UNIT_NAMES
 
@@ -104,13 +104,13 @@ def format_score(receipt: Mapping[str, Any]) -> str:
             score += f"; the best uniform scan of the same seconds gives {format_points(control['miou'])}"
         return f"{score}. {format_worst_class(accuracy)}".rstrip()
     expected = receipt.get("expected") or {}
-    if predicted := format_prediction(expected.get("miou"), expected.get("error")):
+    predicted = format_prediction(expected.get("miou"), expected.get("error"))
+    if predicted and not warnings_of(receipt):
         return f"Expected mIoU {predicted} of 100, estimated from the map's own probabilities."
-    if "not_predicted" in expected:
-        return f"The score is not known: {expected['not_predicted']}."
-    if receipt["settings"].get("accuracy") is False:
-        return "The accuracy was left out; the same survey with --accuracy adds it in a new run."
-    return "The score is not known: there are no labels."
+    left = "the accuracy was left out; the same survey with --accuracy adds it in a new run"
+    known = [expected.get("not_predicted"), left if receipt["settings"].get("accuracy") is False else None]
+    why = "; ".join(filter(None, known)) or "the score is not known: there are no labels"
+    return f"{why[0].upper()}{why[1:]}."
 
 
 def format_second_pass(receipt: Mapping[str, Any]) -> str:
@@ -135,10 +135,11 @@ def headline(receipt: Receipt) -> list[str]:
 
 
 def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) -> None:
-    """Print classes, score, leading savings, their reference, unlike spectra, saturation, lost lines, and a prior map.
+    """Print warnings, classes, score, leading savings, their reference, saturation, lost lines, and a prior map.
 
     With ``verbose`` print all savings, the stages that ran or were read from the archive, and the effects.
     """
+    show_warnings(warnings_of(receipt), console)
     for sentence in filter(None, (class_sentence(receipt), format_score(receipt), format_second_pass(receipt))):
         console.print(escape(sentence))
     rows = [row for row in saving_rows(receipt) if verbose or row["label"] in LEADING]
@@ -152,7 +153,7 @@ def print_summary(receipt: Receipt, console: Console, *, verbose: bool = False) 
     console.print()
     console.print(costs)
     console.print(escape(format_reference(receipt)))
-    shown = {part: receipt[part] for part in ("unlike", "signal", "lines", "prior_map") if receipt.get(part)}
+    shown = {part: receipt[part] for part in ("signal", "lines", "prior_map") if receipt.get(part)}
     for name, words in finding_rows(shown):
         console.print(escape(f"{name}: {words}"), soft_wrap=True)  # numbers have spaces
     if not verbose:
@@ -182,21 +183,18 @@ def print_effects(effects: Iterable[Mapping[str, Any]], total: Mapping[str, Any]
     unit = UNIT_NAMES[total["unit"]]
     tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
     bound = "without a bound" if total["bound"] is None else f"at most {total['bound']:.2g} {unit}"
+    saved = f" Saved processor time: about {format_seconds(total['saved_s'])}." if total["saved_s"] > 0 else ""
     console.print(
         f"Effects computed: {total['on']} of {total['on'] + total['off']} (asked: {escape(str(total['asked']))}, "
-        f"tolerance {tolerance} {unit}). Change of a stored number by the others: {bound}. "
-        f"Saved processor time: about {format_seconds(max(total['saved_s'], 0.0))}."
+        f"tolerance {tolerance} {unit}). Change of a stored number by the others: {bound}.{saved}"
     )
 
 
 def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the findings of a receipt as rows of a table: label, and figures with their names.
 
-    Zeros, what is empty, and costs, which the savings have, are left out. For a scene unlike the training, no
-    score is predicted.
+    Zeros, what is empty, and costs, which the savings have, are left out.
     """
-    if found.get("unlike") and "scans" in found:
-        found = {**found, "scans": {name: {**scan, "expected_miou": None} for name, scan in found["scans"].items()}}
     words: dict[str, list[str]] = {}
     for label, part, name, show in _SHOWN:
         if value := (found.get(part) or {}).get(name):
@@ -209,16 +207,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     for name, facts in found.get("lines", {}).items():
         counts = ", ".join(f"{count} {what}" for what, count in facts.items() if count)
         rows.append((f"sweep {name}", f"lines left out: {counts}"))
-    if unlike := found.get("unlike"):
-        rows.insert(0, ("note", _unlike(**unlike)))
     return [(label, words) for label, words in rows if words]
-
-
-def _unlike(mean: float, spectra: float) -> str:
-    """Return the sentence on a scene whose mean or spectra are farther from the training than any of its scenes."""
-    what = f"its mean spectrum lies {mean:.1f}" if mean >= spectra else f"its spectra lie {spectra:.1f}"
-    far = f"{what} times as far from it as any part of it from the rest"
-    return f"the scene is unlike the training ({far}): the map may be wrong with confidence"
 
 
 def _scan(scan: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ from spectralzoom.flows.publish.field_map import FieldMap
 from spectralzoom.flows.publish.quicklook import data_address
 from spectralzoom.flows.publish.receipt import Receipt
 from spectralzoom.flows.publish.receipt_table import finding_rows, format_reference, headline, saving_rows
-from spectralzoom.flows.tasks.scores import error_matrix, format_false_classes
+from spectralzoom.flows.tasks.scores import error_matrix, format_false_classes, warnings_of
 from spectralzoom.flows.terminal.figures import format_percent, format_points
 from spectralzoom.pipeline.errors import visible
 from spectralzoom.storage.readers.open_cubes import split_variable
@@ -93,6 +93,7 @@ def render_report(receipt: Receipt, quicklook: bytes, field: FieldMap) -> str:
         policy=policy(),
         scripts=Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in MAP_SCRIPTS),
         title=receipt["survey"],
+        warnings=warnings_of(receipt),
         lead=headline(receipt),
         about=f"{scene}, source {receipt['source']}, seed {receipt['seed']}, "
         + (f"acquired {receipt['acquired']}, " if "acquired" in receipt else "")

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 from spectralzoom.flows.plan import SurveyPlan
 from spectralzoom.flows.products import Control, Products
 from spectralzoom.flows.publish.field_map import field_map
-from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, plots_csv
+from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, map_warnings, plots_csv
 from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
 from spectralzoom.flows.publish.receipt import Receipt, build_receipt
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.values import KEEP_SIGNAL, RASTER
 from spectralzoom.flows.stage import Row, Stores
+from spectralzoom.flows.stages.capture import SAVED_S
 from spectralzoom.flows.stages.effects import load_manifest
 from spectralzoom.flows.stages.evaluate import load_accuracy
 from spectralzoom.flows.stages.score import READING, SCORES, load_plan, read_in_full
-from spectralzoom.flows.tasks.capture_plan import as_figures
 from spectralzoom.flows.tasks.scene import seen_in_training
 from spectralzoom.pipeline.geometry.grid import SceneGrid
 from spectralzoom.pipeline.planning.coverage import BYTES_PER_SAMPLE, SavingEntry, capture_savings, raw_bytes
@@ -41,7 +41,7 @@ from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
 from spectralzoom.storage.receipts import Facts
 from spectralzoom.storage.runs import RECEIPT
-from spectralzoom.storage.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json, write_new
 
 REPORT = "report.html"
 COSTS_OF_STAGE = ("wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")
@@ -69,11 +69,11 @@ def publish_run(
         nonlocal receipt
         receipt = make_receipt(stores, plan, products, control, uri, started)
         page = render_report(receipt, quicklook, field_map(shown, plan.field.prior))
-        (folder / "quicklook.png").write_bytes(quicklook)
+        write_new(folder / "quicklook.png", quicklook)
         if "plots" in receipt:
-            (folder / PLOTS_FILE).write_text(plots_csv(receipt["plots"]), encoding="utf-8")
-        (folder / RECEIPT).write_text(to_json(receipt), encoding="utf-8")
-        (folder / REPORT).write_text(page, encoding="utf-8")
+            write_new(folder / PLOTS_FILE, plots_csv(receipt["plots"]))
+        write_new(folder / RECEIPT, to_json(receipt))
+        write_new(folder / REPORT, page)
         return {"survey": receipt["survey"], "settings": receipt["settings"]}
 
     day = moment_of(plan.field.acquired)
@@ -95,11 +95,6 @@ def make_receipt(
     if (products.class_map.path / READING).exists():  # patches were chosen in the segmentation
         places["attention"] = f"{products.class_map.uri}/{READING}"
     files = (RECEIPT, "quicklook.png", REPORT, *([PLOTS_FILE] if field.zones.plots is not None else []))
-    scans = {
-        "taken": plan.scans.chosen,
-        "best_in_time": plan.scans.best_in_time(plan.passes.coarse_s + fine.seconds),
-        "reference": plan.scans.reference,
-    }  # where there is a table
     return build_receipt(
         survey=field.name,
         source=RASTER if field.source is None else field.source.name,
@@ -116,10 +111,9 @@ def make_receipt(
         accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
         training_scene=seen_in_training(field.scene, field.described),
         effects=effects.get("effects"),
-        effects_total=effects.get("total"),
+        effects_total=effects and {**effects["total"], SAVED_S: stores.total(SAVED_S)},
         products={**places, **{name: f"{uri}/{name}" for name in files}},
         control=None if control is None else control_figures(control),
-        scans={name: as_figures(scan) for name, scan in scans.items() if scan is not None},
         **find_out(plan, products),
     )
 
@@ -189,7 +183,7 @@ def quicklook_data(plan: SurveyPlan, products: Products) -> QuicklookData:
     return QuicklookData(
         survey=field.name,
         seed=plan.settings.seed,
-        about=fine.reason,
+        about="   ·   ".join([*map("Warning: {}".format, map_warnings(plan, products.class_map)), fine.reason]),
         rectified=open_mosaic(products.mosaic.path / "mosaic.zarr").thinned(thin[0].step, [*bands]),
         caption=caption,
         class_map=found.classes,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import islice
 from typing import cast
@@ -15,9 +15,11 @@ import numpy as np
 from spectralzoom.flows.frame import FieldView
 from spectralzoom.flows.stage import Output, Unkeyed, stage
 from spectralzoom.flows.stages.effects import chosen_effects, load_manifest
+from spectralzoom.pipeline.errors import PipelineError
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.scan import CostModel, Sweep
+from spectralzoom.pipeline.geometry.scan import CostModel, Sweep, exposing
 from spectralzoom.pipeline.signal.condense import LineStatistics
+from spectralzoom.pipeline.signal.line_faults import LineJudge
 from spectralzoom.pipeline.signal.subspace import SignalStatistics
 from spectralzoom.pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from spectralzoom.pipeline.source import RECORD, Line, SimulatedLight, Source
@@ -25,8 +27,10 @@ from spectralzoom.storage.arrays.cubes import STATISTICS, RawCubeWriter, SweepHe
 from spectralzoom.storage.arrays.spool import Spool
 from spectralzoom.storage.parallel.pool import WorkerPool
 from spectralzoom.storage.store import Ref
+from spectralzoom.storage.whole_files import make_folder, read_own, write_new
 
 RAW, RAW_VERSION = "capture", 15
+SAVED_S = "saved_s"  # fact of a simulated capture, for its receipt
 KEPT = "source"  # folder of a source's own files within a capture's spool
 MADE_BY = ("pipeline/simulator", "pipeline/rig", "pipeline/capture", "storage/arrays/cubes.py")
 
@@ -89,7 +93,7 @@ class SweepRecorder:
         before = 0
         self.out.report(0.0)  # before the first line, which takes a rig some time
         kept = self.out.spool / KEPT
-        kept.mkdir(parents=True, exist_ok=True)
+        make_folder(kept, self.out.spool.parents[1])
         if self.effects is not None:
             source = cast(SimulatedLight, source).with_effects(chosen_effects(self.effects), request.starts_s)
         with source.opened(kept) as opened:
@@ -100,18 +104,26 @@ class SweepRecorder:
 
                 self._sweep(opened, sweep, found, taken)
                 before += sweep.lines
+        if self.effects is not None and isinstance(source, SimulatedSource):
+            with suppress(PipelineError):  # only the effects that were left out cannot be rendered
+                exact = chosen_effects(self.effects, exact=True)
+                self.out.facts[SAVED_S] = source.saved_seconds(exact, request.sweeps)
         np.savez(self.out.path / STATISTICS, allow_pickle=False, **found.arrays())
-        if (kept / RECORD).exists():
-            shutil.copyfile(kept / RECORD, self.out.path / RECORD)
+        with suppress(FileNotFoundError):
+            write_new(self.out.path / RECORD, read_own(kept / RECORD))
 
     def _sweep(self, source: Source, sweep: Sweep, found: SignalStatistics, taken: Callable[[int], None]) -> None:
-        """Write the lines of a sweep into spool and cube, one by one."""
+        """Write the lines of a sweep into spool and cube, one by one.
+
+        Lines that cannot be are not valid in the cube. Raises SceneError: they are more than a tenth.
+        """
         references = source.references(sweep)
         manifest = None if self.effects is None else load_manifest(self.effects)
         bands = self.view.wavelength_nm, self.view.fwhm_nm
         header = SweepHeader(sweep, references, *bands, source.name, simulation=manifest)
         of_spool = {"sweep": asdict(sweep), "camera": asdict(self.view.camera), **self.view.light}
         statistics = LineStatistics(found, sweep, references, self.view.camera)
+        judge = LineJudge(references, exposing(self.view.camera, sweep).exposure_ms)
         with (
             Spool.open(self.out.spool, *references.dark.shape, header=of_spool, name=sweep.name) as spool,
             RawCubeWriter(self.out.path / f"{sweep.name}.zarr", header, statistics.add) as cube,
@@ -119,13 +131,15 @@ class SweepRecorder:
 
             def take(line: Line) -> None:
                 spool.append(line)
-                cube.write([line])
+                cube.write([judge.judged(line)])
                 taken(spool.count)
 
             for block in spool.blocks():
-                cube.write(block)
+                cube.write([judge.judged(line) for line in block])
             taken(spool.count)
             take_lines(source, sweep, take, self.pool, first=spool.count)
+        for note in judge.notes(f"sweep {sweep.name}", sweep.lines):
+            self.out.note(note)
 
 
 Take = Callable[[Line], None]

@@ -19,12 +19,12 @@ from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 from spectralzoom.pipeline.simulator.selection.choice import decide, list_effects, sum_up
 from spectralzoom.pipeline.simulator.selection.survey_probe import probe_survey
 from spectralzoom.storage.store import Ref, read_table
-from spectralzoom.storage.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json, write_new
 
 RECORD = "effects.json"
 
 
-@stage("choice of effects", version=13, product="effects", made_by=("pipeline/simulator",))
+@stage("choice of effects", version=14, product="effects", made_by=("pipeline/simulator",))
 def choose_effects(
     out: Output, *, scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], cost: CostModel, asked: str, tol: Tolerance
 ) -> None:
@@ -32,7 +32,7 @@ def choose_effects(
     probes = probe_survey(scene, rig, sweeps, tol.unit, cost)
     decision = decide(probes, rig, EFFECTS, tol.value, asked)
     text = to_json({"effects": list_effects(decision), "total": sum_up(decision)})
-    (out.path / RECORD).write_text(text, encoding="utf-8")
+    write_new(out.path / RECORD, text)
     out.report(1.0)
 
 
@@ -41,10 +41,15 @@ def load_manifest(effects: Ref) -> dict[str, Any]:
     return read_table(effects.path / RECORD)
 
 
-def chosen_effects(effects: Ref) -> dict[Effect, str]:
-    """Return the chosen effects with their variants. Raises IncompleteStoreError: this version lacks one."""
+def chosen_effects(effects: Ref, *, exact: bool = False) -> dict[Effect, str]:
+    """Return the chosen effects with their variants, or all that the rig has as ``exact`` ones.
+
+    Raises IncompleteStoreError: this version lacks one.
+    """
     chosen: dict[Effect, str] = {}
     for row in load_manifest(effects)["effects"]:
+        if exact and row["reason"] != "absent" and row["name"] in BY_NAME:
+            row = {**row, "state": "on", "variant": BY_NAME[row["name"]].variants[0]}
         if row["state"] != "on":
             continue
         if row["name"] not in BY_NAME or row["variant"] not in BY_NAME[row["name"]].variants:

@@ -24,7 +24,7 @@ from spectralzoom.pipeline.geometry.scan import Axis
 from spectralzoom.pipeline.simulator.effects.pointing import PointingErrors
 from spectralzoom.storage.arrays.class_maps import load_class_map
 from spectralzoom.storage.store import Ref, read_table
-from spectralzoom.storage.whole_files import to_json
+from spectralzoom.storage.whole_files import to_json, write_new
 
 RECORD = "accuracy.json"
 
@@ -45,7 +45,7 @@ def evaluate(
     judged = np.where(drawn.classes == UNLABELLED, np.uint8(UNLABELLED), truth)  # only pixels with a class
     counts = confusion(judged, drawn.classes, len(names))
     result: dict[str, Any] = map_figures(names, counts) | {"confusion": counts.tolist()}
-    (out.path / RECORD).write_text(to_json(result), encoding="utf-8")  # JSON without NaN
+    write_new(out.path / RECORD, to_json(result))  # JSON without NaN
 
 
 def map_offset(pointing: PointingErrors | None, seams: Ref | None) -> NDArray[np.float64]:

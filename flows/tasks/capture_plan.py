@@ -288,8 +288,7 @@ def lay_out_passes(
         if pays and first is not None and chosen is not None:
             notes = (
                 f"two passes: {format_scan(first.step, first.exposure_ms)} first, then lines of the highest expected "
-                f"gain; expected mIoU {100 * first.expected:.1f} or more, one uniform scan {chosen.summary} "
-                f"{100 * chosen.expected[MIOU]:.1f} (--zoom never)",
+                f"gain; by the weights' record one uniform scan, {chosen.summary}, scores no more (--zoom never)",
             )
     if settings.zooms:
         layout = replace(layout, first_step=settings.scan_step or FIRST_STEP, step=None)
@@ -359,9 +358,10 @@ def choose_first_pass(
     return max(good, key=lambda one: (-one.step, one.exposure_ms), default=fastest)
 
 
-def as_figures(scan: UniformScan | None, **more: int) -> dict[str, Any] | None:
-    """Return a scan for receipts and plans, with its expected mIoU and ``more`` figures."""
+def as_figures(scan: UniformScan | None, *, scored: bool, **more: int) -> dict[str, Any] | None:
+    """Return a scan for receipts and plans, with ``more`` figures; its expected mIoU is None unless ``scored``."""
     if scan is None:
         return None
-    figures = {"expected_miou": scan.expected[MIOU], "expected_spread": scan.spread}
+    expected = (scan.expected[MIOU], scan.spread) if scored else (None, None)
+    figures = dict(zip(("expected_miou", "expected_spread"), expected, strict=True))
     return {name: value for name, value in asdict(scan).items() if name not in ("expected", "spread")} | figures | more

@@ -90,12 +90,14 @@ def choose_extent(
     seconds: float,
     max_age: float | None,
     left_out: Mask | None = None,
+    scored: bool = True,
 ) -> tuple[PassLayout, ExtentChoice, str]:
     """Choose the lines of a partial scan within a time; return their layout, the choice, and a sentence.
 
     Patches that would become older than ``max_age`` days come first. Pixels of ``left_out`` (y, x) are not of interest:
-    they lie outside of zones or have no data. Raises WeightsError: the weights have no scan performance table;
-    BudgetError: no line fits the time; names the least time; PoseError: the field exceeds the mirror's range.
+    they lie outside of zones or have no data. The sentence has the expected errors only if ``scored``.
+    Raises WeightsError: the weights have no scan performance table; BudgetError: no line fits the time; names the least
+    time; PoseError: the field exceeds the mirror's range.
     """
     content = weights.scans(law)
     if content is None:
@@ -133,10 +135,9 @@ def choose_extent(
     )
     chosen = replace(layout, extent=format_extent(extent.runs), step=step, exposure_ms=exposure_ms)
     aged = f"; patches beyond --max-age: {choice.due - choice.due_left} of {choice.due} included" if choice.due else ""
-    sentence = (
-        f"captures the lines of highest expected gain, {format_scan(step, exposure_ms)}, in {choice.seconds:.1f} s; by"
-        f" its own probabilities, the prior map is wrong at {format_percent(wrong)} of its pixels{aged}"
-    )
+    what = f"captures the lines of highest expected gain, {format_scan(step, exposure_ms)}, in {choice.seconds:.1f} s"
+    own = f"; by its own probabilities, the prior map is wrong at {format_percent(wrong)} of its pixels"
+    sentence = f"{what}{own if scored else ''}{aged}"
     return chosen, choice, sentence
 
 
@@ -178,7 +179,7 @@ def _swaths(
     Probabilities are those of the nearest pixel among every second row and column.
     """
     store = ProbabilityStore(prior.probabilities.path / "class_probabilities.zarr")
-    read = None if weights.reader is None else load_reader(path)
+    read = None if weights.reader is None else load_reader(path, weights)
     across = np.arange(grid.width) // EVERY_PX
     for rows in cuts(grid.height, SWATH_PATCHES * grid.patch):
         first, last = max(rows.start - EVERY_PX * HALO, 0), min(rows.stop + EVERY_PX * HALO, grid.height)

@@ -74,21 +74,22 @@ class WeightsFile:
         """Travel with the content of the file, which other machines may lack."""
         return _weights_there, (self.seal, self.weights, self.device, self.path.read_bytes())
 
-    def _check(self) -> None:
-        if describe_weights(self.path).about[SEAL] != self.seal:
+    def _described(self) -> Description:
+        described = describe_weights(self.path)
+        if described.about[SEAL] != self.seal:
             raise WeightsError(f"the weights {self.path} have changed since the survey began; start it again")
+        return described
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load_reader(self) -> TemporalReader | None:
         """Read the temporal reader; None where the weights have none."""
-        self._check()
-        return None if describe_weights(self.path).reader is None else load_reader(self.path)
+        described = self._described()
+        return None if described.reader is None else load_reader(self.path, described)
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
         """Read the network."""
-        self._check()
-        return load_weights(self.path).on(self.device)
+        return load_weights(self.path, self._described()).on(self.device)
 
 
 @cache

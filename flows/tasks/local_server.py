@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import os
 import secrets
-import shutil
 import socket
 import sqlite3
+import stat
 import subprocess
 import sys
 import threading
@@ -23,7 +23,8 @@ from typing import Any, cast
 from urllib.parse import quote
 
 from spectralzoom.flows.terminal.processes import cache_folder, place_pages
-from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.pipeline.errors import ArchiveError, SettingsError
+from spectralzoom.storage.whole_files import aside, check_no_link, files_in, remove, write_new
 
 HOST = "127.0.0.1"
 STARTED_WITHIN_S, ENDED_WITHIN_S, SENT_WITHIN_S, ANSWERED_WITHIN_S = 120.0, 10.0, 10.0, 5.0
@@ -49,12 +50,13 @@ class ServerUnavailable(SettingsError):  # noqa: N818 - a survey runs without it
 def configured(home: Path, usual: Mapping[str, Any] = QUIET, **own: Any) -> Iterator[None]:
     """Configure Prefect for a block, which passes it on to its processes: ``usual``, with ``home`` for its files.
 
-    Settings of the user are kept, but for ``own``.
+    Settings of the user are kept, but for ``own``. Raises as `close_folder`.
     """
     is_chosen = CONSOLE in os.environ
     os.environ.setdefault(CONSOLE, "CRITICAL")  # Prefect reads this one from the environment alone, at its import
     from prefect.settings import temporary_settings
 
+    close_folder(home)
     try:
         with temporary_settings(own | {"flows.heartbeat_frequency": None}, {**usual, "home": home}):
             yield
@@ -153,15 +155,39 @@ def server_answers() -> bool:
 
 
 def private_files(home: Path) -> str:
-    """Create a folder closed to other users, with a password and a database; return the password."""
-    home.mkdir(mode=0o700, parents=True, exist_ok=True)
-    home.chmod(0o700)
+    """Create a folder closed to other users, with a password and a database; return the password.
+
+    Others may know or have written the password of a folder that was open to them: it gets another one. Raises as
+    `close_folder`.
+    """
+    was_closed = close_folder(home)
     password = home / "password"
-    if not password.exists() or not password.read_text(encoding="utf-8").strip():
-        password.write_text(f"spectralzoom:{secrets.token_urlsafe(24)}\n", encoding="utf-8")
+    if not was_closed or not password.exists() or not password.read_text(encoding="utf-8").strip():
+        remove(password)
+        write_new(password, f"spectralzoom:{secrets.token_urlsafe(24)}\n")
     if not (home / "prefect.db").exists():
         copy_tables(home / "prefect.db")
     return password.read_text(encoding="utf-8").strip()
+
+
+def close_folder(home: Path) -> bool:
+    """Make a folder that only this user may open, or close it; return whether it was closed before.
+
+    Raises ArchiveError: it or a file in it is a link, or belongs to another user.
+    """
+    check_no_link(home, home.parent)
+    home.mkdir(mode=0o700, exist_ok=True)
+    descriptor = os.open(home, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        before, user = os.fstat(descriptor), os.geteuid()
+        if before.st_uid == user:
+            os.fchmod(descriptor, 0o700)
+        for name, about in {"": before, **files_in(home)}.items():
+            if stat.S_ISLNK(about.st_mode) or about.st_uid != user:
+                raise ArchiveError(f"{home / name} is a link or belongs to another user; move {home} elsewhere")
+        return stat.S_IMODE(before.st_mode) & 0o077 == 0
+    finally:
+        os.close(descriptor)
 
 
 def copy_tables(database: Path) -> None:
@@ -182,4 +208,6 @@ def copy_tables(database: Path) -> None:
             with closing(sqlite3.connect(full)) as made:
                 made.execute("VACUUM INTO ?", (str(one_file),))
             one_file.replace(tables)
-    shutil.copyfile(tables, database.with_suffix(".part")).replace(database)
+    part = aside(database)
+    write_new(part, tables.read_bytes())
+    part.replace(database)

@@ -27,7 +27,8 @@ class Observer:
     """Callbacks that report what a survey does."""
 
     watch: Callable[[str, str, str, float], None] = lambda *_: None  # name, title, state and progress (0..1) of a stage
-    note: Callable[[str], None] = lambda text: None  # assumptions and warnings
+    note: Callable[[str], None] = lambda text: None  # assumptions
+    warn: Callable[[str], None] = lambda text: None  # warnings about the map, before it is drawn
     say: Callable[[str], None] = lambda text: None  # state of a device before its first line
     log: Callable[[str], None] = lambda text: None  # one line for each finished stage
     carry: Callable[[Callable[[], Any]], Any] = lambda work: work()  # calls the work of a flow
@@ -56,7 +57,11 @@ def current_observer() -> Observer:
         terminal.note(text)
         log_to_run(text)
 
-    return replace(terminal, note=note, log=log_to_run)
+    def warn(text: str) -> None:
+        terminal.warn(text)
+        log_to_run(f"Warning: {text}")
+
+    return replace(terminal, note=note, warn=warn, log=log_to_run)
 
 
 def say_state(flow: Any, flow_run: Any, state: Any) -> None:

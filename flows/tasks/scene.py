@@ -71,11 +71,15 @@ def check_scene_there(scene: str) -> None:
 def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the scene in the light of the settings' sky; arguments, notes and errors as in `_in_clear_light`."""
     scene, notes = _in_clear_light(settings)
-    if settings.source == SIM and settings.sky.started is not None:
-        height = float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
-        if height <= 0:
-            notes += (f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark",)
     return scene.in_light(settings.sky.fraction_of_clear), notes
+
+
+def darkness(settings: Settings) -> tuple[str, ...]:
+    """Return the warning that a simulated field is dark; or nothing."""
+    is_lit = settings.source != SIM or settings.sky.started is None
+    height = 1.0 if is_lit else float(sun_elevation_deg(settings.sky, np.zeros(1))[0])
+    text = f"the sun is {-height:.0f} degrees below the horizon at sky.started: the field is dark"
+    return () if height > 0 else (text,)
 
 
 def _in_clear_light(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
@@ -116,7 +120,9 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         geobox=file.geobox,
     )
     values = map_values(file.class_values)
-    return replace(scene, regridded=file.regridded, content=file.content, pixel_m=file.pixel_m, class_values=values)
+    zero = [name for name, value in zip(file.class_names, file.class_values, strict=True) if value in (0, (0, 0, 0))]
+    more = {"pixel_m": file.pixel_m, "class_values": values, "zero_class": "".join(zero)}
+    return replace(scene, regridded=file.regridded, content=file.content, **more)
 
 
 def open_map(settings: Settings) -> tuple[SceneFile, RasterScene, tuple[str, ...]]:

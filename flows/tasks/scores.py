@@ -17,6 +17,12 @@ def format_prediction(miou: float | None, error: float | None) -> str:
     return format_points(miou) if error is None else f"{format_points(miou)} ± {format_points(error)}"
 
 
+def warnings_of(receipt: Mapping[str, Any]) -> list[str]:
+    """Return the warnings about a run's map; none of a receipt with something else in their place."""
+    found = receipt.get("warnings")
+    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
     """Return ``miou`` and ``overall_accuracy`` of a run's map, 0..1; None without labels."""
     accuracy = receipt.get("accuracy")

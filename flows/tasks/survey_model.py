@@ -51,11 +51,11 @@ class SurveyModel:
         Raises WeightsError: the file is missing, damaged or inconsistent; SettingsError: the machine lacks the device.
         """
         described = describe_weights(path)
-        load = Once(lambda: load_weights(path).on(choose_device(device)))
+        load = Once(lambda: load_weights(path, described).on(choose_device(device)))
         if not planning:
             load()
             if described.reader is not None:
-                load_reader(path)
+                load_reader(path, described)
         return SurveyModel(path, described, load)
 
     @staticmethod
@@ -152,8 +152,8 @@ def beyond_training(
     return found
 
 
-def training_note(found: Sequence[str], path: Path) -> tuple[str, ...]:
-    """Return the note that a scene is unlike the training of weights, with the conditions; or nothing."""
+def training_warning(found: Sequence[str], path: Path) -> tuple[str, ...]:
+    """Return the warning that conditions lie outside of the training of weights; or nothing."""
     advice = "Expect a poorer map; train on such labelled scenes: spectralzoom train DATASET -o my.safetensors"
     return (f"outside of the training data of {path.name}: {'; '.join(found)}. {advice}",) if found else ()
 

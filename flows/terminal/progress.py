@@ -44,6 +44,12 @@ def on_stderr() -> Terminal:
 stderr = on_stderr()
 
 
+def show_warnings(texts: Iterable[str], console: Console) -> None:
+    """Print warnings about a map, one a line."""
+    for text in texts:
+        console.print(f"[yellow]Warning: {escape(text)}[/]", soft_wrap=True)
+
+
 def say(message: str) -> None:
     """Print an error on stderr, as one message."""
     stderr.print(f"[bold red]error[/]: {escape(message)}", highlight=False, soft_wrap=True)

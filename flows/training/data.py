@@ -36,7 +36,6 @@ from spectralzoom.storage.readers.label_files import (
     scene_number,
 )
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_files import SceneFile, load_scene_file
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
@@ -136,7 +135,7 @@ def _scenes(path: str | Path) -> tuple[dict[str, str], dict[str, Path], tuple[Pa
             f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"
             f"{folders_within(folder)}"
         )
-    names = _names([within(folder, image) for image in found.images])
+    names = _names(found.images)
     return (
         {name: str(image) for name, image in names.items()},
         {name: found.labels[image] for name, image in names.items() if image in found.labels},
@@ -271,6 +270,24 @@ def check_taught(dataset: str, taught: Sequence[str], frames: Sequence[str]) -> 
         note = f"no pixel of {list_some(frames)} has a class; correct the labels, or 'unlabelled' in scene.toml"
         note = filled(alike_note(taught[0]), frames) if taught else note
         raise SceneError(f"{dataset}: training needs two or more classes, and {note}")
+
+
+UNNAMED_ZERO = {"class_0": "0", "colour_000000": "[0, 0, 0]"}  # class without a name of its own -> its label
+
+
+def zero_cure(kind: str) -> str:
+    """Return how to say that the label 0 is no class; empty for another class, or one that a scene.toml names."""
+    value = UNNAMED_ZERO.get(kind)
+    return f"if it means unlabelled, write unlabelled = {value} into a {SETTINGS_NAME} beside the scene" * bool(value)
+
+
+def zero_sentence(name: str = "", fraction: float = 0.0) -> str:
+    """Return what label 0 stands for: a class of that name, or unlabelled; empty where all labels are others."""
+    share = f"{fraction:.1%} of the pixels"
+    if name:
+        return "; ".join(filter(None, (f"label 0 is the class {name}: {share}", zero_cure(name))))
+    way = f"a table [classes] in a {SETTINGS_NAME} can name it: NAME = 0"
+    return f"label 0 is no class, {share} are unlabelled; {way}" if fraction else ""
 
 
 EMPTY = "{scenes} without any value left out: {names}"

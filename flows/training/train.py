@@ -27,6 +27,7 @@ from spectralzoom.flows.training.data import (
     open_training_data,
     read_farm_name,
     untaught_note,
+    zero_sentence,
 )
 from spectralzoom.flows.training.train_scenes import CAMERA, Scenes, TrainRequest, network_config, observe_all
 from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
@@ -67,6 +68,7 @@ from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from spectralzoom.pipeline.simulator.scenes.farm.land import sun_over_farm
 
+LABEL_ZERO = "label_zero"  # entry in a record
 CORRECTED_SCENES = 4  # labelled scenes, at least, whose classifiers a network corrects
 
 
@@ -290,7 +292,13 @@ class Learner:
             "data": data.law,
             **({CLASS_VALUES: list(values)} if values else {}),
             TRAINED_ON: asdict(_trained_on(data, taught, request.flags.min_exposure_ms)),
-            "split": taught.split | {"validation": self.scenes.validation.keys, "held_out": list(data.held_out)},
+            "split": {
+                **taught.split,
+                "validation": self.scenes.validation.keys,
+                "validated": [*self.scenes.validation.content],
+                "held_out": list(data.held_out),
+            },
+            **({} if data.files is None else {LABEL_ZERO: taught.label_zero}),
             "settings": asdict(request.flags.settings),
             "camera": asdict(CAMERA),
             CAPTURED: request.captured,
@@ -338,6 +346,8 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     with one_after_the_other(console) as report:
         record = train_weights(request, report, lambda note: show_text(f"note: {note}", console))
     _print_figures(record, request, console)
+    if text := zero_sentence(**record.get(LABEL_ZERO, {})):
+        show_text(text, console)
     return record
 
 

@@ -19,7 +19,7 @@ from spectralzoom.models.training.capture_augmentation import REFERENCE_MS
 from spectralzoom.models.training.examples import Example, normalised, observe_scene, untaught_classes
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.pipeline.geometry.camera import LineCamera
-from spectralzoom.pipeline.geometry.grid import SceneGrid
+from spectralzoom.pipeline.geometry.grid import UNLABELLED, SceneGrid
 from spectralzoom.pipeline.simulator.scenes.built_in import built_in_laws
 from spectralzoom.pipeline.simulator.scenes.scene import RasterScene
 
@@ -56,6 +56,7 @@ class Common:
     patch: int
     wavelength_nm: NDArray[np.float64]
     values: tuple[int, ...] = ()  # numbers of the classes in the label files, where maps can have them
+    zero_class: str = ""  # class of the number 0, or of black, in the label files
 
     def check(self, scene: RasterScene) -> None:
         """Raise SceneError where a scene has other classes or bands."""
@@ -88,6 +89,15 @@ class Scenes:
     def untaught(self) -> tuple[int, ...]:
         """Return the classes without a training pixel, ascending."""
         return untaught_classes(self.train.examples, len(self.common.names))
+
+    @property
+    def label_zero(self) -> dict[str, Any]:
+        """Return the class of label 0, empty if it is none, and its fraction of the pixels, else the unlabelled one."""
+        zero = self.common.zero_class
+        number = self.common.names.index(zero) if zero else UNLABELLED
+        labels = [one.labels[: one.shape[0], : one.shape[1]] for one in self.train.examples]
+        count = sum(np.count_nonzero(one == number) for one in labels)
+        return {"name": zero, "fraction": count / sum(one.size for one in labels)}
 
     @property
     def joined(self) -> Scenes:
@@ -168,7 +178,8 @@ def _common(request: TrainRequest, scene: RasterScene, scenes: int) -> Common:
     )
     basis = SpectralBasis.spanning(scene.wavelength_nm, most)
     patch = patch_of(scene.shape, built_in=built_in)
-    return Common(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm, scene.class_values)
+    classes = scene.class_names, scene.class_colours
+    return Common(basis, *classes, patch, scene.wavelength_nm, scene.class_values, scene.zero_class)
 
 
 def patch_of(shape: tuple[int, int], *, built_in: bool) -> int:

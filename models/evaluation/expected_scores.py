@@ -26,11 +26,13 @@ from spectralzoom.models.evaluation.metrics import Floats, iou_per_class, labell
 PRESENT = (-4.33, 2.0, 2.38, 0.94, 2.45)  # least errors of the mIoU of scans of 32 validation scenes
 FULL_MS = 100.0  # exposure of logarithm 0
 FEW_PX = 10.0  # pixels of other classes that the expected IoU of a class adds
-SURE_PX = 2000.0  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
+SURE_PX = 2000  # of a class: a scene with so many counts in full; fewer in all scenes shrink the bias
+ENOUGH_PX = SURE_PX  # pixels with a class that an expected score needs
 SMALL_PX, SMALL_ERROR = 300.0, 0.3  # the IoU of a class of so few pixels has half of this error
 LEAST_IOU = 0.005  # IoU is kept as far from 0 and 1
 ROUNDING_MS = 0.05  # of exposures, to a tenth of a millisecond
 LEAST_ERROR = 0.005  # of mIoU: lower bound of the estimate from a few scenes
+LARGEST_ERROR = 0.5  # largest standard deviation of a value between 0 and 1
 
 
 def expected_counts(swaths: Iterable[NDArray[np.floating]], classes: int) -> Floats:
@@ -76,7 +78,7 @@ def expected_score(counts: Floats, bias: Floats, error: float, step: int, exposu
     miou = float(there @ iou / number)
     unsure = there * (1 - there) * (iou - miou) ** 2 + there * (SMALL_ERROR * SMALL_PX / (SMALL_PX + area)) ** 2
     off = math.hypot(error, math.sqrt(float(unsure.sum())) / number)
-    return ExpectedScore(miou, off, np.where(there > 0.5, iou, np.nan))
+    return ExpectedScore(miou, min(off, LARGEST_ERROR), np.where(there > 0.5, iou, np.nan))
 
 
 @dataclass(frozen=True)
@@ -150,9 +152,10 @@ class MapScores:
         }
 
     def expected(self, counts: Floats, step: int, exposure_ms: float) -> ExpectedScore | None:
-        """Return the expected score of a map by its `expected_counts`; None for a scan beyond the record."""
+        """Return the expected score of a map by `expected_counts`; None beyond the record, or below `ENOUGH_PX`."""
         within = self.exposures_ms[0] - ROUNDING_MS <= exposure_ms <= self.exposures_ms[-1] + ROUNDING_MS
-        if step not in self.steps or not within or len(counts) != self.bias.shape[-1]:
+        enough = len(counts) == self.bias.shape[-1] and round(counts.sum()) >= ENOUGH_PX
+        if step not in self.steps or not within or not enough:
             return None
         row = self.steps.index(step)
         at = math.log(exposure_ms)

@@ -23,6 +23,7 @@ PARTS = 8  # training scenes to leave out in turn; fewer scenes are cut into blo
 DIFFERENCE = 0.05  # least standard deviation of the means of training scenes
 EDGES = np.geomspace(0.5, 1e9, 500)  # of the histogram of products; half a component is not told from 0
 DIGITS = 5  # decimals of the statistics in a description
+MOST = 1e12  # of statistics in a description
 UNLIKE = 2.0  # times the largest distance of a training scene
 
 Floats = NDArray[np.floating]
@@ -95,7 +96,8 @@ class TrainingSpectra:
         axes, centre, spread = (np.asarray(content[name], np.float64) for name in ("axes", "centre", "spread"))
         mean, spectra = map(float, content["limits"])
         fits = axes.shape == (columns, *centre.shape) and spread.shape == centre.shape
-        if not fits or not min(mean, spectra, *spread) > 0:
+        known = np.concatenate([axes.ravel(), centre, spread, [mean, spectra]])
+        if not fits or not min(mean, spectra, *spread) > 0 or not (np.abs(known) < MOST).all():
             raise ValueError(f"spectra of axes {axes.shape}, centre {centre.shape} and spread {spread.shape}")
         return TrainingSpectra(axes, centre, spread, (mean, spectra))
 

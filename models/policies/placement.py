@@ -6,7 +6,7 @@ This is evaluation only: it needs labels and the whole scene at full resolution.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -59,16 +59,19 @@ class ReadTwice:
 
 @dataclass(frozen=True)
 class CascadeTable:
-    """Mean losses of validation scenes, for each threshold of the expected gain."""
+    """Mean losses and readings of validation scenes, for each threshold of the expected gain."""
 
     least_gain: tuple[float, ...]  # ascending
     loss: tuple[float, ...]  # mIoU of the map read in full minus that of the part
-    fraction: tuple[float, ...]  # of the patches that are read in full
+    fraction: tuple[float, ...]  # of the patches that are read in full, median of the scenes
+    fewest: tuple[float, ...] = ()  # of the scene that needs fewest; empty if not known
+    most: tuple[float, ...] = ()
 
     @staticmethod
     def read(content: Mapping[str, Any]) -> CascadeTable:
         """Read what `dataclasses.asdict` gave for a record."""
-        return CascadeTable(*(tuple(map(float, content[name])) for name in ("least_gain", "loss", "fraction")))
+        known = (one.name for one in fields(CascadeTable) if one.name in content)
+        return CascadeTable(**{name: tuple(map(float, content[name])) for name in known})
 
     @staticmethod
     def of_overview() -> CascadeTable:
@@ -86,7 +89,8 @@ class CascadeTable:
                 chosen = one.gain >= least
                 losses[row, number] = mean_iou(every) - mean_iou(one.counts(chosen, classes))
                 fractions[row, number] = chosen.mean()
-        return CascadeTable(LEAST_GAINS, *(tuple(rows.mean(axis=1).tolist()) for rows in (losses, fractions)))
+        rows = (losses.mean(axis=1), np.median(fractions, axis=1), fractions.min(axis=1), fractions.max(axis=1))
+        return CascadeTable(LEAST_GAINS, *(tuple(row.tolist()) for row in rows))
 
     def within(self, loss: float) -> float | None:
         """Return the highest threshold within a loss; None where all lose more.
@@ -99,6 +103,7 @@ class CascadeTable:
         ends = slice(rows - 1, rows + 1)
         return float(np.exp(np.interp(loss, self.loss[ends], np.log(self.least_gain[ends]))))
 
-    def fraction_at(self, least_gain: float) -> float:
-        """Return the fraction of patches that a threshold reads, interpolated over logarithms of the gain."""
-        return float(np.interp(np.log(least_gain), np.log(self.least_gain), self.fraction))
+    def fractions_at(self, least_gain: float) -> list[float]:
+        """Return usual, fewest and most patches that a threshold reads [fraction], by logarithms of the gain."""
+        columns = (self.fraction, self.fewest or self.fraction, self.most or self.fraction)
+        return [float(np.interp(np.log(least_gain), np.log(self.least_gain), column)) for column in columns]

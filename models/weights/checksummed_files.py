@@ -88,7 +88,7 @@ def read_tensors(
         hashes = {name: value for name, value in about[TENSORS].items() if wanted(name)}
         for name in sorted(hashes.keys() | tensors.keys()):
             if name not in tensors or hash_of(tensors[name]) != hashes.get(name):
-                raise ValueError(f"it is damaged: tensor {name} is not what was written")
+                raise ValueError(f"it is damaged, or changed while it was read: tensor {name} is not what was written")
     return tensors
 
 

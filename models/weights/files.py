@@ -20,6 +20,7 @@ from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
 from spectralzoom.models.network.sizes import SegmenterConfig, TemporalSizes
 from spectralzoom.models.network.spectral import Normalisation, SpectralBasis, checked_wavelengths, project
 from spectralzoom.models.weights.checksummed_files import key_of, read_about, read_tensors, refusing, write_checksummed
+from spectralzoom.models.weights.ranges import check_ranges, check_record
 from spectralzoom.pipeline.errors import WavelengthError, WeightsError
 from spectralzoom.pipeline.readings import readings_alone
 from spectralzoom.pipeline.signal.components import Components
@@ -221,11 +222,11 @@ def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tens
     write_checksummed(out, {**described.about, "keys": keys, part: about}, kept | added)
 
 
-def load_reader(weights: Path) -> TemporalReader:
-    """Load the temporal reader of weights. WeightsError: their file has none, or it is damaged."""
+def load_reader(weights: Path, described: Description | None = None) -> TemporalReader:
+    """Load the temporal reader of weights, as ``described``. WeightsError: as `load_weights`, or none is there."""
     import torch
 
-    described = describe_weights(weights)
+    described = described or describe_weights(weights)
     if described.reader is None:
         raise WeightsError(
             f"{weights} has no temporal reader; train one with: spectralzoom train DATASET --train-temporal "
@@ -242,17 +243,17 @@ def load_reader(weights: Path) -> TemporalReader:
     return reader.eval()
 
 
-def load_weights(path: Path) -> Weights:
-    """Read a file of `save_weights`; no pickle is involved.
+def load_weights(path: Path, described: Description | None = None) -> Weights:
+    """Read a file of `save_weights`, as ``described``; no pickle is involved.
 
-    Raises WeightsError: it is missing or of another format, or a tensor is damaged, does not fit the config, or has a
-    value that is not finite.
+    Raises WeightsError: it is missing or of another format, or a tensor is damaged or of other weights than described,
+    does not fit the config, or has a value that is not finite.
     """
     import torch
 
     from spectralzoom.models.network.segmenter import Segmenter
 
-    described = describe_weights(path)
+    described = described or describe_weights(path)
     config = described.config
     with torch.device("meta"):
         network = Segmenter(config)
@@ -300,6 +301,8 @@ def describe_weights(path: Path) -> Description:
                 f"a basis of {basis.columns} columns from {basis.low_nm:g} to {basis.high_nm:g} nm, expected "
                 f"{config.columns} of them between ascending wavelengths"
             )
+        check_record(record, len(config.parts))
+        check_ranges(about.get(MAP_SCORES) or {})
         keys = about["keys"]
         map_scores = MapScores.read(about[MAP_SCORES]) if MAP_SCORES in about else None
         reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None

@@ -99,7 +99,7 @@ class Recording:
     wavelength_nm: Floats  # (band,)
     fwhm_nm: Floats | None = None  # (band,)
     notes: tuple[str, ...] = ()  # assumptions
-    light: tuple[str, ...] = ()  # identity of the numbers: hashes of manifests, or sizes and times of files
+    light: tuple[str, ...] = ()  # identity of the numbers: hashes of manifests, or of files
     acquired: str | None = None  # when the first lines were captured, a day or a moment in UTC, ISO 8601
     pixel_m: float | None = None  # side of a pixel on the ground
     geobox: GeoBox | None = None  # place of the field

@@ -38,7 +38,6 @@ from spectralzoom.pipeline.rig.capture_runner import CaptureJournal, CaptureRunn
 from spectralzoom.pipeline.rig.device_settings import SurveyRig
 from spectralzoom.pipeline.rig.drivers import RigDevices
 from spectralzoom.pipeline.rig.transports import DeviceRefused, StateUnknown
-from spectralzoom.pipeline.signal.calibrate import full_scale_notes
 from spectralzoom.pipeline.simulator.effects.effect import Chosen, Effect
 from spectralzoom.pipeline.simulator.simulated import SimulatedSource
 from spectralzoom.pipeline.source import RECORD, Line, References
@@ -120,7 +119,9 @@ class RigSource:
         source = self.keeping(self.keep(kept))
         with source.session():
             yield source
-        (kept / RECORD).write_text(json.dumps(source.record, indent=1) + "\n")
+        (kept / RECORD).unlink(missing_ok=True)
+        with (kept / RECORD).open("x") as file:  # a new file, so that no link is followed
+            file.write(json.dumps(source.record, indent=1) + "\n")
 
     @contextmanager
     def session(self) -> Iterator[CaptureRunner]:
@@ -221,9 +222,15 @@ class RigSource:
             )
         exposure_ms = exposing(self.camera, sweep).exposure_ms
         dark, white = frames["dark"], frames["white"]
-        whole, notes = as_references(dark, white, white_reference=self.rig.white_reference, exposure_ms=exposure_ms)
+        whole, notes = as_references(
+            dark,
+            white,
+            white_reference=self.rig.white_reference,
+            exposure_ms=exposure_ms,
+            full_scale_dn=self.camera.full_scale_dn,
+        )
         self._check_size(whole.dark.shape, folder)
-        for note in (*notes, *full_scale_notes(whole.white, self.camera.full_scale_dn)):
+        for note in notes:
             self.note(f"{folder}: {note}")
         return whole
 

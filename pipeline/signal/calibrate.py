@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from spectralzoom.pipeline.errors import PoseError, RigError, ShapeError
-from spectralzoom.pipeline.geometry.mirror import mirror_throughput
+from spectralzoom.pipeline.errors import PoseError, RigError, SceneError, ShapeError
+from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, mirror_throughput
 from spectralzoom.pipeline.readings import SIGMA_OF_MEDIAN
 from spectralzoom.pipeline.source import References
 
@@ -23,6 +23,7 @@ LEAST_RESPONSE = 0.1  # of the neighbours'
 ODD_SIGMAS, ODD_FRACTION = 8.0, 0.2  # off the window, in spreads of the band, and beyond the nearest neighbours
 WINDOW, NEAR = 15, 7  # neighbouring samples compared; nearest neighbours, the element among them
 MOST_BAD = 0.05  # of all elements, or one column; more mean that the frames are wrong, not the detector
+LEAST_LIGHT = 2.0  # sum of white above dark, over that of white below dark
 LEAST_NOISE_DN = 1.0  # dark frames are whole numbers: a smaller spread means nothing
 BANDS_FOR_COLUMN = 8  # fewer bands cannot separate an odd element from an odd column
 
@@ -132,7 +133,7 @@ def calibrate(
     """Return scene values ``(raw - dark) / (white - dark) * white_reference / throughput``, and their validity.
 
     ``raw`` is (line, sample, band) uint16 DN. ``position`` (line, 2) mirror X and Y is needed for references with
-    ``by_mirror``; a line without a finite position is then NaN. ``exposure_ms`` (line,) is needed for references with
+    ``by_mirror``; a line without one on the mirror is then NaN. ``exposure_ms`` (line,) is needed for references with
     their own: values are multiplied by the exposure of the references over that of the line. A bad element takes the
     value between the nearest good samples of its line and band, at most 8 away, linear in sample. It is not filled if
     more than half of its sample's bands are bad.
@@ -150,7 +151,7 @@ def calibrate(
     sample), or (line, sample, band) if some but not all bands of a sample are out.
 
     Raises ShapeError: the references or the positions do not fit the lines.
-    Raises PoseError: positions are needed and missing, or one lies beyond the mirror's rim.
+    Raises PoseError: positions are needed and missing.
     """
     elements = _judged(raw, references)
     gain = line_gain(elements.references, position, exposure_ms)
@@ -163,21 +164,24 @@ def calibrate(
 def line_gain(references: References, position: ArrayLike | None, exposure_ms: ArrayLike | None) -> Floats32 | None:
     """Return the factor of each line for its exposure and the mirror's throughput, (line,); None if there is none.
 
-    Raises PoseError: mirror positions are needed and missing, or one lies beyond the rim. Raises ShapeError: exposures
-    are needed and missing.
+    It is NaN without an exposure above 0 ms or a position on the mirror. Raises PoseError: mirror positions are needed
+    and missing. Raises ShapeError: exposures are needed and missing.
     """
     gain: Floats | None = None
     if references.by_mirror:
         if position is None:
             raise PoseError("the white frame was taken at rest (by_mirror), which needs the lines' mirror positions")
         at = np.asarray(position, np.float64)
-        known = np.isfinite(at).all(axis=1)
+        known = np.hypot(*at.T) <= 1 + RIM_SLACK["float64"]
         gain = np.full(len(at), np.nan)
         gain[known] = 1 / mirror_throughput(at[known])
     if references.exposure_ms is not None:
         if exposure_ms is None:
             raise ShapeError("the white frame has its own exposure, which needs those of the lines")
-        gain = (1.0 if gain is None else gain) * (references.exposure_ms / np.asarray(exposure_ms, np.float64))
+        exposed = np.asarray(exposure_ms, np.float64)
+        known = np.isfinite(exposed) & (exposed > 0)
+        ratio = np.divide(references.exposure_ms, exposed, where=known, out=np.full(exposed.shape, np.nan))
+        gain = ratio if gain is None else gain * ratio
     return None if gain is None else gain.astype(np.float32)
 
 
@@ -265,11 +269,29 @@ def find_bad_elements(dark: NDArray[np.floating], white: NDArray[np.floating]) -
     return bad
 
 
-def full_scale_notes(white: NDArray[np.floating], full_scale_dn: float) -> list[str]:
-    """Return a note where elements of a white frame are at the converter's full scale."""
-    full = float(np.mean(np.abs(white - full_scale_dn) < 0.5))
-    what = f"the white frame is at full scale in {100 * full:.2g} % of the elements"
-    return [f"{what}: if it is saturated, values there are too high, and a darker one is needed"] if full else []
+def check_frames(
+    where: str, dark: NDArray[np.floating], white: NDArray[np.floating], full_scale_dn: float | None = None
+) -> list[str]:
+    """Return a note where elements of a white frame are at the full scale of a converter; ``where`` begins messages.
+
+    This is that of the camera, or the largest number of 8 to 16 bits. Raises SceneError: the white frame has no light
+    beside the dark one, as where they are exchanged.
+    """
+    known = np.isfinite(white) & np.isfinite(dark)
+    light = np.subtract(white, dark, where=known, out=np.zeros(white.shape))
+    if not np.maximum(light, 0).sum() > LEAST_LIGHT * np.maximum(-light, 0).sum():
+        brighter = 100 * np.mean(light > 0)
+        raise SceneError(
+            f"{where}the white frame is not brighter than the dark one ({brighter:.0f} % of its elements are); "
+            "exchange them if they are swapped, or give others"
+        )
+    most = float(white[known].max())
+    scales = [*(2.0**bits - 1 for bits in range(8, 17)), *([] if full_scale_dn is None else [full_scale_dn])]
+    if not any(abs(most - scale) < 0.5 for scale in scales):
+        return []
+    full = 100 * float(np.mean(white[known] >= most - 0.5))
+    what = f"{where}the white frame is at full scale ({most:g} DN) in {full:.2g} % of the elements"
+    return [f"{what}: if it is saturated, values there are too high, and a darker one is needed"]
 
 
 def _off_neighbours(response: Floats, noise: Floats) -> Bools:

@@ -30,16 +30,16 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 from urllib.parse import quote
 
 import numpy as np
 
-from spectralzoom.pipeline.errors import RigError, disk_advice, list_some
+from spectralzoom.pipeline.errors import PipelineError, RigError, disk_advice, list_some
 from spectralzoom.pipeline.rig.transports import NotKept
 from spectralzoom.pipeline.source import Line
 from spectralzoom.storage.store import plain
-from spectralzoom.storage.whole_files import sync
+from spectralzoom.storage.whole_files import make_folder, open_own, read_own, sync, write_new
 
 SYNC_LINES = 64
 MOST_NAMED = 8
@@ -58,7 +58,7 @@ class Spool:
         self._head = head
         self._seed = zlib.crc32(head)
         self._size = _FACTS.size + _CRC.size + 2 * shape[0] * shape[1]  # of a record
-        self._file: BinaryIO | None = None
+        self._file: IO[Any] | None = None
 
     @classmethod
     def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
@@ -69,9 +69,9 @@ class Spool:
         facts = {"samples": samples, "bands": bands, "header": plain(dict(header))}
         spool = cls(folder / f"{name}.lines", json.dumps(facts).encode() + b"\n", (samples, bands))
         with _refusals(spool.path, 0):
-            folder.mkdir(parents=True, exist_ok=True)
-            if not spool.path.exists():
-                spool.path.write_bytes(spool._head)
+            make_folder(folder, folder.parents[1])
+            if not os.path.lexists(spool.path):
+                write_new(spool.path, spool._head)
                 for named in (spool.path, folder, folder.parent, folder.parent.parent):  # lines need their file's name
                     sync(named)
             spool._recover()
@@ -101,7 +101,7 @@ class Spool:
         data = np.ascontiguousarray(line.data, "<u2").data.cast("B")  # no copy: it is written and summed once
         with _refusals(self.path, self.count):
             if self._file is None:
-                self._file = self.path.open("ab", buffering=0)
+                self._file = open_own(self.path, "ab", 0)
             try:
                 for part in (facts + self._crc(facts, data), data):
                     write_all(self._file.fileno(), part)
@@ -122,7 +122,7 @@ class Spool:
         """Yield the lines in blocks of `SYNC_LINES`; the last may be shorter. A damaged line is not valid."""
         nothing = np.zeros((self.samples, self.bands), np.uint16)
         unknown = (float("nan"),) * 4
-        with self.path.open("rb") as file:
+        with open_own(self.path) as file:
             file.seek(len(self._head))
             for first in range(0, self.count, SYNC_LINES):
                 read = [self._line(n, file.read(self._size)) for n in range(first, min(first + SYNC_LINES, self.count))]
@@ -139,13 +139,13 @@ class Spool:
 
     def _recover(self) -> None:
         """Count the lines, and cut off the first damaged one behind the last sync with all that follows it."""
-        with self.path.open("rb") as file:
+        with open_own(self.path) as file:
             head = file.readline(_LONGEST_HEADER)
             file.seek(len(self._head))
             records = enumerate(iter(lambda: file.read(self._size), b""))
             whole = [self._line(number, record) is not None for number, record in records]
         if head != self._head:
-            with self.path.open("r+b", buffering=0) as file:
+            with open_own(self.path, "r+b", 0) as file:
                 write_all(file.fileno(), self._head)
         if not any(whole):  # a header that was begun, and nothing that belongs to it
             whole = []
@@ -173,7 +173,7 @@ class Spool:
         if self._file is not None:
             self._file.close()
             self._file = None
-        os.truncate(self.path, len(self._head) + self.count * self._size)
+        _cut(self.path, len(self._head) + self.count * self._size)
 
 
 def line_values(numbers: Sequence[int]) -> str:
@@ -193,12 +193,17 @@ def write_all(descriptor: int, content: bytes | memoryview) -> None:
         view = view[os.write(descriptor, view) :]
 
 
+def _cut(path: Path, size: int) -> None:
+    with open_own(path, "r+b", 0) as file:
+        file.truncate(size)
+
+
 @contextmanager
 def _refusals(path: Path, lines: int) -> Iterator[None]:
     """Turn a disk's refusal into a RigError that says how many lines are kept."""
     try:
         yield
-    except RigError:
+    except PipelineError:
         raise
     except OSError as error:
         raise RigError(
@@ -230,9 +235,9 @@ class FetchedFiles:
                 reached, crc32, count = _agreeing(path)
                 if path.exists() and path.stat().st_size > reached:
                     LOG.warning("%s: cut off at byte %d: the rest is damaged or was not synced", path, reached)
-                    os.truncate(path, reached)
+                    _cut(path, reached)
                 if _sums_of(path).exists():
-                    os.truncate(_sums_of(path), count * _SUM.size)
+                    _cut(_sums_of(path), count * _SUM.size)
                 self._crc32[name] = crc32
             return path.stat().st_size if path.exists() else 0
 
@@ -241,9 +246,9 @@ class FetchedFiles:
         path = self._path(name)
         if not self.size(name):
             return b""
-        with _unread(path), path.open("rb") as file:
+        with _unread(path), open_own(path) as file:
             file.seek(start)
-            return file.read(max(stop - start, 0))
+            return bytes(file.read(max(stop - start, 0)))
 
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end. Raises NotKept: the disk refuses; a part that was written is removed again."""
@@ -251,14 +256,14 @@ class FetchedFiles:
         before = self.size(name)
         try:
             if not before:
-                self.folder.mkdir(parents=True, exist_ok=True)
-            with path.open("ab", buffering=0) as file:
+                make_folder(self.folder, self.folder.parent)
+            with open_own(path, "ab", 0) as file:
                 write_all(file.fileno(), data)
                 if _is_note(name):
                     os.fdatasync(file.fileno())
             if data and not _is_note(name):
                 crc32 = zlib.crc32(data, self._crc32[name])
-                with _sums_of(path).open("ab", buffering=0) as file:
+                with open_own(_sums_of(path), "ab", 0) as file:
                     write_all(file.fileno(), _SUM.pack(before + len(data), crc32))
                 self._crc32[name] = crc32
             if not before:
@@ -266,7 +271,7 @@ class FetchedFiles:
         except OSError as error:
             self._crc32.pop(name, None)  # what the disk took of it is compared next time
             with suppress(OSError):
-                os.truncate(path, before)
+                _cut(path, before)
             raise NotKept(
                 f"cannot keep byte {before} of {name} in {self.folder}: {format_disk_error(error)}; the {before} bytes "
                 "before it are kept, and the camera still has the file"
@@ -291,8 +296,8 @@ def _agreeing(path: Path) -> tuple[int, int, int]:
     """Return up to which byte a file agrees with its sums, the CRC-32 of these bytes, and the number of such sums."""
     reached, crc32, count = 0, 0, 0
     with suppress(FileNotFoundError):
-        sums = _sums_of(path).read_bytes()
-        with path.open("rb") as file:
+        sums = read_own(_sums_of(path))
+        with open_own(path) as file:
             for to, expected in _SUM.iter_unpack(sums[: len(sums) // _SUM.size * _SUM.size]):
                 at, found = reached, crc32
                 while at < to and (data := file.read(min(to - at, _BLOCK))):

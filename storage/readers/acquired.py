@@ -9,16 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-# in order of trust, without case, signs and prefix; the first with a day counts, and any of them may add the time
+# whole keys without case and signs, in order of trust; the first with a day counts, and any of them may add the time
 NAMES = (
     *("acquisitiondatetime", "acquisitionstarttime", "acquisitiontime", "acquisitiondate", "dateacquired", "acquired"),
-    *("datetimeoriginal", "datetimedigitized", "timecoveragestart", "startdatetime", "datatakesensingstart"),
+    *("emitacquisitionstarttime", "datetimeoriginal", "exifdatetimeoriginal", "datetimedigitized"),
+    *("exifdatetimedigitized", "timecoveragestart", "ncglobaltimecoveragestart", "startdatetime"),
+    *("datatakesensingstart", "datatake1datatakesensingstart"),
     *("sensingstart", "sensingtime", "sensingdate", "capturetime", "capturedate", "observationtime", "observationdate"),
     *("flightdate", "productstarttime", "starttime", "scenecentertime", "time", "datetime"),
     *("timestamp", "imagedate", "date"),
-    *("tifftagdatetime", "exifdatetime"),  # of the image, or of its last change
 )
-_PREFIX = re.compile(r"^(ncglobal|exif(?=datetime[od])|emit|datatake1|spacecraft)")
+CHANGED = ("tifftagdatetime", "exifdatetime")  # of the image, or of its last change
 _LABEL = re.compile(r"([A-Za-z ]+)(\([a-z/. -]+\))?:\s*(?=\d)")  # DATE(yyyy-mm-dd): or UTC TIME:
 _FIRST_YEAR = 1971  # a clock that was never set says 1970 or 0
 
@@ -37,9 +38,10 @@ def acquired_of(fields: Mapping[str, object], now: datetime | None = None) -> Ac
     1971 or after ``now`` (None: the clock), are left out with a note. A time without a zone is taken as UTC.
     """
     latest = (now or datetime.now(UTC)).date() + timedelta(days=1)
-    known = {_PREFIX.sub("", re.sub(r"[\W_]", "", key.lower())): key for key in fields}
+    known = {re.sub(r"[\W_]", "", key.lower()): key for key in fields}
     day, clock, where, notes = None, None, "", list[str]()
-    for key in (known[name] for name in NAMES if name in known):
+    for name in (name for name in (*NAMES, *CHANGED) if name in known):
+        key = known[name]
         text = _text_of(fields[key])
         if text.lower() in ("", "unknown", "none", "null", "nan", "nat", "n/a", "-"):
             continue
@@ -53,6 +55,8 @@ def acquired_of(fields: Mapping[str, object], now: datetime | None = None) -> Ac
             day, clock, where = found, at or clock, key
         elif found is None:
             clock = clock or at
+        elif day is not None and name not in CHANGED and abs(found - day) > timedelta(days=1):
+            notes.append(f"{key} states another day, {found}, than {where}, which counts")
     if day is None:
         return Acquired(None, tuple(notes))
     moment = None if clock is None else datetime.combine(day, clock, clock.tzinfo or UTC).astimezone(UTC)
@@ -80,6 +84,8 @@ def _read(text: str, zone: str, latest: date) -> tuple[date | None, time | None]
         body = re.sub(r"^(\d\d)-(\d\d)-(\d{4})", r"\3-\2-\1", body)
     if re.match(r"\d\d:", body):
         return None, time.fromisoformat(f"{body}{'Z' * words.startswith('UTC')}{zone}")
+    if not re.match(r"\d{4}-\d\d-\d\d|\d{8}", body):
+        raise ValueError("it is no whole day such as 2022-07-01")
     has_clock = ":" in body or "T" in body
     moment = datetime.fromisoformat(f"{body}{zone if has_clock else ''}")
     day = moment.date()

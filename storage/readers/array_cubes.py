@@ -27,11 +27,12 @@ from spectralzoom.storage.readers.band_facts import (
     GOOD_BANDS,
     WIDTHS,
     Bands,
-    are_wavelengths,
+    axis_hint,
     bad_bands,
     bands_of_fields,
     is_spectral,
     letters,
+    unit_of,
 )
 from spectralzoom.storage.readers.cube_sources import (
     BLOCK_LINES,
@@ -44,6 +45,7 @@ from spectralzoom.storage.readers.cube_sources import (
 )
 from spectralzoom.storage.readers.packing import CODED, ENDS, FILLS, Turn, packing_of, shown, unpacking, values_of
 from spectralzoom.storage.readers.places import Place, place_of_dataset
+from spectralzoom.storage.readers.user_files import files_below
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,6 +58,7 @@ BANDS = ("band", "bands", "wavelength", "wavelengths", "wavelength_3d", "channel
 
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 MOST_UNEVEN = 16  # times that a picture is longer than wide
+_FILL_WORDS = "fillvalue|(data)?ignorevalue|nodata(value)?"
 _SHOWN = 5  # arrays in a note
 
 
@@ -70,6 +73,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
     ending = path.suffix.lower()
     guard = partial(reading, path, "Zarr" if path.is_dir() else "NetCDF or HDF5" if ending in HDF_ENDINGS else ending)
     with guard():
+        files = tuple(files_below(path)) if path.is_dir() else (path,)
         arrays, about = list_arrays(path)
         name, notes = _chosen(arrays, variable, path, (2, 3) if labels else (3, 2))
         array = arrays[name]
@@ -81,14 +85,15 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         dims = [dim or f"axis {at}" for at, dim in enumerate((array.dims or DIMS)[: array.ndim])]
         near = _in_scope(arrays, name)
         stated = {**about, **array.attrs}
-        bands, bad, doubts = _bands_of(name, stated, dims[order[2]] if len(order) == 3 else "", near, count)
+        axis = dims[order[2]] if len(order) == 3 else ""
+        bands, bad, doubts = _bands_of(name, stated, axis, near, () if named else array.shape, count)
         geobox, of_place = _place_of(name, dims, order, near, stated)
         time, of_time = _time_of(near)
         acquired = acquired_of({**stated, **time})
         packing = packing_of(array.attrs, array.where, count)
         unpack, nodata = unpacking(packing, array.dtype.newbyteorder("="))
+        fills = [float(one) for name in FILLS for one in np.ravel(packing.get(name, ()))]
         taken = taken_with(path.name, about, array.attrs)
-        files = tuple(sorted(file for file in path.rglob("*") if file.is_file())) if path.is_dir() else (path,)
     unnamed = [] if named or ending in ARRAY_ENDINGS else ["dims have no names, read as y, x, band"]
     said = [*of_time, *acquired.notes, *array.notes, *notes, *_value_notes(array), *unnamed]
     dtype, read = _reader_of(array, order, unpack, guard)
@@ -102,6 +107,7 @@ def open_arrays(path: Path, variable: str | None, *, labels: bool) -> CubeSource
         taken=taken,
         bands=bands,
         nodata=nodata,
+        packed_nodata=fills[0] if fills and unpack is not None else None,
         geobox=geobox,
         bad_bands=bad,
         acquired=acquired.text,
@@ -129,22 +135,25 @@ def _reader_of(
 
 
 def _value_notes(array: FileArray) -> list[str]:
-    """Return notes on the unit of the values, and on scales by names that are not CF's."""
-    unit = str(array.attrs.get("units", "")).strip()
-    values = {key: value for key, value in array.attrs.items() if re.search("scale|offset", key.lower())}
+    """Return notes on the unit of the values, and on scales and fill values by names that are not CF's."""
+    unit = unit_of(array.attrs)
+    scales = {key: "scale_factor and add_offset" for key in array.attrs if re.search("scale|offset", key.lower())}
+    fills = {key: "numbers in _FillValue" for key in array.attrs if re.fullmatch(_FILL_WORDS, letters(key))}
+    ends = {key: "numbers" for key in ENDS if np.asarray(array.attrs.get(key, 0)).dtype.kind not in "iuf"}
     return ([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]) + [
-        f"its {key} = {shown(value)} is not applied: only scale_factor and add_offset are"
-        for key, value in values.items()
-        if key not in CODED
+        f"its {key} = {shown(array.attrs[key])} is not applied: only {allowed} are"
+        for key, allowed in (scales | fills | ends).items()
+        if key not in (*CODED, *FILLS)
     ]
 
 
 def _time_of(near: Arrays) -> tuple[dict[str, Any], list[str]]:
     """Return the value of a coordinate ``time`` with one element, by its units, if there is one; and notes."""
     found = near.get("time")
-    if found is None or math.prod(found.shape) != 1 or "since" not in str(found.attrs.get("units", "")):
+    if found is None or math.prod(found.shape) != 1 or "since" not in unit_of(found.attrs):
         return {}, []
-    about = {name: found.attrs[name] for name in ("units", "calendar") if name in found.attrs}
+    about = {"units": unit_of(found.attrs)}
+    about |= {"calendar": found.attrs["calendar"]} if "calendar" in found.attrs else {}
     import xarray as xr  # takes a second
 
     time = xr.Dataset({"time": ((), found[...].reshape(()), about)})
@@ -179,11 +188,12 @@ def _place_of(
 
 
 def _bands_of(
-    cube: str, attributes: Mapping[str, Any], axis: str, arrays: Arrays, count: int
+    cube: str, attributes: Mapping[str, Any], axis: str, arrays: Arrays, unnamed: Sequence[int], count: int
 ) -> tuple[Bands, tuple[int, ...], tuple[str, ...]]:
     """Return facts of the bands by the arrays beside a cube and by attributes; bad bands (from 0), and notes on them.
 
-    Both have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``.
+    Both have the names of fields of other files; wavelengths may be the coordinate of the bands' ``axis``. ``unnamed``
+    is the shape of a cube whose axes have no names.
     """
     fields: dict[str, Any] = {}
     notes: list[str] = []
@@ -194,13 +204,10 @@ def _bands_of(
         is_centre = CENTRES.fullmatch(letters(word)) is not None
         of_bands = is_centre or WIDTHS.fullmatch(letters(word)) or letters(word) in GOOD_BANDS
         if of_bands and _is_line(arrays, name, count):
-            fields = {word: values_of(one), f"{word} units": _unit(one.attrs)} | fields
+            fields = {word: values_of(one), f"{word} units": unit_of(one.attrs)} | fields
         elif is_centre:
-            notes.append(f"the array {name} is left out: it has {one.dtype} of shape {one.shape} for {count} bands")
-    if not any(CENTRES.fullmatch(letters(word)) for word in fields) and _is_line(arrays, axis, count):
-        values = values_of(arrays[axis]).astype(np.float64).ravel()
-        if are_wavelengths(values):
-            fields |= {"wavelength": values, "wavelength units": _unit(arrays[axis].attrs)}
+            doubt = f"it has {one.dtype} of shape {one.shape} for {count} bands"
+            notes.append(f"the array {name} is left out: {doubt}{axis_hint(unnamed, math.prod(one.shape))}")
     usable = {
         key: value
         for key, value in attributes.items()
@@ -208,6 +215,8 @@ def _bands_of(
     }
     names = _names_of(arrays, (axis, "band_names", "band_name"), count)
     found = bands_of_fields(usable | fields, names, cube or "the file")
+    if found.wavelength_nm is None and _is_line(arrays, axis, count) and (np.diff(values_of(arrays[axis])) != 1).any():
+        notes.append(f"the coordinate {axis} has no unit of a length, such as nm, and is not read as wavelengths")
     return replace(found, notes=(*notes, *found.notes)), *bad_bands(usable | fields, count)
 
 
@@ -215,9 +224,8 @@ def _names_of(arrays: Arrays, names: Sequence[str], count: int) -> list[str | No
     """Return the texts, one a band, of the first array of texts that has one of the names; None each without one."""
     listed = [arrays[name] for name in names if name in arrays]
     texts = next((one for one in listed if one.shape == (count,) and one.dtype.kind in "SOUT"), None)
-    each = [None if texts is None else texts[(band,)] for band in range(count)]  # none is larger than the file
-    plain = [one.item() if isinstance(one, np.ndarray) else one for one in each]
-    return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in plain]
+    each = [None] * count if texts is None else texts[...].tolist()
+    return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in each]
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, axes: Sequence[int]) -> tuple[str, tuple[str, ...]]:
@@ -272,10 +280,6 @@ def _is_line(arrays: Arrays, name: str, count: int) -> bool:
 
 def _word(name: str) -> str:
     return name.rpartition("/")[2].lower()
-
-
-def _unit(attributes: Mapping[str, Any]) -> str:
-    return str(attributes.get("units", attributes.get("unit", ""))).strip().lower()
 
 
 def _check_picture(shape: tuple[int, ...], where: object) -> None:

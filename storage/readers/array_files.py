@@ -1,7 +1,7 @@
 """List the arrays of .npy, .mat, NetCDF, HDF5 and Zarr by their headers; only the array wanted is read.
 
-Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file. A
-Zarr store is checked before it is opened: links out of it and codecs other than those of numbers are refused.
+Python objects, cells and structures are not read, nor links and virtual arrays of HDF5, which may lead to any file.
+Codecs of Zarr other than those of numbers are refused.
 """
 
 from __future__ import annotations
@@ -9,13 +9,12 @@ from __future__ import annotations
 import base64
 import importlib
 import math
-import mmap
-import os
+import re
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +25,10 @@ from numpy.typing import NDArray
 from zarr.storage import LocalStore
 
 from spectralzoom.pipeline.errors import SceneError
-from spectralzoom.storage.readers.allowed_codecs import CheckedStore, outside_links
+from spectralzoom.storage.readers.allowed_codecs import CheckedStore, check_filters, outside_links
 from spectralzoom.storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_claim, check_memory
-from spectralzoom.storage.readers.own_files import within
+from spectralzoom.storage.readers.file_numbers import FileNumbers
+from spectralzoom.storage.readers.user_files import files_below, is_there
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -94,8 +94,8 @@ def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
         return _zarr_arrays(path)
     if ending == ".npy":
         values = load_npy(path)
-        each = (1,) * values.ndim
-        return {"": FileArray(str(path), values.shape, values.dtype, {}, values.__getitem__, each, values.nbytes)}, {}
+        each, stored = (1,) * len(values.shape), path.stat().st_size
+        return {"": FileArray(str(path), values.shape, values.dtype, {}, values.__getitem__, each, stored)}, {}
     if h5py.is_hdf5(path):
         arrays, attributes = _hdf_arrays(path)
         return (_matlab_order(arrays), {}) if ending == ".mat" else (arrays, attributes)
@@ -107,9 +107,11 @@ def list_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     raise SceneError(f"{path} cannot be read as NetCDF or HDF5: it begins as neither; copy it again")
 
 
-def load_npy(path: Path) -> NDArray[Any]:
-    """Return the array of a .npy file as a read-only view of it."""
-    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+def load_npy(path: Path) -> FileNumbers:
+    """Return the array of a .npy file, which is read part by part."""
+    is_there(path)
+    mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    return FileNumbers(path, mapped.offset, mapped.shape, mapped.dtype, mapped.strides)
 
 
 def _whole(
@@ -125,27 +127,18 @@ def _mat_arrays(path: Path) -> dict[str, FileArray]:
     scipy_io = importlib.import_module("scipy.io")
 
     def load(name: str, kind: str) -> NDArray[Any]:
-        with _mapped(path) as content:
-            values = np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
+        values = np.asarray(scipy_io.loadmat(BytesIO(path.read_bytes()), variable_names=[name])[name])
         if np.iscomplexobj(values):
             raise SceneError(f"{path}:{name} holds complex numbers, expected real ones; write their absolute values")
         return values.astype(_MATLAB[kind], copy=False)  # whole doubles may be stored as bytes
 
-    with _mapped(path) as content:
-        listed = scipy_io.whosmat(content)
+    listed = scipy_io.whosmat(BytesIO(path.read_bytes()))
     size, most = path.stat().st_size, 8 * DEFLATE_RATIO  # a double may be one byte
     return {
         name: _whole(f"{path}:{name}", shape, np.dtype(_MATLAB[kind]), partial(load, name, kind), size, most)
         for name, shape, kind in listed
         if kind in _MATLAB
     }
-
-
-@contextmanager
-def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """Open a file as a map of memory, which never gives more bytes than the file has."""
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        yield content
 
 
 def _matlab_order(arrays: Arrays) -> dict[str, FileArray]:
@@ -216,6 +209,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
 
     def read(name: str, part: Any) -> NDArray[Any]:
         with h5py.File(path, "r") as file:
+            check_filters(file[name])
             return np.asarray(file[name][part])
 
     def visit(name: str, item: Any) -> None:
@@ -258,13 +252,12 @@ def find_zarr_store(path: Path) -> Path | None:
     """Return the Zarr store at a path, or the ``cube.zarr`` in it."""
     for folder in (path, path / "cube.zarr"):
         if any((folder / name).is_file() for name in METADATA):
-            return within(path, folder)
+            return folder
     return None
 
 
 def _zarr_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """List the arrays of a store (SceneError: a codec is not allowed, a link leads out, or it is a survey's own)."""
-    _check_store(path)
+    """List the arrays of a store (SceneError: a codec is not allowed, or it is a survey's own)."""
     node = zarr.open(CheckedStore(LocalStore(path, read_only=True)), mode="r")
     if not isinstance(node, zarr.Group):
         return {"": _zarr_array(path, node)}, {}
@@ -291,11 +284,11 @@ def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
     named: Any = getattr(array.metadata, "dimension_names", None) or about.pop("_ARRAY_DIMENSIONS", ())
     fill = about.get("_FillValue")
     kind = array.dtype.kind
-    if isinstance(fill, str) and kind == "f":  # of Zarr v3
+    if kind == "f" and isinstance(fill, str) and re.fullmatch("[A-Za-z0-9+/]{11}=", fill):  # a double of xarray
         about["_FillValue"] = float(struct.unpack("<d", base64.standard_b64decode(fill))[0])
     elif fill is None and array.metadata.zarr_format == 2 and named and kind in "buif" and array.fill_value is not None:
         about["_FillValue"] = float(array.fill_value)  # xarray's of v2
-    held = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    held = sum(file.stat().st_size for file in files_below(path))
     lost, count = lost_chunks(array)
     note = f"{path.name}: {lost} of {count} chunks have no file, and are read as {array.fill_value}"
     dims = tuple("" if one is None else str(one) for one in named)
@@ -310,13 +303,3 @@ def _zarr_array(path: Path, array: zarr.Array[Any]) -> FileArray:
         dims,
         notes=(note,) if lost else (),
     )
-
-
-def _check_store(path: Path) -> None:
-    """Refuse links out of the store and special files (SceneError)."""
-    for place, folders, files in os.walk(path):
-        for entry in (Path(place, name) for name in (*folders, *files)):
-            if entry.is_symlink():
-                within(path, entry)
-            if entry.name in files and not entry.is_file():  # reading a pipe may never end
-                raise SceneError(f"{entry} is no file; take it out of the store")

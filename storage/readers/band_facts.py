@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 RANGE_NM = (200.0, 3000.0)
 THERMAL_NM = 20_000.0  # end of the longest wavelengths in cameras' files
 LEAST_WIDTH_NM = 0.02
-NEAR_INFRARED_NM = 800.0
-YEARS = (1900, 2100)
+SAME = 1.02  # ratio of two lengths up to which one is the other, rounded
 # spelling of a unit: its length [nm]; the first ones may stand behind a number in the name of a band
 _LENGTHS: Mapping[str, float] = {
     r"nm|nano ?-?met(?:er|re)s?": 1.0,
@@ -28,7 +27,7 @@ _LENGTHS: Mapping[str, float] = {
 }
 _BY_SIZE = {"nm": 1.0, "micrometres": 1000.0, "metres": 1e9}
 _UNSAID = ("", "unknown", "none", "unspecified", "-", "1")
-_MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
+MISSING = ("", "nan", "n/a", "na", "none", "null", "-", "--", "?", "unknown", "missing")
 _NUMBER = r"(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:e[+-]?\d+)?"
 _BRACKET = re.compile(r"(?:\b[a-z]\w*(?:\.\w+)?)?[\[({]|[\])}]", re.IGNORECASE)  # also of np.float64(450.0)
 _KEY_UNIT = r"(?:in)?(nm|um|μm|nanomet(?:er|re)s?|micromet(?:er|re)s?|microns?|angstroms?)?"
@@ -45,30 +44,30 @@ MOST_NAME = 200  # characters of a band name that are read
 _COUNTED = r"(?<![a-z\d])(?:bands?|b|channels?|chan|ch|layers?|lyr|nr|no)[\s_#.:]*"  # words before a band's number
 _BAND_NUMBER = re.compile(rf"({_COUNTED}|^\W*)(\d+)(?![.,]?\d)")
 _LENGTH = re.compile(rf"(?<![\d.,])({_NUMBER})\s*({'|'.join(list(_LENGTHS)[:3])})(?![a-z])")
-_BARE = re.compile(r"(?<![\d.])(?:\d{3,4}|\d?\.\d+)(?!\d)")  # may be a length in nm or um
-# words of a colour: its usual wavelength [nm]; the first that fits counts
-_COLOURS: Mapping[str, float] = {
-    "coastal(?: aerosol| blue)?|aerosol": 443.0,
-    "red ?edge ?(?:1|071)": 705.0,
-    "red ?edge ?(?:2|075)": 740.0,
-    "red ?edge ?(?:3|078)": 783.0,
-    "red ?edge": 717.0,
-    "near ?(?:infra ?red|ir)|nir": NEAR_INFRARED_NM,
-    "infra ?red": np.nan,  # short, middle or thermal
-    "swir ?(?:16|1)": 1610.0,
-    "swir ?(?:22|2)": 2200.0,
-    "blue": 460.0,
-    "green": 550.0,
-    "yellow": 590.0,
-    "orange": 620.0,
-    "red": 640.0,
-    "gr[ae]y|pan(?:chromatic)?": 550.0,
+# whole names, without case and signs, of STAC's EO extension and plain words: usual, least and greatest wavelength [nm]
+_NAMED: Mapping[str, tuple[float, float, float]] = {
+    name: wavelengths
+    for names, wavelengths in (
+        ("coastal coastalaerosol coastalblue aerosol", (443.0, 400.0, 460.0)),
+        ("blue b", (460.0, 420.0, 530.0)),
+        ("green g", (550.0, 490.0, 610.0)),
+        ("yellow", (590.0, 565.0, 630.0)),
+        ("orange", (620.0, 585.0, 650.0)),
+        ("red r", (640.0, 590.0, 710.0)),
+        ("rededge", (717.0, 670.0, 800.0)),
+        ("rededge1 rededge071", (705.0, 690.0, 730.0)),
+        ("rededge2 rededge075", (740.0, 725.0, 765.0)),
+        ("rededge3 rededge078", (783.0, 760.0, 800.0)),
+        ("nir nearinfrared nearir n", (800.0, 700.0, 1400.0)),
+        ("nir08", (865.0, 750.0, 900.0)),
+        ("nir09", (945.0, 850.0, 1050.0)),
+        ("cirrus", (1375.0, 1340.0, 1410.0)),
+        ("swir1 swir16", (1610.0, 1500.0, 1800.0)),
+        ("swir2 swir22", (2200.0, 2000.0, 2400.0)),
+        ("gray grey pan panchromatic", (550.0, 0.0, np.inf)),
+    )
+    for name in names.split()
 }
-_LETTERS = {"r": "red", "g": "green", "b": "blue", "n": "nir"}
-_COLOUR = re.compile("|".join(f"(?<![a-z])({words})(?![a-z])" for words in _COLOURS))
-_PLAIN = re.compile(
-    rf"(?:(?:{'|'.join(_COLOURS)}|r|x|wl|w|λ|lambda|wavelength|refl|reflectance|rho|rrs|radiance)[\s_-]*)*({_NUMBER})"
-)
 
 
 @dataclass(frozen=True)
@@ -101,9 +100,15 @@ def scale_nm(unit: object) -> float | None:
     return next((nm for words, nm in _LENGTHS.items() if re.fullmatch(words, text)), None)
 
 
+def unit_of(attrs: Mapping[str, Any]) -> str:
+    """Return the unit that attributes state as ``units`` or ``unit``, in any case; empty without one."""
+    said = {letters(key): str(value).strip() for key, value in attrs.items() if value is not None}
+    return said.get("units") or said.get("unit", "")
+
+
 def is_spectral(attrs: Mapping[str, Any]) -> bool:
     """Return whether attributes are those of wavelengths, by their standard name or a unit of nm, um or Angstrom."""
-    short = scale_nm(attrs.get("units", attrs.get("unit")))
+    short = scale_nm(unit_of(attrs))
     return "wavelength" in str(attrs.get("standard_name", "")) or (short is not None and short <= 1000)
 
 
@@ -154,14 +159,6 @@ def _scale(unit: object, numbers: NDArray[np.float64]) -> tuple[float | None, st
     return None, f"they have no unit, and {low:g} to {high:g} fit no unit of wavelengths"
 
 
-def are_wavelengths(numbers: NDArray[np.float64]) -> bool:
-    """Return whether numbers without a unit can only be nm: no years, and not counted one by one."""
-    if not ((numbers >= RANGE_NM[0]) & (numbers <= RANGE_NM[1])).all() or len(set(numbers)) < len(numbers):
-        return False
-    years = (numbers % 1 == 0) & (numbers >= YEARS[0]) & (numbers <= YEARS[1])
-    return not years.all() and not (len(numbers) > 1 and (np.diff(numbers) == 1).all())
-
-
 # --- fields of a file -------------------------------------------------------------------------------------------------
 
 
@@ -194,7 +191,7 @@ def _words(value: object) -> list[Any]:
 
 def _is_number(word: object) -> bool:
     """Return whether an item of a list is a number, or a word for a missing one."""
-    return _plain_text(word) in _MISSING or re.fullmatch(rf"[+-]?{_NUMBER}", _plain_text(word)) is not None
+    return _plain_text(word) in MISSING or re.fullmatch(rf"[+-]?{_NUMBER}", _plain_text(word)) is not None
 
 
 def _to_number(text: object) -> float:
@@ -218,20 +215,43 @@ def bands_of_fields(
 ) -> Bands:
     """Return (band,) facts by a file's fields, else by the names of its bands, else by its colours; with all notes.
 
-    A field such as ``wavelength`` or ``band centres (um)`` is a list in one text, or has one text or number a band.
-    ``colours`` are GDAL's colour interpretations.
+    A field such as ``wavelength`` or ``band centres (um)`` is a list in one text, or has one text or number a band. The
+    first list counts; a note tells which other list or name contradicts it. ``colours`` are GDAL's interpretations.
     """
     count = len(names)
+    names = names if any(names) else _listed_names(fields, count)
+    key, listed = bands_of_lists(fields, count, where)
+    if listed.wavelength_nm is not None:
+        said = [(f"the band name {name!r}", *_named_range(name, place)) for place, name in enumerate(names)]
+        wrong = _contradiction(key, listed.wavelength_nm, said)
+        return replace(listed, notes=tuple(dict.fromkeys([*listed.notes, *wrong])))
+    found = bands_of_names(names, where, () if listed.notes else colours)
+    return replace(found, notes=(*listed.notes, *found.notes))
+
+
+def bands_of_lists(fields: Mapping[str, object], count: int, where: str) -> tuple[str, Bands]:
+    """Return the key of the first list of wavelengths in a file's fields, and (band,) facts by it; else notes alone."""
     notes: list[str] = []
+    first: tuple[str, Bands, NDArray[np.float64]] | None = None
     for key, numbers, unit in _lists(fields, CENTRES, count, notes):
         _, *widths = next(_lists(fields, WIDTHS, count, notes), ("",))
         found = bands_of_numbers(numbers, unit, f"wavelengths from the list {key} of {where}", *widths)
-        notes += found.notes
-        if found.wavelength_nm is not None:
-            return replace(found, notes=tuple(notes))
-    names = names if any(names) else _listed_names(fields, count)
-    found = bands_of_names(names, where, () if notes else colours)
-    return replace(found, notes=(*notes, *found.notes))
+        if first is None:
+            notes += found.notes
+            first = None if found.wavelength_nm is None else (key, found, found.wavelength_nm)
+        elif found.wavelength_nm is not None:
+            notes += _contradiction(*first[::2], [(key, nm, nm) for nm in found.wavelength_nm.tolist()])
+    return ("", Bands(notes=tuple(notes))) if first is None else (first[0], replace(first[1], notes=tuple(notes)))
+
+
+def _contradiction(key: str, nm: NDArray[np.float64], others: Sequence[tuple[str, float, float]]) -> list[str]:
+    """Return a note on the first band of which ``others`` give a range [nm] beyond its wavelength in the list."""
+    pairs = zip(nm.tolist(), others, strict=True)
+    wrong = [at for at, (own, (_, low, high)) in enumerate(pairs) if own * SAME < low or own > high * SAME]
+    if not wrong:
+        return []
+    at, more = wrong[0], f" (so in {len(wrong)} bands)" if len(wrong) > 1 else ""
+    return [f"band {at} is {nm[at]:g} nm by {key}, which counts; {others[at][0]} says another{more}"]
 
 
 def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | None]:
@@ -240,7 +260,7 @@ def _listed_names(fields: Mapping[str, object], count: int) -> Sequence[str | No
         if letters(key) in ("bandname", "bandnames", "longname"):
             words = value.split(",") if isinstance(value, str) else _words(value)
             if len(words) == count:
-                return list(map(str, words))
+                return [str(word).strip() for word in words]
     return [None] * count
 
 
@@ -256,12 +276,13 @@ def _lists(
         value, unit = fields[key], units.get(f"{letters(key)}unit", of_kind[0] if of_kind else "")
         words = (split_list(value, count) if isinstance(value, str) else None) or _words(value)
         wrong = [word for word in words if not _is_number(word)]
-        several = set() if isinstance(unit, str) else {str(one) for one in _words(unit)}
+        stated = [unit] if isinstance(unit, str) else [one for one in _words(unit) if _plain_text(one) not in _UNSAID]
+        several = {scale_nm(one) or str(one) for one in stated}  # a band without one has that of the others
         if wrong or len(words) != count or len(several) > 1:
             why = f"{str(wrong[0])!r} is no number" if wrong else f"{len(words)} for {count} bands"
             notes.append(f"{key} is left out: {'it has several units' if len(several) > 1 else why}")
             continue
-        yield key, np.array([_to_number(word) for word in words]), known[1] or "".join(several) or unit
+        yield key, np.array([_to_number(word) for word in words]), known[1] or (stated or [""])[0]
 
 
 def bad_bands(fields: Mapping[str, object], count: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
@@ -293,40 +314,55 @@ def bands_text(bands: Sequence[int]) -> str:
 
 
 def bands_of_names(names: Sequence[str | None], where: str, colours: Sequence[str] = ()) -> Bands:
-    """Return (band,) facts by the one length, number or colour in each band's name, else by the file's own colours.
+    """Return (band,) facts by the one length in each band's name, or its whole name, else by the file's own colours.
 
     A name with a length and another number, and colours that contradict the file's, give a note alone.
     """
-    texts = [_without_number(name, place) for place, name in enumerate(names)]
-    found = [_LENGTH.search(text) for text in texts]
-    origin = f"wavelengths from the band names of {where}"
-    if any(found):
-        centres = np.full(len(names), np.nan)
-        for at, length in enumerate(found):
-            if length is None:
-                continue
-            if len(re.findall(r"\d+(?:\.\d+)?", texts[at])) > 1:
-                return Bands(notes=(f"the band name {names[at]!r} may give several lengths",))
-            centres[at] = _to_number(length[1]) * (scale_nm(length[2]) or np.nan)
-            if not RANGE_NM[0] <= centres[at] <= THERMAL_NM:
-                return Bands(notes=(f"the band name {names[at]!r} gives {centres[at]:g} nm, which is no wavelength",))
-        known = centres[np.isfinite(centres)]
-        if len(set(known)) < len(known):
-            return Bands(notes=("the band names give several bands the same length",))
-        return bands_of_numbers(centres, "nm", origin)
-    plain = [_PLAIN.fullmatch(text.strip(" _-()[]")) for text in texts]
-    numbers = np.array([np.nan if one is None else _to_number(one[1]) for one in plain])
-    if are_wavelengths(numbers):
-        return Bands(numbers, None, origin, ("the band names have no unit, read as nm by their size",))
-    return _bands_of_colours(names, texts, where, colours)
+    centres = np.full(len(names), np.nan)
+    for at, name in enumerate(names):
+        length, doubt = _length(name, at)
+        if doubt:
+            return Bands(notes=(f"the band name {name!r} {doubt}",))
+        centres[at] = length
+    known = centres[np.isfinite(centres)]
+    if not known.size:
+        return _bands_of_colours(names, where, colours)
+    if len(set(known)) < len(known):
+        return Bands(notes=("the band names give several bands the same length",))
+    return bands_of_numbers(centres, "nm", f"wavelengths from the band names of {where}")
 
 
-def _without_number(name: str | None, place: int) -> str:
-    """Return the text of a name without the number of its band: after such a word, or its ``place`` (from 0 or 1)."""
+def _length(name: str | None, place: int) -> tuple[float, str]:
+    """Return the only length in a name [nm], NaN without one; and why it is doubtful: a width, or one of several."""
+    text = _without_number(name, place)
+    if (found := _LENGTH.search(text)) is None:
+        return np.nan, ""
+    several = len(re.findall(r"\d+(?:\.\d+)?", text)) > 1
+    if several or WIDTHS.search(letters(text)) or re.search("[<>≤≥±~]", text):
+        return np.nan, "may give several lengths"
+    nm = _to_number(found[1]) * (scale_nm(found[2]) or np.nan)
+    return nm, "" if RANGE_NM[0] <= nm <= THERMAL_NM else f"gives {nm:g} nm, which is no wavelength"
+
+
+def _named_range(name: str | None, place: int) -> tuple[float, float]:
+    """Return the least and greatest wavelength [nm] of a band by its length or whole name; any without one."""
+    nm, doubt = _length(name, place)
+    if nm > 0 and not doubt:
+        return nm, nm
+    return _NAMED.get(_whole_name(name, place), (0.0, 0.0, np.inf))[1:]
+
+
+def _whole_name(name: str | None, place: int) -> str:
+    """Return a name without signs, the words band and channel, and the ``place`` (from 0 or 1) as a number."""
+    return re.sub(r"[\W_]+|band|channel", "", _without_number(name, place, counted=False))
+
+
+def _without_number(name: str | None, place: int, *, counted: bool = True) -> str:
+    """Return the text of a name without its ``place`` (from 0 or 1), or any number ``counted`` by a word before it."""
 
     def shortened(found: re.Match[str]) -> str:
         number, behind = int(found[2]), found.string[found.end() :].lstrip()
-        said = bool(found[1].strip()) and (number < RANGE_NM[0] or behind.startswith("("))
+        said = counted and bool(found[1].strip()) and (number < RANGE_NM[0] or behind.startswith("("))
         return " " if said or number in (place, place + 1) else found[0]
 
     text = re.sub(r"(?<!\d)(\d{1,2}),(?=\d)|(?<=\d),(?=\d{1,2}(?!\d))", r"\1.", _plain_text(name)[:MOST_NAME])
@@ -339,39 +375,43 @@ def is_named(name: str | None, place: int) -> bool:
     return bool(_without_number(name, place).strip()) or not {int(one) for one in numbers} <= {place, place + 1}
 
 
-def _colour(text: str) -> set[float]:
-    """Return the usual wavelengths of the colours in a text, NaN for infrared without a range."""
-    words = re.sub(r"[\W_]+", " ", text).strip()
-    values = list(_COLOURS.values())
-    found = _COLOUR.finditer(_LETTERS.get(words, words))
-    return {values[(one.lastindex or 1) - 1] for one in found}
+def _bands_of_colours(names: Sequence[str | None], where: str, colours: Sequence[str]) -> Bands:
+    """Return bands by their whole names, else by the file's own flags.
 
-
-def _bands_of_colours(names: Sequence[str | None], texts: Sequence[str], where: str, colours: Sequence[str]) -> Bands:
-    """Return bands by the colours in their names, else by the file's own flags.
-
-    A band without a name has the flag of the file; flags that GDAL writes by itself say nothing on a named one. A
-    name with a number that may be a length has no colour.
+    A band without a name has the flag of the file; flags that GDAL writes by itself say nothing on a named one.
     """
     default = tuple(colours[:3]) == ("red", "green", "blue") and set(colours[3:]) <= {"undefined", "alpha"}  # of GDAL
-    flags = [_colour(colour) for colour in colours] or [set() for _ in names]
-    bare = [not is_named(name, place) for place, name in enumerate(names)]
+    bare = np.array([not is_named(name, place) for place, name in enumerate(names)], np.bool_)
+    flags, named = (
+        np.array([_NAMED.get(word, (np.nan,))[0] for word in words])
+        for words in (colours or [""] * len(names), [_whole_name(name, place) for place, name in enumerate(names)])
+    )
     if default and tuple(colours[3:]) == ("undefined",) and bare[3]:
-        flags[3] = {NEAR_INFRARED_NM}
-    named = [set() if _BARE.search(text) else _colour(text) for text in texts]
-    by_flag = not default and not any(named)
-    nm = [one or (flag if by_flag or no_name else set()) for one, no_name, flag in zip(named, bare, flags, strict=True)]
-    centres = [min(one) if len(one) == 1 else np.nan for one in nm]
-    if not centres or np.isnan(centres).any() or len(set(centres)) < len(centres):
+        flags[3] = _NAMED["nir"][0]
+    by_flag = bare | (not default and bool(np.isnan(named).all()))
+    nm = np.where(np.isnan(named) & by_flag, flags, named)
+    if not nm.size or np.isnan(nm).any() or len(set(nm)) < len(nm):
         shown = ", ".join(repr(name) for name in names[:5]) + (", ..." if len(names) > 5 else "")
-        doubt = f"the band names {shown} do not give each band a wavelength or a colour of its own"
-        return Bands(notes=() if all(bare) else (doubt,))
-    others = [at for at, flag in enumerate(flags) if flag and colours[at] != "gray" and flag != {centres[at]}]
+        doubt = f"the band names {shown} do not give each band a length with its unit, or a known colour of its own"
+        return Bands(notes=() if bare.all() else (doubt,))
+    others = [at for at in np.flatnonzero(~np.isnan(flags) & (flags != nm)).tolist() if colours[at] != "gray"]
     if others and not default:
         said = f"the band name {names[others[0]]!r} contradicts its colour in the file, {colours[others[0]]}"
         return Bands(notes=(said,))
     notes = ("the band names say other colours than the file's flags of red, green and blue: the names count",)
-    source = f"the colours in the band names of {where}" if any(named) else "the file's colours"
-    listed = ", ".join(f"{one:g}" for one in centres)
-    origin = f"wavelengths assumed from {source}: {listed} nm"
-    return Bands(np.array(centres), None, origin, notes if others else ())
+    source = "the file's colours" if np.isnan(named).all() else f"the colours in the band names of {where}"
+    listed = ", ".join(f"{one:g}" for one in nm)
+    return Bands(nm, None, f"wavelengths assumed from {source}: {listed} nm", notes if others else ())
+
+
+def axis_hint(shape: Sequence[int], count: int) -> str:
+    """Return what to type where another axis of (y, x, band) ``shape`` has ``count`` numbers; empty without one."""
+    fits = [axis for axis, size in enumerate(shape) if size == count]
+    if len(fits) != 1 or fits[0] == 2:
+        return ""
+    ways = "[2 3 1] or numpy.moveaxis(cube, 0, -1) of (band, y, x), [3 2 1] or cube.T of (band, x, y)"
+    ways = ways if fits[0] == 0 else "[1 3 2] or numpy.moveaxis(cube, 1, -1)"
+    return (
+        f"; axis {fits[0]} (from 0) of {tuple(shape)} has {count}, so if these are the bands, store the cube as (y, x, "
+        f"band) by MATLAB's permute {ways}"
+    )

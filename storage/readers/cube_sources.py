@@ -5,9 +5,12 @@ The size that a file claims is checked against its bytes and the machine before 
 
 from __future__ import annotations
 
+import logging
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -21,8 +24,10 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken
 from spectralzoom.pipeline.signal.calibrate import calibrate
+from spectralzoom.pipeline.signal.line_faults import DarkLevel
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.band_facts import Bands
+from spectralzoom.storage.readers.user_files import OpenedFiles
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
@@ -57,6 +62,38 @@ def check_memory(where: object, needed: int) -> None:
             f"{where}: reading it takes about {needed / 1e9:.1f} GB of memory, this machine has {there / 1e9:.1f}; cut "
             "a part out of it, or store it as ENVI, GeoTIFF in tiles or Zarr, which are read a few lines at a time"
         )
+
+
+_HEARD: ContextVar[list[logging.LogRecord] | None] = ContextVar("heard", default=None)
+
+
+class _Listener(logging.Handler):
+    """Keep the log of an image library while a reader of this thread uses it; pass on the rest."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        heard = _HEARD.get()
+        if heard is None:
+            logging.getLogger().handle(record)
+        else:
+            heard.append(record)
+
+
+for _library in (logging.getLogger("PIL"), logging.getLogger("rasterio")):
+    _library.addHandler(_Listener())
+    _library.propagate = False
+
+
+@contextmanager
+def library_log() -> Iterator[list[logging.LogRecord]]:
+    """Keep what Pillow and rasterio say off the terminal, and return their log; a call within another adds to it."""
+    heard: list[logging.LogRecord] = [] if (outer := _HEARD.get()) is None else outer
+    token = _HEARD.set(heard)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="PIL|rasterio")
+            yield heard
+    finally:
+        _HEARD.reset(token)
 
 
 @contextmanager
@@ -98,6 +135,7 @@ class CubeSource:
     dtype: np.dtype[Any]
     read: ReadLines
     files: tuple[Path, ...]  # that it was read from
+    opened: OpenedFiles = field(default_factory=OpenedFiles)  # these, and headers and metadata
     lines: LineFacts = LineFacts()
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
@@ -105,6 +143,7 @@ class CubeSource:
     white_ms: float | None = None  # exposure of the white frame at the gain of the lines; None: that of every line
     taken: Taken = field(default_factory=Taken)
     nodata: float | None = None
+    packed_nodata: float | None = None  # no-data value that was compared before the file's scale
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files mark as bad, from 0
     void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked: without a value; some, not all
@@ -128,11 +167,14 @@ def check_cube_source(source: CubeSource) -> None:
 
 
 def unpacked(
-    raw: NDArray[Any], scale: float | NDArray[np.float64], offset: float | NDArray[np.float64], fill: float | None
+    raw: NDArray[Any],
+    scale: float | NDArray[np.float64],
+    offset: float | NDArray[np.float64],
+    fill: float | NDArray[Any] | None,
 ) -> NDArray[np.float32]:
     """Return ``raw * scale + offset`` (..., band) as float32, NaN where raw is ``fill``.
 
-    Scale and offset are one number, or one for each band.
+    Scale, offset and fill are one number, or one for each band.
     """
     values = (raw * np.asarray(scale, np.float64) + offset).astype(np.float32)
     if fill is not None:
@@ -179,5 +221,15 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
         values[~usable] = np.nan
         if source.nodata is not None:
             values[raw == source.nodata] = np.nan
+        values[dark_lines(source, raw)] = np.nan
     values[~valid] = np.nan
     return values
+
+
+def dark_lines(source: CubeSource, raw: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return (line,) whether raw lines of a cube are darker than its dark frame; none without one, or without data."""
+    if source.dark is None or source.white is None:
+        return np.zeros(len(raw), np.bool_)
+    level = DarkLevel(source.dark)
+    found = np.array([level.is_above(line) for line in raw], np.bool_)
+    return found if source.nodata is None else found & ~(raw == source.nodata).all(axis=(1, 2))

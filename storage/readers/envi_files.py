@@ -16,16 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.envi_headers import EnviHeader, finite_number, parse_envi_header
+from spectralzoom.pipeline.envi_headers import EnviHeader, header_text, parse_envi_header
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import Taken, check_parts, taken_with
 from spectralzoom.pipeline.frame_indices import FRAME_INDEX, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from spectralzoom.storage.readers.acquired import acquired_of
 from spectralzoom.storage.readers.band_facts import bad_bands, bands_of_fields, numbers_of_list
+from spectralzoom.storage.readers.band_matches import match_bands
 from spectralzoom.storage.readers.cube_sources import MOST_MISSING, ONE_FILE, CubeSource, LineFacts
+from spectralzoom.storage.readers.file_numbers import FileNumbers
 from spectralzoom.storage.readers.image_files import rescaled
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.places import place_of_envi
+from spectralzoom.storage.readers.user_files import first_there, is_there
 
 # where a data file's name may differ from its header's
 DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
@@ -35,12 +37,12 @@ _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class EnviCube:
-    """An open ENVI cube. ``values`` is a read-only view of the file, (line, sample, band) in the file's type."""
+    """An open ENVI cube. ``values`` are read from the file, (line, sample, band) in the file's type."""
 
     header_path: Path
     path: Path
     header: EnviHeader
-    values: NDArray[Any]
+    values: FileNumbers
     lost_lines: int  # in the header and not whole in the file
     notes: tuple[str, ...]
 
@@ -80,45 +82,38 @@ def open_envi_cube(path: str | Path) -> EnviCube:
         "bip": (samples * bands * item, bands * item, item),
         "bsq": (samples * item, item, promised * samples * item if bands > 1 else item),  # lines may be any number
     }[header.interleave]
-    content = np.memmap(data_path, np.uint8, mode="r")
-    values: NDArray[Any] = np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)
+    values = FileNumbers(data_path, header.offset, (held, samples, bands), header.dtype, strides)
     return EnviCube(header_path, data_path, header, values, promised - held, tuple(notes))
 
 
 def find_envi_pair(path: Path) -> tuple[Path, Path]:
     """Return header and data file by the address of either (SceneError: one of them is missing)."""
-    if not path.exists() or (path.suffix.lower() != ".hdr" and not path.is_file()):
+    if not is_there(path) or (path.suffix.lower() != ".hdr" and not path.is_file()):
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     if path.suffix.lower() == ".hdr":
         stem = path.with_suffix("")
         endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
-        data = next((file for file in (stem.with_name(stem.name + end) for end in endings) if file.is_file()), None)
+        data = first_there(stem.with_name(stem.name + end) for end in endings)
         if data is None:
             raise SceneError(
                 f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
             )
-        return path, within(path, data)
+        return path, data
     names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
-    header = next((file for file in map(path.with_name, names) if file.is_file()), None)
+    header = first_there(map(path.with_name, names))
     if header is None:
         wanted = " or ".join(dict.fromkeys(names[:2]))
         raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
-    return within(path, header), path
+    return header, path
 
 
 def load_envi_header(path: Path) -> EnviHeader:
     """Read one header file (SceneError: there is no such file, or it is no usable ENVI header)."""
-    if path.exists() and not path.is_file():  # reading a pipe may never end
-        raise SceneError(f"{path} is no file; name an ENVI header")
+    is_there(path)
     try:
-        content = path.read_bytes()
+        return parse_envi_header(header_text(path.read_bytes()), str(path))
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error}; name an ENVI header") from error
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
-    return parse_envi_header(text, str(path))
 
 
 def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
@@ -132,20 +127,31 @@ def open_envi_source(path: Path, *, scaled: bool = True) -> CubeSource:
     source = replace(source, geobox=geobox, notes=(*source.notes, *where))
     if not scaled:
         return source
-    fields = cube.header.fields
-    bands = source.shape[2]
-    factor = finite_number(fields.get("reflectance scale factor", "")) or 0.0
-    gain, offset = _numbers(fields, "data gain values", bands, 1.0), _numbers(fields, "data offset values", bands, 0.0)
-    if factor > 0:
-        gain, offset = np.full(bands, 1 / factor), np.zeros(bands)
-    return source if (gain == 1).all() and not offset.any() else rescaled(source, gain, offset)
+    return _scaled(source, cube.header.fields)
+
+
+def _scaled(source: CubeSource, fields: Mapping[str, str]) -> CubeSource:
+    """Return a cube with the first of the header's scales as its values, and a note on the others."""
+    count = source.shape[2]
+    factor = _numbers(fields, "reflectance scale factor", 1, 1.0)[0]
+    scales = {"reflectance scale factor": (np.full(count, 1 / factor if factor > 0 else 1.0), np.zeros(count))}
+    for kind in ("data reflectance", "data"):
+        gain, offset = f"{kind} gain values", f"{kind} offset values"
+        scales[gain] = _numbers(fields, gain, count, 1.0), _numbers(fields, offset, count, 0.0)
+    first, *others = [key for key, one in scales.items() if (one[0] != 1).any() or one[1].any()] or list(scales)[:1]
+    notes = [f"{key} of the header is not applied: {first} is" for key in others]
+    fill, ignored = None, fields.get("data ignore value", "")
+    if ignored and source.nodata is None and numbers_of_list(ignored, 1) is None:
+        fill = numbers_of_list(ignored, count)
+        notes += [] if fill is not None else [f"data ignore value = {ignored!r} is no number, and is not read"]
+    return rescaled(replace(source, notes=(*source.notes, *notes)), *scales[first], fill)
 
 
 def _numbers(fields: Mapping[str, str], name: str, count: int, default: float) -> NDArray[np.float64]:
     """Return the numbers of a list in a header, one a band; the default where there is none. SceneError: others."""
     found = numbers_of_list(fields[name], count) if fields.get(name) else np.full(count, default)
     if found is None or not np.isfinite(found).all():
-        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} numbers; correct the header")
+        raise SceneError(f"the header lists {name} = {fields[name]!r}, expected {count} as numbers; correct it")
     return found
 
 
@@ -160,7 +166,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     Lines are missing between parts, and at the end of a file that is cut off. Empty parts are left out. Raises
     SceneError: a part cannot be used, parts differ in their frames, or too many lines are missing.
     """
-    entries = [entry for entry in sorted(folder.iterdir()) if entry.is_file()]
+    entries = [entry for entry in sorted(folder.iterdir()) if not entry.is_dir()]
     numbered = [(int(match[1]), entry) for entry in entries if (match := _PART.fullmatch(entry.name)) is not None]
     headers = dict(sorted(one for one in numbered if one[1].suffix.lower() == ".hdr"))
     if headers and (lone := [entry for number, entry in numbered if number not in headers]):
@@ -174,7 +180,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     notes: list[str] = []
     opened: dict[int, EnviCube] = {}
     for number, header in headers.items():
-        data = find_envi_pair(within(folder, header))[1]
+        data = find_envi_pair(header)[1]
         if data.stat().st_size == 0:
             notes.append(f"{data.name} is empty and left out")
         else:
@@ -184,7 +190,7 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     frames = {(cube.values.shape[1:], str(cube.values.dtype)) for cube in opened.values()}
     if len(frames) > 1:
         raise SceneError(f"the parts of {folder} have frames of {sorted(frames)} (sample, band); name them one by one")
-    parts = [(cube.path.name, number, len(cube.values)) for number, cube in opened.items()]
+    parts = [(cube.path.name, number, cube.values.shape[0]) for number, cube in opened.items()]
     starts = _first_lines(parts, MOST_MISSING, notes)
     notes += [note for cube in opened.values() for note in cube.notes]
     if any("map info" in cube.header.fields for cube in opened.values()):
@@ -199,8 +205,8 @@ def open_headwall_cube(folder: Path) -> CubeSource:
         if number not in indices:
             notes.append(f"there is no frame index for {cube.path.name}")
             continue
-        index = load_frame_index(within(folder, indices[number]))
-        own = times_of_lines(index, number, len(cube.values), cube.lost_lines)
+        index = load_frame_index(indices[number])
+        own = times_of_lines(index, number, cube.values.shape[0], cube.lost_lines)
         there = slice(start, start + len(own.frame))
         times.frame[there], times.stamp_us[there] = own.frame, own.stamp_us
         notes.extend((*index.notes, *(f"{indices[number].name}: {note}" for note in own.notes)))
@@ -240,14 +246,19 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     if lost < cube.lost_lines:
         notes.append(f"the {cube.lost_lines} lines that {cube.path.name} lacks are not filled up")
     _, samples, count = cubes[0].values.shape
-    height = last + len(cube.values) + lost
+    height = last + cube.values.shape[0] + lost
     native = cubes[0].values.dtype.newbyteorder("=")
     valid = np.zeros(height, np.bool_)
     for start, part in parts.items():
-        valid[start : start + len(part.values)] = True
+        valid[start : start + part.values.shape[0]] = True
     taken, exposure_ms = _taken(parts, height, notes)
     of_parts = [bands_of_fields(one.header.fields, [None] * count, one.header_path.name) for one in cubes]
     bands = next((one for one in of_parts if one.wavelength_nm is not None), of_parts[0])
+    for one, part in zip(of_parts, cubes, strict=True):
+        order, _ = match_bands(one, bands, part.header_path.name, cubes[0].header_path.name)
+        if order is not None and (order != np.arange(count)).any():
+            where = f"{part.header_path.name} has the bands of {cubes[0].header_path.name} in another order"
+            raise SceneError(f"{where}; name these parts one by one")
     bad, doubts = bad_bands(cubes[0].header.fields, count)
     notes += [*bands.notes, *doubts]
 
@@ -256,11 +267,11 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
     def read(start: int, stop: int) -> NDArray[Any]:
         """Return some lines (line, sample, band)."""
         for begin, part in parts.items():
-            if begin <= start < stop <= begin + len(part.values):
+            if begin <= start < stop <= begin + part.values.shape[0]:
                 return part.values[start - begin : stop - begin].astype(native, order="C")
         block = np.zeros((stop - start, samples, count), native)
         for begin, part in parts.items():
-            low, high = max(start, begin), min(stop, begin + len(part.values))
+            low, high = max(start, begin), min(stop, begin + part.values.shape[0])
             if low < high:
                 block[low - start : high - start] = part.values[low - begin : high - begin]
         return block
@@ -297,7 +308,9 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
         return first, None
     exposure_ms = np.full(height, np.nan)
     for start, one in every.items():
-        exposure_ms[start : start + len(parts[start].values)] = np.nan if one.exposure_ms is None else one.exposure_ms
+        exposure_ms[start : start + parts[start].values.shape[0]] = (
+            np.nan if one.exposure_ms is None else one.exposure_ms
+        )
     usual = float(np.nanmedian(exposure_ms))
     unknown = [one.where for one in every.values() if one.exposure_ms is None]
     notes += [f"{where} does not state its exposure: {usual:g} ms is assumed" for where in unknown]
@@ -306,6 +319,7 @@ def _taken(parts: Mapping[int, EnviCube], height: int, notes: list[str]) -> tupl
 
 def load_frame_index(path: Path) -> FrameIndex:
     """Read one index (SceneError: the file cannot be read, or no line of it is a frame)."""
+    is_there(path)
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             return parse_frame_index(iter(lambda: file.readline(LONGEST_LINE), ""), path.name, str(path))

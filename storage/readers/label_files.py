@@ -17,7 +17,7 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import SceneError, list_some
 from spectralzoom.storage.readers.labels import Labels, found_classes, load_labels
 from spectralzoom.storage.readers.open_cubes import CUBE_ENDINGS, split_variable
-from spectralzoom.storage.readers.own_files import stated_file, within
+from spectralzoom.storage.readers.own_files import stated_file
 from spectralzoom.storage.readers.polygons import (
     POLYGON_ENDINGS,
     is_polygon_file,
@@ -26,6 +26,7 @@ from spectralzoom.storage.readers.polygons import (
     split_layer,
 )
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
+from spectralzoom.storage.readers.user_files import is_there
 
 WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "ground_truth")  # of files and folders
 SHOWN = 5  # names in a message
@@ -74,19 +75,22 @@ def classes_of_files(files: Sequence[Path], settings: SceneSettings) -> dict[str
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Return the files and Zarr stores that may be scenes or labels, sorted by name, without hidden ones."""
+    """Return the files and Zarr stores that may be scenes or labels, sorted by name, without hidden ones.
+
+    Among them may be links that lead nowhere, which are refused where they are chosen.
+    """
     return sorted(
         entry
         for entry in folder.iterdir()
         if not entry.name.startswith(".")
-        and ((entry.suffix.lower() in CUBE_ENDINGS and entry.is_file()) or is_store(entry))
+        and ((entry.suffix.lower() in CUBE_ENDINGS and not entry.is_dir()) or is_store(entry))
     )
 
 
 def image_folder(folder: Path) -> Path:
     """Return the folder ``images`` (or of a similar name) in a folder, or the folder itself."""
-    inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
-    return within(folder, min(inner, key=lambda entry: entry.name != "images", default=folder))
+    inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and is_there(entry) and entry.is_dir())
+    return min(inner, key=lambda entry: entry.name != "images", default=folder)
 
 
 def find_files(path: Path) -> MatchedFiles:
@@ -124,7 +128,7 @@ def match_folder(folder: Path) -> MatchedFiles:
                 f" say which files are labels in a {SETTINGS_NAME}"
             )
     for entry in (*images, *labels.values()):
-        within(folder, entry, _home(folder))
+        is_there(entry)
     return MatchedFiles(tuple(images), labels, tuple(entry for entry in pictures if entry not in owner))
 
 
@@ -137,12 +141,7 @@ def find_label(scene: Path) -> Path | None:
     except PermissionError:  # the folder cannot be listed
         return None
     found = _label_of(scene, [entry for entry in pictures if entry != scene]) or _label_of(scene, polygons)
-    return None if found is None else within(scene, found, _home(scene.parent))
-
-
-def _home(folder: Path) -> Path:
-    """Return the folder that images and labels share."""
-    return folder.parent if is_image_folder(folder) else folder
+    return found if found is not None and is_there(found) else None
 
 
 def is_label_name(path: Path) -> bool:
@@ -165,7 +164,7 @@ def listed_names(paths: Iterable[Path]) -> str:
 
 def is_store(entry: Path) -> bool:
     """Return whether a folder is a Zarr store, which is one scene."""
-    return entry.suffix.lower() == ".zarr" and entry.is_dir()
+    return entry.suffix.lower() == ".zarr" and not entry.is_file()
 
 
 def _labels_near(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -174,12 +173,12 @@ def _labels_near(folder: Path) -> tuple[list[Path], list[Path]]:
     They lie in the folder or in folders of labels there, and beside it if it has images.
     """
     around = [folder, folder.parent] if is_image_folder(folder) else [folder]
-    inside = [one for place in around for one in sorted(place.iterdir()) if one.name.lower() in WORDS and one.is_dir()]
-    inside = [one for one in inside if one != folder]
+    named = [one for place in around for one in sorted(place.iterdir()) if one.name.lower() in WORDS and is_there(one)]
+    inside = [one for one in named if one.is_dir() and one != folder]
     pictures = [entry for entry in scene_entries(folder) if is_label_name(entry)]
     pictures += [entry for place in inside for entry in scene_entries(place)]
     visible = [entry for place in [*around, *inside] for entry in sorted(place.glob("[!.]*"))]
-    return pictures, [entry for entry in visible if entry.suffix.lower() in POLYGON_ENDINGS and entry.is_file()]
+    return pictures, [entry for entry in visible if entry.suffix.lower() in POLYGON_ENDINGS and not entry.is_dir()]
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures, span_text
+from spectralzoom.pipeline.signal.calibrate import check_frames
 from spectralzoom.storage.readers.array_cubes import open_arrays
 from spectralzoom.storage.readers.array_files import ARRAY_ENDINGS, HDF_ENDINGS, find_zarr_store
 from spectralzoom.storage.readers.band_facts import Bands
@@ -21,6 +22,7 @@ from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, open_envi_sour
 from spectralzoom.storage.readers.frames import find_reference, load_frame, taken_of
 from spectralzoom.storage.readers.image_files import IMAGE_ENDINGS, open_image
 from spectralzoom.storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
+from spectralzoom.storage.readers.user_files import is_there, reading_files
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -80,40 +82,44 @@ def open_cube_source(address: str | Path, *, labels: bool = False) -> CubeSource
 
     ``address`` may name an array: ``STORE:ARRAY``. A Headwall folder's reference frames are
     averaged over their lines. ``labels`` are read without scale, and an array with two axes is preferred. Raises
-    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used.
+    SceneError: there is no such file, it is damaged, or its kind or shape cannot be used; FileChangedError, also as its
+    lines are read: one of its files changed since it was opened.
     """
     path, variable = split_variable(address)
-    match reader_of(address):
-        case "zarr":
-            source = open_arrays(find_zarr_store(path) or path, variable, labels=labels)
-        case "headwall":
-            source = _with_frames(open_headwall_cube(path), path)
-        case "envi":
-            source = open_envi_source(path, scaled=not labels)
-        case "image":
-            source = open_image(path, scaled=not labels)
-        case "array":
-            source = open_arrays(path, variable, labels=labels)
-        case "none" if not path.exists():
+    with reading_files() as opened:
+        if not is_there(path):
             raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
-        case "none":
-            ending = path.suffix.lower() or "nothing"
-            raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
+        match reader_of(address):
+            case "zarr":
+                source = open_arrays(find_zarr_store(path) or path, variable, labels=labels)
+            case "headwall":
+                source = _with_frames(open_headwall_cube(path), path)
+            case "envi":
+                source = open_envi_source(path, scaled=not labels)
+            case "image":
+                source = open_image(path, scaled=not labels)
+            case "array":
+                source = open_arrays(path, variable, labels=labels)
+            case "none":
+                ending = path.suffix.lower() or "nothing"
+                raise SceneError(f"{path} ends in {ending}, which is not read; use {', '.join(CUBE_ENDINGS)}")
     check_cube_source(source)
-    return source
+    return replace(source, opened=opened, read=opened.guarded(source.read))
 
 
 def _with_frames(source: CubeSource, folder: Path) -> CubeSource:
     """Return a Headwall cube with the dark and white frames of its folder, if there are some."""
     found = {kind: find_reference(folder, kind) for kind in ("dark", "white")}
-    frames = {kind: load_frame(file, kind, source.shape[1:]) for kind, file in found.items() if file is not None}
+    frames = {
+        kind: load_frame(file, kind, source.shape[1:], source.bands) for kind, file in found.items() if file is not None
+    }
     stated_ms = source.lines.exposure_ms
     lines_ms = np.ones(1) if stated_ms is None else stated_ms
     notes = [f"{kind} frame from {frame.files[0].name}" for kind, frame in frames.items()]
     white_ms = None
     if len(frames) == 2:
         white_ms, more = match_exposures(taken_of(frames), source.taken, lines_ms, stated=stated_ms is not None)
-        notes += more
+        notes += [*more, *check_frames(f"{source.name}: ", frames["dark"].values, frames["white"].values)]
     else:
         notes = [f"{note} is not used: values over white need a dark and a white frame" for note in notes]
         notes += [] if all_alike(lines_ms) else [f"numbers of {span_text(lines_ms)} are not scaled to one exposure"]
@@ -144,6 +150,8 @@ def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[f
         settings = SceneSettings()  # of some bands only
     if stated is None and settings.wavelengths_nm is None and settings.wavelengths_file is None:
         return source
-    found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
+    found = settle_wavelengths(
+        path, range(count), count, stated=stated, settings=settings, known=Bands(), shape=source.shape
+    )
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.storage.readers.array_files import FileArray
+from spectralzoom.storage.readers.band_facts import MISSING
 
 Turn = Callable[[NDArray[Any]], NDArray[Any]]
 CODED = ("scale_factor", "add_offset", "_Unsigned")
@@ -23,9 +24,10 @@ ENDS = ("valid_range", "valid_min", "valid_max")
 def packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) -> dict[str, Any]:
     """Return the attributes of packing: numbers, of scale and offset one or ``count``, and _Unsigned.
 
-    Raises SceneError: scale, offset or _Unsigned is something else.
+    Fill values may be texts of numbers. Raises SceneError: scale, offset, a fill value or _Unsigned is something else.
     """
     stated = {name: attributes[name] for name in (*CODED, *FILLS, *ENDS) if name in attributes}
+    stated |= {name: _numbers(stated[name], f"{where} has {name}") for name in set(FILLS) & set(stated)}
     known = {name: value for name, value in stated.items() if np.asarray(value).dtype.kind in "iuf"}
     if "_Unsigned" in stated:
         sign = str(stated["_Unsigned"]).lower()
@@ -42,6 +44,17 @@ def packing_of(attributes: Mapping[str, Any], where: object, count: int = 1) -> 
     return known
 
 
+def _numbers(value: Any, what: str) -> Any:
+    """Return numbers, also those of texts; none for a text that states none (SceneError: another text)."""
+    if np.asarray(value).dtype.kind in "iufb":
+        return value
+    try:
+        texts = [str(one).strip() for one in np.ravel(np.asarray(value, object)).tolist()]
+        return [float(text) for text in texts if text.lower() not in MISSING]
+    except ValueError:
+        raise SceneError(f"{what} = {shown(value)!r}, expected a number; correct it") from None
+
+
 def shown(value: object) -> str:
     """Return an attribute as text of one line."""
     return " ".join(str(value).split())[:80]
@@ -50,15 +63,17 @@ def shown(value: object) -> str:
 def unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | None, float | None]:
     """Return the function from numbers of a file to values, NaN where there is none, and the no-data value.
 
-    The function is None where the numbers are the values, with one no-data value at most.
+    The function is None where the numbers are the values, with one no-data value at most. A fill value that the numbers
+    cannot hold is that of scaled values.
     """
     kind = stored
     if "_Unsigned" in about and stored.kind in "iu":
         kind = np.dtype(f"{stored.byteorder}{'u' if about['_Unsigned'] == 'true' else 'i'}{stored.itemsize}")
     scale, offset = about.get("scale_factor", 1.0), about.get("add_offset", 0.0)
     scaled = bool(np.any(scale != 1) or np.any(offset != 0))
-    listed = [_held(number, stored, kind) for name in FILLS for number in np.ravel(about.get(name, ()))]
-    fills = list(dict.fromkeys(one for one in listed if one is not None))
+    listed = {number: _held(number, stored, kind) for name in FILLS for number in np.ravel(about.get(name, ()))}
+    fills = list(dict.fromkeys(one for one in listed.values() if one is not None))
+    late = [float(number) for number, one in listed.items() if one is None] if scaled else []
     pair = about.get("valid_range", (about.get("valid_min"), about.get("valid_max")))
     pair = pair if np.size(pair) == 2 else (None, None)
     # floating ends of whole numbers with a scale are values, others are packed (NetCDF Users Guide, conventions)
@@ -78,7 +93,7 @@ def unpacking(about: Mapping[str, Any], stored: np.dtype[Any]) -> tuple[Turn | N
         out |= False if high is None else (values if are_values[1] else packed) > high
         return np.where(out, np.float32(np.nan), values)
 
-    return unpack, None
+    return unpack, late[0] if late else None
 
 
 def _held(number: Any, stored: np.dtype[Any], kind: np.dtype[Any]) -> float | None:

@@ -27,6 +27,8 @@ from pyproj.exceptions import ProjError
 
 from spectralzoom.pipeline.errors import SceneError
 from spectralzoom.pipeline.ground.georeference import OFF_GRID_PX
+from spectralzoom.storage.readers.band_facts import unit_of
+from spectralzoom.storage.readers.cube_sources import library_log
 from spectralzoom.storage.readers.own_files import check_sidecars
 
 if TYPE_CHECKING:
@@ -110,7 +112,8 @@ def _axis(dataset: xr.Dataset, dim: str, kind: str) -> _Axis | None:
         found = dataset.variables.get(name)
         if found is None or found.dims != (dim,) or found.dtype.kind not in "iuf" or not found.size:
             continue
-        standard, axis, unit = (str(found.attrs.get(key, "")).strip() for key in ("standard_name", "axis", "units"))
+        standard, axis = (str(found.attrs.get(key, "")).strip() for key in ("standard_name", "axis"))
+        unit = unit_of(found.attrs)
         word = str(name).rpartition("/")[2]
         if not (
             name == dim or standard in marks or kind in (axis.lower(), word.lower()) or word.lower() in _NAMES[kind]
@@ -330,12 +333,11 @@ def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int])
     if not set(_ENVI_PLACES) & set(header):
         return None, ()
     rasterio = importlib.import_module("rasterio")
-    check_sidecars(data)
+    with library_log():
+        check_sidecars(data, "ENVI")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(data, driver="ENVI") as file:
-                found, notes = place_of_file(file)
+        with library_log(), rasterio.open(data, driver="ENVI") as file:
+            found, notes = place_of_file(file)
     except Exception as error:  # of GDAL and PROJ
         return None, (f"its map info cannot be read: {error}",)
     if found is None or found.crs is None:

@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from spectralzoom.pipeline.capture.straight_scans import angles_to_positions
 from spectralzoom.pipeline.errors import SceneError
+from spectralzoom.pipeline.exposures import WILD_RATIO
 from spectralzoom.pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats
-from spectralzoom.storage.readers.own_files import within
+from spectralzoom.pipeline.signal.line_faults import leave_out, wild_exposures
+from spectralzoom.storage.readers.user_files import first_there, is_there
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,6 +33,9 @@ KINDS: Mapping[Kind, tuple[str, ...]] = {
 WITHOUT_MIRROR: tuple[Kind, ...] = ("px", "m")
 ACCEPTED = ("line", "sweep", "time", "exposure_ms", "valid", *(name for names in KINDS.values() for name in names))
 ENDINGS = (".csv", ".tsv", ".txt")
+_OF_ANGLES = "beyond the mirror, which turns the view by up to 50 deg along the scan and 35.6 deg across it"
+REACH = {"mirror": "beyond the mirror, which reaches X^2 + Y^2 <= 1", "angles": _OF_ANGLES, "angle": _OF_ANGLES}
+POSSIBLE = f"expected a time above 0 ms, less than {WILD_RATIO:g} times off the median"
 
 
 @dataclass(frozen=True)
@@ -43,12 +48,13 @@ class LinePointing:
     time_s: Floats | None = None  # (line,) of mid exposure
     exposure_ms: Floats | None = None  # (line,)
     part: tuple[str, ...] | None = None  # (line,) names of the sweeps, if a table cuts one cube into several
+    notes: tuple[str, ...] = ()  # on lines that are left out
 
 
 def find_pointing(folder: Path, stem: str, marks: Sequence[str] = (".pointing",)) -> Path | None:
     """Return the file ``STEM.pointing.csv`` (or .tsv, .txt) of a cube in a folder."""
     names = [f"{stem}{mark}{ending}" for mark in marks for ending in ENDINGS]
-    return next((within(folder, folder / name) for name in names if (folder / name).is_file()), None)
+    return first_there(folder / name for name in names)
 
 
 def load_pointing(
@@ -57,8 +63,10 @@ def load_pointing(
     """Read the pointing of the cube ``name``: the rows whose ``sweep`` is its name, or all without that column.
 
     If the cube is ``alone`` and no row has its name, the column cuts it into sweeps. ``mounting`` transforms the
-    device's positions to the model's. Raises SceneError: the table cannot be read, or does not describe the cube.
+    device's positions to the model's. Lines that cannot be are not valid. Raises SceneError: the table cannot be read,
+    or does not describe the cube, or more than a tenth of the lines cannot be.
     """
+    is_there(path)
     table = _read_table(path)
     kind = _kind_of(path, list(table.columns))
     rows = table
@@ -83,15 +91,38 @@ def load_pointing(
         valid = rows["valid"].to_numpy() == 1
     if not valid.any():
         raise SceneError(f"{path} calls no line of {name} valid; set valid = 1 for lines that can be used")
-    for column in (*KINDS[kind], *({"time", "exposure_ms"} & set(rows))):
-        unknown = valid & ~np.isfinite(rows[column])
-        _refuse(path, rows, [column], unknown, "expected a number; set valid = 0 where it is not known")
+    if "time" in rows:
+        unknown = valid & ~np.isfinite(rows["time"])
+        _refuse(path, rows, ["time"], unknown, "expected a number; set valid = 0 where it is not known")
+    valid, position, exposure_ms, notes = _possible(path, rows, kind, valid, mounting)
     time_s = _times(path, rows, valid) if "time" in rows else None
-    exposure_ms = _filled(rows["exposure_ms"].to_numpy(), valid) if "exposure_ms" in rows else None
-    if exposure_ms is not None:
-        _refuse(path, rows, ["exposure_ms"], exposure_ms <= 0, "expected a time above 0 ms")
     part = tuple(rows["sweep"]) if cut else None
-    return LinePointing(kind, _positions(path, rows, kind, valid, mounting), valid, time_s, exposure_ms, part)
+    return LinePointing(kind, position, valid, time_s, exposure_ms, part, tuple(notes))
+
+
+def _possible(
+    path: Path, rows: pd.DataFrame, kind: Kind, valid: NDArray[np.bool_], mounting: Mounting
+) -> tuple[NDArray[np.bool_], Floats, Floats | None, list[str]]:
+    """Return valid lines, positions and exposures, and notes; lines that cannot be are not valid, and interpolated.
+
+    Raises SceneError: more than a tenth of the lines cannot be.
+    """
+    given = rows[list(KINDS[kind])].to_numpy()
+    exposure_ms = rows["exposure_ms"].to_numpy() if "exposure_ms" in rows else None
+    wild = np.zeros(len(rows), np.bool_) if exposure_ms is None else wild_exposures(exposure_ms, valid)
+    unknown = ~np.isfinite(given).all(axis=1)
+    lost = ~np.isfinite(_positions(kind, given, mounting)).all(axis=1)
+    checks = (
+        (valid & unknown, KINDS[kind], "expected a number"),
+        (valid & lost & ~unknown, KINDS[kind], REACH.get(kind, "")),
+        (valid & wild & ~lost, ("exposure_ms",), POSSIBLE),
+    )
+    faults = {_row_text(rows[wrong], names, expected): wrong for wrong, names, expected in checks if wrong.any()}
+    valid, notes = leave_out(str(path), valid, faults, "correct the table")
+    if exposure_ms is not None:
+        exposure_ms = _filled(np.where(wild, np.nan, exposure_ms), valid)
+    every = [_filled(np.where(lost, np.nan, values), valid) for values in given.T]
+    return valid, _positions(kind, np.stack(every, axis=-1), mounting), exposure_ms, notes
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -148,32 +179,28 @@ def _times(path: Path, rows: pd.DataFrame, valid: NDArray[np.bool_]) -> Floats:
     return np.where(valid | ((before < time_s) & (time_s < after)), time_s, np.nan)
 
 
-def _positions(path: Path, rows: pd.DataFrame, kind: Kind, valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
-    """Return (line, 2) positions of the model, or (line, 1) places, interpolated for invalid lines."""
-    values = np.stack([_filled(rows[name].to_numpy(), valid) for name in KINDS[kind]], axis=-1)
+def _positions(kind: Kind, values: Floats, mounting: Mounting) -> Floats:
+    """Return (line, 2) positions of the model, or (line, 1) places; NaN beyond the mirror."""
     if kind in WITHOUT_MIRROR:
         return values
     if kind == "mirror":
         position = mounting.to_model(values)
-        beyond = ~(np.hypot(*position.T) <= 1 + RIM_SLACK["float64"])
-        reach = "beyond the mirror, which reaches X^2 + Y^2 <= 1"
-    else:
-        angles = values if kind == "angles" else np.concatenate([np.zeros_like(values), values], axis=1)
-        position, reached = angles_to_positions(angles)
-        beyond = ~reached
-        reach = "beyond the mirror, which turns the view by up to 50 deg along the scan and 35.6 deg across it"
-    _refuse(path, rows, KINDS[kind], beyond, reach)
-    return position
+        return np.where(np.hypot(*position.T)[:, None] <= 1 + RIM_SLACK["float64"], position, np.nan)
+    return angles_to_positions(values if kind == "angles" else np.concatenate([values * 0, values], axis=1))[0]
 
 
 def _refuse(path: Path, rows: pd.DataFrame, columns: Sequence[str], wrong: ArrayLike, expected: str) -> None:
     """Raise SceneError for the first wrong row, with its number in the file."""
     found = rows[np.asarray(wrong)]
-    if found.empty:
-        return
+    if not found.empty:
+        raise SceneError(f"{path}, {_row_text(found, columns, expected)}; correct the table")
+
+
+def _row_text(found: pd.DataFrame, columns: Sequence[str], expected: str) -> str:
+    """Return the number and the values of the first of some rows."""
     came = ", ".join(f"{name} = {found[name].iloc[0]:.10g}" for name in columns)
     more = "" if len(found) == 1 else f" (the first of {len(found)} such rows)"
-    raise SceneError(f"{path}, row {found.index[0]}: {came}{more}, {expected}; correct the table")
+    return f"row {found.index[0]}: {came}{more}, {expected}"
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:

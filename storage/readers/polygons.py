@@ -28,8 +28,8 @@ from spectralzoom.pipeline.ground.field_places import FieldPlace, GroundPlace, N
 from spectralzoom.pipeline.ground.georeference import WGS84
 from spectralzoom.pipeline.ground.zones import on_field
 from spectralzoom.storage.readers.labels import MOST_FOUND_CLASSES, Labels, class_colours
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
+from spectralzoom.storage.readers.user_files import is_there, reading_files
 
 if TYPE_CHECKING:
     import geopandas
@@ -81,6 +81,7 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
     return ZoneFile(source, table.crs, shapes, notes)
 
 
+@reading_files()
 def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]:
     """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes, without empty ones; and notes.
 
@@ -91,7 +92,7 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
     path, layer = split_layer(source)
     if path.suffix.lower() not in ZONE_ENDINGS:
         raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
-    if not path.is_file():
+    if not is_there(path) or path.is_dir():
         raise ZoneError(f"there is no file {path}; give the path of a file with polygons, or leave it out")
     try:
         table = _read_table(path, layer)
@@ -101,7 +102,7 @@ def read_polygons(source: str) -> tuple[geopandas.GeoDataFrame, tuple[str, ...]]
         _check_coordinates(table)
         valid = table.geometry.is_valid
         whole = [one if one.is_valid else polygons_of(shapely.make_valid(one)) for one in table.geometry.force_2d()]
-    except ZoneError:
+    except PipelineError:
         raise
     except (OSError, ValueError, RuntimeError, *OF_LIBRARIES) as error:
         raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None
@@ -138,7 +139,8 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
     with path.open("rb") as file:
         head = file.read(100)
     if head.startswith(SQLITE_MAGIC) and head[68:70] == GEOPACKAGE_ID:
-        _check_parts(path, [f"{path.name}{end}" for end in ("-wal", "-journal", "-shm")])
+        for end in ("-wal", "-journal", "-shm"):  # which SQLite may write
+            is_there(path.with_name(f"{path.name}{end}"), noted=False)
         _check_tables(path)
         address = f"GPKG:{path.absolute()}"
         layers = [str(name) for name, kind in pyogrio.list_layers(address) if kind is not None]
@@ -148,7 +150,8 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
             raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{[*layers, 'LAYER'][0]}")
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(address, layer=found))
     if head.startswith(SHAPEFILE_MAGIC) and path.suffix.lower() == ".shp":
-        _check_parts(path, [f"{path.stem}{end}" for part in SHAPEFILE_PARTS for end in (part, part.upper())])
+        for end in (end for part in SHAPEFILE_PARTS for end in (part, part.upper())):
+            is_there(path.with_name(f"{path.stem}{end}"))
         if "!" in str(path.absolute()):
             raise ValueError('a "!" in its path stands for an archive; rename that folder')
         return geopandas.GeoDataFrame(pyogrio.read_dataframe(path.absolute()))
@@ -158,13 +161,6 @@ def _read_table(path: Path, layer: str | None) -> geopandas.GeoDataFrame:
         return _read_geojson(path.read_text(encoding="utf-8-sig"))
     except (AttributeError, KeyError, TypeError):
         raise ValueError("it is no valid GeoJSON") from None
-
-
-def _check_parts(path: Path, names: Iterable[str]) -> None:
-    """Refuse parts of a file that are no files, or links out of its folder (SceneError, ValueError)."""
-    for part in map(path.with_name, names):
-        if part.exists() and not within(path, part).is_file():
-            raise ValueError(f"{part} is no file")
 
 
 def _check_tables(path: Path) -> None:

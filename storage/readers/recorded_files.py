@@ -15,16 +15,16 @@ from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.exposures import all_alike, match_exposures
 from spectralzoom.pipeline.geometry.camera import LineCamera
 from spectralzoom.pipeline.geometry.scan import Axis, Floats
-from spectralzoom.pipeline.signal.calibrate import find_bad_elements, full_scale_notes
+from spectralzoom.pipeline.signal.calibrate import check_frames, find_bad_elements
 from spectralzoom.pipeline.source import References
 from spectralzoom.storage.readers.array_files import find_zarr_store
-from spectralzoom.storage.readers.band_facts import bands_text, numbers_of_list, why_unknown
+from spectralzoom.storage.readers.band_facts import bands_text, why_unknown
 from spectralzoom.storage.readers.cube_sources import CubeSource
 from spectralzoom.storage.readers.envi_files import DATA_ENDINGS, find_envi_pair, load_envi_header
 from spectralzoom.storage.readers.frames import KINDS, Frame, find_frames, taken_of
 from spectralzoom.storage.readers.open_cubes import open_cube_source, reader_of, with_wavelengths
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import LinePointing
+from spectralzoom.storage.readers.user_files import is_there
 
 SAMPLED_LINES = 64  # for bits
 
@@ -59,7 +59,8 @@ def find_cubes(path: Path) -> list[Path]:
     """Return the cubes of an address: itself, or the ENVI cubes or Zarr stores of a folder (SceneError: none)."""
     if not path.is_dir() or find_zarr_store(path) is not None:
         return [path]
-    headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
+    entries = sorted(entry for entry in path.iterdir() if entry.suffix.lower() in (".hdr", ".zarr") and is_there(entry))
+    headers = [entry for entry in entries if entry.suffix.lower() == ".hdr" and entry.is_file()]
     if any(entry.name.lower().startswith("raw_") for entry in headers):
         return [path]  # parts of a Headwall camera's cube
     stems = [(entry, _stem(entry).lower()) for entry in headers]
@@ -79,7 +80,7 @@ def find_cubes(path: Path) -> list[Path]:
         raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
     if cubes and stores:
         raise SceneError(f"{path} holds ENVI cubes and the Zarr store {stores[0].name}; name one, or move either kind")
-    return [within(path, one) for one in cubes or stores]
+    return cubes or stores
 
 
 def _stem(path: Path) -> str:
@@ -109,12 +110,11 @@ def open_file_cube(path: Path, wavelengths: Sequence[float] | None, stated: Mapp
         raise WavelengthError(f"{path} gives no wavelength of bands {without} (from 0); give --wavelengths in nm")
     folder = path if path.is_dir() and find_zarr_store(path) is None else path.parent
     name = _stem(path.absolute())  # of the folder ., too
+    frames = find_frames(folder / name, stated, source.shape[1:], source.bands)
     fields = load_envi_header(find_envi_pair(path)[0]).fields if reader_of(path) == "envi" else {}
     if (axis := fields.get("line axis", "x").strip()) not in ("x", "y"):
         raise SceneError(f"{path} has line axis = {axis!r}, expected x or y; correct the header")
-    return FileCube(
-        name, folder, source, find_frames(folder / name, stated, source.shape[1:]), "y" if axis == "y" else "x"
-    )
+    return FileCube(name, folder, source, frames, "y" if axis == "y" else "x")
 
 
 def with_bits(camera: LineCamera, cubes: Sequence[FileCube]) -> tuple[LineCamera, list[str]]:
@@ -175,17 +175,13 @@ def references_of(
         )
     dark = found.get("dark", np.zeros(frame, np.float32))
     white = found.get("white", np.full(frame, white_dn, np.float32))
-    if not (white > dark).any():
-        raise SceneError(
-            f"the white frame of {name} is nowhere brighter than its dark frame; exchange them, or give others with "
-            "--dark and --white"
-        )
+    more = check_frames(f"{name}: ", dark, white, white_dn)
+    notes += more if "white" in found else []
     bad: NDArray[Any] = found.get("bad", np.zeros(frame, np.float32))
     if measured and "bad" not in found:
         bad = find_bad_elements(dark, white)
-        notes += full_scale_notes(white, white_dn)
     fields = frames["white"].fields if "white" in frames else {}
-    listed = numbers_of_list(fields.get("white_reference", ""), frame[1])
+    listed = frames["white"].white_reference if "white" in frames else None
     value = np.asarray(white_reference if listed is None or np.isnan(listed).any() else listed, np.float32)
     if value.shape not in ((), frame[1:]):
         raise SceneError(

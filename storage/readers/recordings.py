@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +19,23 @@ from spectralzoom.pipeline.geometry.camera import LARGEST_SUM_DN, LineCamera
 from spectralzoom.pipeline.geometry.mirror import STRAIGHT, Mounting
 from spectralzoom.pipeline.geometry.scan import Floats, Sweep, scan_positions
 from spectralzoom.pipeline.ground.georeference import geobox_of_record
+from spectralzoom.pipeline.signal.line_faults import (
+    BEYOND,
+    CURE,
+    NO_EXPOSURE,
+    beyond_mirror,
+    counted,
+    leave_out,
+    wild_exposures,
+)
+from spectralzoom.storage.arrays.cubes import RawCube
 from spectralzoom.storage.arrays.layout import array_of, open_group
 from spectralzoom.storage.arrays.signal_cubes import RestoredCube, open_lines
 from spectralzoom.storage.readers.array_files import lost_chunks
 from spectralzoom.storage.readers.cube_sources import CubeSource
-from spectralzoom.storage.readers.own_files import within
 from spectralzoom.storage.readers.pointing_tables import WITHOUT_MIRROR, LinePointing, find_pointing, load_pointing
 from spectralzoom.storage.readers.recorded_files import FileCube, find_cubes, open_file_cube, references_of, with_bits
+from spectralzoom.storage.readers.user_files import OpenedFiles, files_below, reading_files
 from spectralzoom.storage.runs import LINE_PRODUCTS, Run, read_run
 from spectralzoom.storage.store import MANIFEST, Archive, check_store, damage, is_archive, try_manifest
 from spectralzoom.storage.whole_files import sha256
@@ -44,6 +54,7 @@ def stores_of_lines(products: Mapping[str, str], is_there: Callable[[str], bool]
     return raw if all(map(is_there, raw)) else condensed[:1] or raw
 
 
+@reading_files()
 def open_recording(
     address: str | Path,
     camera: LineCamera | None = None,
@@ -68,7 +79,7 @@ def open_recording(
     if (of_archive := _run_with_cubes(address)) is not None:
         stores = of_archive[2]
     else:
-        beside = [path] if _is_raw_cube(path) else sorted(within(path, one) for one in path.glob("*.zarr"))
+        beside = [path] if _is_raw_cube(path) else sorted(path.glob("*.zarr"))
         stores = [one for one in beside if _is_raw_cube(one)]
     flags = {"pointing": pointing, "dark": dark, "white": white, "wavelengths": wavelengths}
     if not stores:
@@ -87,39 +98,54 @@ def _stored_recording(stores: Sequence[Path], camera: LineCamera) -> Recording:
     """Open raw cubes, or condensed sweeps, of an archive."""
     for folder in {path.parent for path in stores if (path.parent / MANIFEST).is_file()}:
         check_store(folder)
-    cubes = [open_lines(path) for path in stores]
+    with reading_files() as opened:
+        light = tuple(_content_of(path, opened) for path in stores)
+        cubes = [open_lines(path) for path in stores]
     first = cubes[0]
     for path, cube in zip(stores, cubes, strict=True):
         if not np.array_equal(cube.wavelength_nm, first.wavelength_nm):
             raise SceneError(f"{path} has other bands than {stores[0]}; name the raw cubes of one survey")
         if "dn" in cube.group and (lost := lost_chunks(array_of(cube.group, "dn"))[0]):
             raise IncompleteStoreError(f"{path}/dn lacks {lost} of its chunks, whose lines would be 0; copy it again")
+    notes = [RESTORED] if any(isinstance(cube, RestoredCube) for cube in cubes) else []
     sweeps = tuple(
-        RecordedSweep(
-            cube.sweep, cube.references, cube.position, cube.time_s, cube.exposure_ms, cube.valid_line, cube.read_lines
-        )
-        for cube in cubes
-    )
-    light = tuple(
-        f"{path.name} {sha256(path.parent / MANIFEST)}"
-        if (path.parent / MANIFEST).is_file()
-        else " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
-        for path in stores
+        replace(one, read_lines=opened.guarded(one.read_lines))
+        for one in (_stored_sweep(path, cube, notes) for path, cube in zip(stores, cubes, strict=True))
     )
     camera = _exposing(camera, [float(np.nanmedian(one.exposure_ms)) for one in sweeps if one.valid_line.any()])
-    notes = (RESTORED,) if any(isinstance(cube, RestoredCube) for cube in cubes) else ()
-    return Recording(sweeps, camera, first.wavelength_nm, first.fwhm_nm, notes, light)
+    return Recording(sweeps, camera, first.wavelength_nm, first.fwhm_nm, tuple(notes), light)
+
+
+def _stored_sweep(path: Path, cube: RawCube, notes: list[str]) -> RecordedSweep:
+    """Return the sweep of a raw cube; lines that cannot be are not valid, and have the usual exposure (SceneError)."""
+    wild = wild_exposures(cube.exposure_ms, cube.valid_line)
+    beyond = beyond_mirror(cube.position)
+    faults = counted((what, cube.valid_line & one) for what, one in ((NO_EXPOSURE, wild), (BEYOND, beyond & ~wild)))
+    valid, more = leave_out(path.name, cube.valid_line, faults, CURE)
+    usual = float(np.median(cube.exposure_ms[~wild])) if not wild.all() else 1.0
+    exposure_ms = np.where(wild, usual, cube.exposure_ms)
+    references, varies = cube.references, not all_alike(exposure_ms)
+    if varies and references.exposure_ms is None and not isinstance(cube, RestoredCube):
+        references = replace(references, exposure_ms=usual)
+        more.append(f"{path.name}: white is taken to have {usual:g} ms")
+    if varies:
+        more.append(f"{path.name}: lines of {span_text(exposure_ms)} are scaled to the exposure of white")
+    notes += more
+    position = np.where(beyond[:, None], np.nan, cube.position)
+    return RecordedSweep(cube.sweep, references, position, cube.time_s, exposure_ms, valid, cube.read_lines)
+
+
+def _content_of(path: Path, opened: OpenedFiles) -> str:
+    """Return the hash of a raw cube: of its store's manifest in an archive, elsewhere of each file."""
+    if (path.parent / MANIFEST).is_file():
+        return f"{path.name} {sha256(path.parent / MANIFEST)}"
+    return " ".join(f"{file.relative_to(path)}:{opened.digest(file)}" for file in files_below(path))
 
 
 def _exposing(camera: LineCamera, exposures_ms: Sequence[float]) -> LineCamera:
     """Return the camera with the exposure of a recording, if known."""
     kept = not exposures_ms or camera.exposure_ms in exposures_ms
     return camera if kept else replace(camera, exposure_ms=exposures_ms[0])
-
-
-def _stamps(files: Iterable[Path]) -> list[str]:
-    """Return name, size and time of change of files."""
-    return [f"{file.name}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
 
 
 def _recording_of(files: Mapping[Path, FileCube], camera: LineCamera, white_reference: ArrayLike) -> Recording:
@@ -152,7 +178,7 @@ def _recording_of(files: Mapping[Path, FileCube], camera: LineCamera, white_refe
         found, more = _sweeps_of(cube, camera, white_reference, stated=stated)
         sweeps += found
         notes += more
-    light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
+    light = tuple(cube.source.opened.digest(file) for cube in cubes for file in cube.source.files)
     unique = tuple(dict.fromkeys(notes))
     acquired = min((cube.source.acquired for cube in cubes if cube.source.acquired is not None), default=None)
     of_bands = bands.wavelength_nm, bands.fwhm_nm
@@ -172,7 +198,7 @@ def _point(cube: FileCube, file: Path | None, mounting: Mounting, alone: bool) -
     if not file.is_file():
         raise SceneError(f"there is no pointing table {file}; check the name (seen from {Path.cwd()})")
     pointing = load_pointing(file, cube.name, cube.source.shape[0], mounting, alone=alone)
-    notes = [f"{cube.name}: pointing from {file.name}"]
+    notes = [f"{cube.name}: pointing from {file.name}", *pointing.notes]
     stated, pointed = cube.exposure_ms, pointing.exposure_ms
     if stated is not None and pointed is not None and not all(map(all_alike, zip(stated, pointed, strict=True))):
         both = f"{span_text(pointed)}, count; the files state {span_text(stated)}"
@@ -331,7 +357,7 @@ def _run_with_cubes(address: str | Path) -> tuple[Archive, Run, list[Path]] | No
     archive = Archive.open(place, create=False, write=False)
     for folder in [archive.run_folder(name)] if name else archive.past_runs():
         run = read_run(folder)
-        if name and run.problem is not None:
+        if run.problem is not None and (name or run.products):
             raise damage(folder, run.problem)
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:

@@ -18,9 +18,17 @@ from odc.geo.geobox import GeoBox
 from spectralzoom.pipeline.errors import EmptySceneError, SceneError
 from spectralzoom.pipeline.geometry.grid import SceneGrid, cuts
 from spectralzoom.pipeline.readings import MOST_VALUE, beyond_range, find_beyond
+from spectralzoom.pipeline.signal.line_faults import CURE, DARK_LINE, counted, leave_out
 from spectralzoom.storage.parallel.pool import RESERVED_BYTES, memory_refusal
 from spectralzoom.storage.readers.band_facts import Bands, bands_text
-from spectralzoom.storage.readers.cube_sources import BLOCK_LINES, CubeSource, check_memory, scene_lines, unpacked
+from spectralzoom.storage.readers.cube_sources import (
+    BLOCK_LINES,
+    CubeSource,
+    check_memory,
+    dark_lines,
+    scene_lines,
+    unpacked,
+)
 from spectralzoom.storage.readers.label_files import label_file, read_labels
 from spectralzoom.storage.readers.labels import Labels
 from spectralzoom.storage.readers.open_cubes import open_cube_source, split_variable
@@ -31,7 +39,7 @@ from spectralzoom.storage.readers.scene_toml import (
     find_scene_settings,
     settle_wavelengths,
 )
-from spectralzoom.storage.whole_files import sha256
+from spectralzoom.storage.readers.user_files import reading_files
 
 USUAL_NODATA = -9999.0  # assumed where no file states another
 COPIES = 6  # of a block in memory while it is read and processed
@@ -70,6 +78,7 @@ class SceneFile:
         return self.read(0, self.shape[0]) if self.kept is None else self.kept
 
 
+@reading_files()
 def open_scene_file(
     address: str | Path,
     *,
@@ -96,7 +105,9 @@ def open_scene_file(
     stated = wavelengths is not None or settings.wavelengths_nm is not None or settings.wavelengths_file is not None
     known = [band for band in range(count) if stated or band not in source.bands.unknown]
     chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands, known)
-    light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
+    light = settle_wavelengths(
+        file, chosen, count, stated=wavelengths, settings=settings, known=source.bands, shape=source.shape
+    )
     assert light.wavelength_nm is not None
     values = FileValues.of(source, chosen, settings)
     if keep:
@@ -104,7 +115,7 @@ def open_scene_file(
     kept = np.empty((height, width, len(chosen)), np.float32) if keep else None
     missing, filled_px, void, gaps = _find_gaps(file, values, kept)
     found, label_note = _labels_of(file, source, labels, settings, classes or {})
-    content = _content_hash(file, source.files)
+    content = _content_hash(file, source)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     scene = SceneFile(
         name=file.stem,
@@ -156,12 +167,12 @@ def _light_hash(
     return _digest(content, variable, values.bands, light.wavelength_nm.tolist(), widths, *more)
 
 
-def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
+def _content_hash(file: Path, source: CubeSource) -> str:
     """Return the hash of all files, and of their names within a folder."""
-    if files == (file,):
-        return sha256(file)
-    within = [entry.relative_to(file).as_posix() if file in entry.parents else "" for entry in files]
-    return _digest(*((name, sha256(entry)) for name, entry in zip(within, files, strict=True)))
+    if source.files == (file,):
+        return source.opened.digest(file)
+    names = [entry.relative_to(file).as_posix() if file in entry.parents else "" for entry in source.files]
+    return _digest(*zip(names, map(source.opened.digest, source.files), strict=True))
 
 
 def _chosen_bands(
@@ -220,6 +231,7 @@ def _read_from(address: str | Path, found: Labels, settings: SceneSettings) -> s
     return f"labels from {address}, {how}"
 
 
+@reading_files()
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
     """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes (SceneError)."""
     settings = find_scene_settings(split_variable(address)[0])
@@ -305,10 +317,15 @@ def _find_gaps(
     chosen = values.bands
     missing = np.zeros((height, width), np.bool_)
     seen = np.zeros(len(chosen), np.bool_)
-    filled_px = void = infinite = absent = 0
+    filled_px = void = infinite = absent = after_scale = 0
+    source, dark = values.source, np.zeros(height, np.bool_)
     for rows in cuts(height, BLOCK_LINES):
         picked, block, empty = values.converted(rows.start, rows.stop)
+        if source.dark is not None:
+            dark[rows] = dark_lines(source, source.read(rows.start, rows.stop))
         void += 0 if empty is None else int(np.count_nonzero(empty))
+        if (packed := values.source.packed_nodata) is not None:
+            after_scale += int(np.count_nonzero(np.isclose(block, packed, rtol=1e-6, atol=0)))
         if beyond_range(picked) is not None:
             found = find_beyond(picked if empty is None else np.where(empty, picked.dtype.type(0), picked))
             if found is not None:
@@ -328,13 +345,18 @@ def _find_gaps(
         seen |= known.any(axis=(0, 1))
         if kept is not None:
             kept[rows] = values.scaled(block)
-    notes: list[str] = []
+    _, notes = leave_out(source.name, source.valid, counted([(DARK_LINE, dark)]), CURE)
     if void and not values.assumed:
         notes.append(f"{void} samples have the file's no-data value {values.nodata:g}")
     elif void:
         notes.append(
             f"{void} samples are {values.nodata:g}, which is taken for no data; if it is a value, state another number"
             f" as nodata in a {SETTINGS_NAME}"
+        )
+    if after_scale and not absent:
+        notes.append(
+            f"no sample has the file's no-data value {packed:g} before scaling, and {after_scale} have it after; if"
+            f" these are no data, write nodata = {packed:g} into a {SETTINGS_NAME}"
         )
     if infinite:
         notes.append(f"{infinite} infinite samples count as missing")

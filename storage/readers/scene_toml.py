@@ -24,8 +24,9 @@ from pydantic import (
 from spectralzoom.pipeline.errors import SceneError, WavelengthError
 from spectralzoom.pipeline.setting_fields import numbers_of
 from spectralzoom.pipeline.toml_files import read_toml
-from spectralzoom.storage.readers.band_facts import RANGE_NM, Bands, bands_text, why_unknown
-from spectralzoom.storage.readers.own_files import stated_file, within
+from spectralzoom.storage.readers.band_facts import RANGE_NM, Bands, axis_hint, bands_text, why_unknown
+from spectralzoom.storage.readers.own_files import stated_file
+from spectralzoom.storage.readers.user_files import first_there
 
 SETTINGS_NAME = "scene.toml"
 IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # scene.toml may be above such a folder
@@ -92,11 +93,8 @@ def find_scene_settings(scene: Path) -> SceneSettings:
     Raises SceneError: the file is no TOML, or has an unknown key or a wrong value.
     """
     folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
-    home = next((folder for folder in folders if (folder / SETTINGS_NAME).is_file()), None)
-    if home is None:
-        return SceneSettings()
-    beside = None if scene.name == SETTINGS_NAME else scene.resolve().parent
-    return load_scene_settings(within(home, home / SETTINGS_NAME, beside))
+    found = first_there(folder / SETTINGS_NAME for folder in folders)
+    return SceneSettings() if found is None else load_scene_settings(found)
 
 
 def is_image_folder(folder: Path) -> bool:
@@ -154,22 +152,24 @@ def settle_wavelengths(
     stated: Sequence[float] | None,
     settings: SceneSettings,
     known: Bands,
+    shape: Sequence[int] = (),
 ) -> Bands:
     """Return wavelengths of the chosen bands [nm] from the flag, else from ``scene.toml``, else from the file.
 
     ``bands`` count from 0, of ``file_bands``. The flag (``stated``) has one for each of them or for each band of the
-    file; ``known`` has one for every band of the file. Raises WavelengthError: there are none, or their number, unit or
-    range is wrong.
+    file; ``known`` has one for every band of the file, of a cube with this (y, x, band) ``shape``. Raises
+    WavelengthError: there are none, or their number, unit or range is wrong.
     """
     chosen = list(bands)
     if stated is not None:
         values = check_wavelengths(stated, "--wavelengths")
-        fitting = _fit(values, chosen, file_bands, chosen, f"--wavelengths for {path}")
+        fitting = _fit(values, chosen, shape or (file_bands,), chosen, f"--wavelengths for {path}")
         return Bands(fitting, None, f"wavelengths stated: {_listed(fitting)} nm")
     if settings.wavelengths_nm is not None:
         values = check_wavelengths(settings.wavelengths_nm, f"{settings.path}: wavelengths_nm")
         own = list(range(file_bands)) if settings.bands is None else list(settings.bands)
-        fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
+        where = f"{settings.path}: wavelengths_nm for {path}"
+        fitting = _fit(values, chosen, shape or (file_bands,), own, where)
         return Bands(fitting, None, f"wavelengths from {settings.path}")
     if settings.wavelengths_file is not None and settings.path is not None:
         table = stated_file(settings.path.parent, settings.wavelengths_file, f"{settings.path}: wavelengths_file")
@@ -186,15 +186,16 @@ def settle_wavelengths(
 
 
 def _fit(
-    values: NDArray[np.float64], chosen: list[int], file_bands: int, own: list[int], where: str
+    values: NDArray[np.float64], chosen: list[int], shape: Sequence[int], own: list[int], where: str
 ) -> NDArray[np.float64]:
-    """Return the wavelengths of the chosen bands, out of those of the bands ``own`` or of every band."""
+    """Return the wavelengths of the chosen bands, out of those of the bands ``own`` or of every band of a cube."""
+    file_bands = shape[-1]
     belongs = own if len(values) == len(own) else list(range(file_bands))
     if len(values) != len(belongs):
         ways = f"{len(own)} or {file_bands}" if len(own) != file_bands else f"{file_bands}"
         raise WavelengthError(
             f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list (axes are y, x,"
-            " band)"
+            f" band){axis_hint(shape, len(values))}"
         )
     known = dict(zip(belongs, values.tolist(), strict=True))
     if missing := [band for band in chosen if band not in known]:

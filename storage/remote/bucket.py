@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from spectralzoom.pipeline.errors import ArchiveError
+from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError
 from spectralzoom.storage.remote.objects import Objects, some_at_a_time
 from spectralzoom.storage.store import (
     LATEST,
@@ -24,18 +25,24 @@ from spectralzoom.storage.store import (
     RESTS_ON,
     Archive,
     check_store,
+    conflicts,
+    digest_of,
+    inputs_first,
     is_cleared,
     is_known,
     lies_ahead,
     manifest_bytes,
+    manifest_digest,
     parse_manifest,
     try_manifest,
     uri_of,
 )
+from spectralzoom.storage.whole_files import write_new
 
 OF_CLEARED = "cleared.json"  # the manifest of a store without its files
 KINDS = (OF_CLEARED, MANIFEST)
 PROBE = ".conditional-put"
+TO_ANOTHER = "two machines made it, not bit for bit equal: keep one of both, or copy to another folder or prefix"
 Report = Callable[[str, float], None]  # address, and the fraction that is done
 
 
@@ -44,7 +51,7 @@ class Copied:
     """Stores and runs that were copied, the bytes of their files, and the number of those that were there before.
 
     ``conflicts`` are runs that were not copied, since another run has their name; ``missing`` are stores that copied
-    runs name, and that are in neither place.
+    runs name, and that are in neither place. ``bad_names`` are objects in the bucket that no client can ask for.
     """
 
     copied: list[str]
@@ -52,13 +59,15 @@ class Copied:
     there: int
     conflicts: list[str]
     missing: list[str]
+    bad_names: list[str]
 
 
 def push(archive: Archive, objects: Objects, report: Report) -> Copied:
-    """Send the stores and runs that the bucket lacks; stores come first, so that each run finds its own.
+    """Send the stores and runs that the bucket lacks, inputs first, so that each run finds its own.
 
     Files of stores that were cleared or removed here stay in the bucket. Raises UnreachableError: the bucket refuses or
-    does not answer; IncompleteStoreError: a store or run is damaged; ArchiveError: the bucket ignores conditional puts.
+    does not answer; ArchiveError: the bucket ignores conditional puts; IncompleteStoreError, after all else was sent: a
+    store or run is damaged, or the bucket has an input of it with other content.
     """
     with archive.in_use():
         return send_stores(archive, objects, list(archive.manifests()), report)
@@ -67,19 +76,34 @@ def push(archive: Archive, objects: Objects, report: Report) -> Copied:
 def send_stores(
     archive: Archive, objects: Objects, uris: Collection[str], report: Report = lambda uri, done: None
 ) -> Copied:
-    """Send these stores and runs, in this order, if the bucket lacks them. Raises as `push`."""
+    """Send these stores and runs, inputs first, if the bucket lacks them. Raises as `push`."""
     there = _published(objects.listing())
     waiting = [uri for uri in uris if there.get(uri) not in (MANIFEST, _manifest_name(archive.root / uri))]
     if waiting:
         _check_conditional_puts(objects)
-    return _copy(archive, objects, uris, waiting, report, lambda uri: _send(archive.root / uri, uri, objects))
+    digests: dict[str, str] = {}  # of stores in the bucket
+
+    def digest_there(uri: str) -> str | None:
+        if uri not in digests and uri in there:
+            text = objects.read(f"{uri}/{there[uri]}", parse_manifest)
+            digests[uri] = "" if text is None else manifest_digest(parse_manifest(text))
+        return digests.get(uri)
+
+    def send(uri: str) -> int | None:
+        size, text = _send(archive.root / uri, uri, objects)
+        digests[uri] = manifest_digest(parse_manifest(text))
+        return size
+
+    known = {uri: try_manifest(archive.root / uri)[0] for uri in waiting}
+    return _copy(archive, objects, uris, known, report, send, digest_there, objects.url)
 
 
 def pull(objects: Objects, archive: Archive, report: Report, run: str | None = None) -> Copied:
     """Fetch the stores and runs that the archive lacks; with ``run`` this run alone, and the stores that it names.
 
-    Raises UnreachableError: the bucket refuses or does not answer; IncompleteStoreError: an object is missing or has
-    changed; ArchiveError: there is no archive or no such run in the bucket.
+    Inputs come first. Raises UnreachableError: the bucket refuses or does not answer; ArchiveError: there is no archive
+    or no such run in the bucket; IncompleteStoreError, after all else was fetched: an object is missing or has changed,
+    or the archive has an input of a store or run with other content.
     """
     there = _published(objects.listing())
     if not there:
@@ -88,26 +112,61 @@ def pull(objects: Objects, archive: Archive, report: Report, run: str | None = N
     with archive.in_use():
         wanted = _of_run(objects, run, there) if run is not None else sorted(there, key=lambda uri: uri[:4] == "runs")
         waiting = [uri for uri in wanted if not is_known(archive.root / uri)]
+        found = some_at_a_time(lambda uri: _lineage(uri, there[uri], objects), waiting)
+        known = {uri: one for uri, one in zip(waiting, found, strict=True) if one is not None}
+
+        def fetch(uri: str) -> int | None:
+            if "damage" in known[uri]:
+                raise known[uri]["damage"]
+            return fetch_store(uri, there[uri], objects, archive)
+
         return _copy(
-            archive, objects, wanted, waiting, report, lambda uri: fetch_store(uri, there[uri], objects, archive)
+            archive, objects, wanted, known, report, fetch, lambda uri: digest_of(archive.root / uri), archive.name
         )
+
+
+def _lineage(uri: str, kind: str, objects: Objects) -> dict[str, Any] | None:
+    """Return inputs and their digests of a manifest, or its ``damage``; None if another machine has removed it."""
+    try:
+        text = objects.read(f"{uri}/{kind}", parse_manifest)
+    except IncompleteStoreError as error:
+        return {"inputs": [], RESTS_ON: {}, "damage": error}
+    return None if text is None else {name: parse_manifest(text)[name] for name in ("inputs", RESTS_ON)}
 
 
 def _copy(
     archive: Archive,
     objects: Objects,
     asked: Collection[str],
-    waiting: Collection[str],
+    waiting: Mapping[str, Mapping[str, Any]],
     report: Report,
     work: Callable[[str], int | None],
+    digest: Callable[[str], str | None],
+    place: str,
 ) -> Copied:
-    """Copy what waits, by a function that returns the bytes, or None where another process was first."""
+    """Copy what waits, by its manifest, to a ``place`` whose stores have a ``digest``, inputs first.
+
+    ``work`` returns the bytes, or None where another process was first. A store or run that is damaged, or whose input
+    differs there, is left out with what rests on it; then its error is raised at the end.
+    """
     copied, total = [], 0
-    for number, uri in enumerate(waiting):
+    failed: dict[str, IncompleteStoreError] = {}
+    for number, uri in enumerate(inputs_first(waiting, waiting)):
         report(uri, number / len(waiting))
-        if (size := work(uri)) is not None:
+        try:
+            if below := next((one for one in waiting[uri][RESTS_ON] if one in failed), None):
+                raise failed[below]
+            for problem in conflicts(waiting[uri], digest, place):
+                raise IncompleteStoreError(f"{uri} cannot be copied to {place}: {problem}; {TO_ANOTHER}")
+            size = work(uri)
+        except IncompleteStoreError as error:
+            failed[uri] = error
+            continue
+        if size is not None:
             copied.append(uri)
             total += size
+    if failed:
+        raise IncompleteStoreError(f"{next(iter(failed.values()))}. All that does not rest on it was copied")
     runs = [uri for uri in asked if uri.startswith("runs/")]
     named = {one for uri in runs if uri in copied for one in try_manifest(archive.root / uri)[0][RESTS_ON]}
     both = [uri for uri in runs if uri not in copied and (archive.root / uri / MANIFEST).is_file()]
@@ -116,11 +175,15 @@ def _copy(
         uri for uri, text in zip(both, texts, strict=True) if text != (archive.root / uri / MANIFEST).read_bytes()
     ]
     missing = sorted(uri for uri in named if not is_known(archive.root / uri))
-    return Copied(copied, total, len(asked) - len(copied) - len(others), others, missing)
+    there = len(asked) - len(copied) - len(others)
+    return Copied(copied, total, there, others, missing, sorted(objects.bad_names))
 
 
-def _send(folder: Path, uri: str, objects: Objects) -> int | None:
-    """Send one store or run, its manifest last; return the bytes of its files, None where another writer was first."""
+def _send(folder: Path, uri: str, objects: Objects) -> tuple[int | None, bytes]:
+    """Send one store or run, its manifest last; return the bytes of its files, and the manifest.
+
+    Where another writer was first, return None and the manifest of that writer.
+    """
     check_store(folder)
     kind, text = _manifest_name(folder), manifest_bytes(folder)
     files = parse_manifest(text)["files"] if kind == MANIFEST else {}
@@ -129,7 +192,8 @@ def _send(folder: Path, uri: str, objects: Objects) -> int | None:
     check_store(folder, every_byte=True)  # what was sent is what the manifest lists
     if kind != _manifest_name(folder) or text != manifest_bytes(folder):  # cleared, or made again
         return _send(folder, uri, objects)
-    return sum(size for size, _ in files.values()) if objects.create(f"{uri}/{kind}", text) == text else None
+    winner = objects.create(f"{uri}/{kind}", text)
+    return sum(size for size, _ in files.values()) if winner == text else None, winner
 
 
 def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int | None:
@@ -142,7 +206,7 @@ def fetch_store(uri: str, kind: str, objects: Objects, archive: Archive) -> int 
     files = parse_manifest(text)["files"]
 
     def fetch(part: Path) -> None:
-        (part / MANIFEST).write_bytes(text)
+        write_new(part / MANIFEST, text)
         some_at_a_time(lambda name: objects.fetch(_address(uri, text, name), part / name, *files[name]), files)
 
     return sum(size for size, _ in files.values()) if archive.adopt(uri, fetch) else None

@@ -6,6 +6,7 @@ AWS_ENDPOINT_URL.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -13,16 +14,22 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
+from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
+from spectralzoom.storage.remote.all_names import PATH, all_names
+from spectralzoom.storage.whole_files import open_own
 
 AT_ONCE = 8  # transfers in parallel
+NO_FILE = (errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)  # of a name in a manifest
 PART_BYTES = 8 << 20  # of the parts of a large object
 MOST_BYTES = 256 << 20  # of a manifest, which takes 100 bytes a file
-RETRIES = 4  # of one request, by obstore, in about two seconds
+RETRIES, RETRIED_S = 4, 2.0  # of one request, by obstore, and the time in which they begin
 PAUSES_S = (0.5, 2.0, 8.0)  # before what obstore does not try again
+REQUEST_S, LONGEST_S = 10, 900  # of a request
+REQUEST_BYTES = 256 << 10  # for each so many bytes a request may take `REQUEST_S` more
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _PART = r"(?!\.+(?:/|$))[A-Za-z0-9_.=+-]+"
 _ADDRESS = re.compile(rf"s3:/{{1,2}}({_PART})((?:/{_PART})*)/?")  # also as a path has it, which makes one slash of two
@@ -54,8 +61,9 @@ class UnreachableError(ArchiveError):
 class Objects:
     """The objects below ``s3://bucket/prefix``; names are relative to it.
 
-    A request is tried again, in all for about 20 s, after a lost connection, an answer cut short or damaged, overload,
-    or a conflict of two writers. Every method raises UnreachableError: the bucket refuses or does not answer.
+    A request is tried again after a lost connection, an answer cut short or damaged, overload, or a conflict of two
+    writers. A small one is given up after 20 to 32 s. Every method raises UnreachableError: the bucket refuses or does
+    not answer.
     """
 
     def __init__(self, address: str | Path) -> None:
@@ -79,21 +87,34 @@ class Objects:
                 f"{self.url}: archives on S3 need obstore ({error}); pip install 'spectralzoom[s3]'"
             ) from error
         self._errors = BaseError
-        try:
-            self._store = S3Store(
-                found[1],
-                prefix=found[2].strip("/") or None,
+        self.bad_names: list[str] = []  # of objects that the last listing left out
+        self._sizes: dict[str, int] = {}
+        self._address = found[1], found[2].strip("/")
+
+        @cache
+        def store(seconds: int, stalls: str) -> S3Store:
+            return S3Store(
+                self._address[0],
+                prefix=self._address[1] or None,
                 config={"endpoint": self.endpoint} if self.endpoint else {},
                 client_options={
                     "allow_http": self.endpoint.startswith("http://"),
                     "connect_timeout": "5s",
-                    "read_timeout": "30s",
-                    "timeout": "15min",
+                    "read_timeout": stalls,
+                    "timeout": f"{seconds}s",
                 },
-                retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2)},
+                retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRIED_S)},
             )
+
+        self._store = store
+        try:
+            self._client(0)
         except BaseError as error:
             raise ArchiveError(f"{self.url} cannot be used: {_first_line(error)}") from error
+
+    def _client(self, size: int, *, sending: bool = False) -> Any:
+        """Return a client for requests of this size; a connection that stalls is given up before, unless it sends."""
+        return self._store(_seconds(size), f"{_seconds(size) if sending else REQUEST_S}s")
 
     def read(self, name: str, check: Callable[[bytes], object] = len) -> bytes | None:
         """Return the content of a small object; None without one.
@@ -102,7 +123,7 @@ class Objects:
         """
 
         def read() -> bytes:
-            answer = self._store.get(name)
+            answer = self._client(self._sizes.get(name, 0)).get(name)
             try:
                 if answer.meta["size"] > MOST_BYTES:
                     raise ValueError(f"it has {answer.meta['size']} bytes")
@@ -113,7 +134,7 @@ class Objects:
             return content
 
         try:
-            return self._ask(read)
+            return self._ask(read, self._sizes.get(name, 0))
         except FileNotFoundError:
             return None
 
@@ -123,28 +144,30 @@ class Objects:
 
         def write() -> bytes:
             try:
-                self._store.put(name, content, mode="create", use_multipart=False)
+                self._client(len(content), sending=True).put(name, content, mode="create", use_multipart=False)
                 return content
             except AlreadyExistsError as error:  # or two writers at the same time, or one whose answer was lost
                 try:
-                    return bytes(self._store.get(name).bytes())
+                    return bytes(self._client(len(content)).get(name).bytes())
                 except FileNotFoundError:
                     raise error from None
 
-        return self._ask(write)
+        return self._ask(write, len(content))
 
     def write(self, name: str, source: Path | bytes) -> None:
         """Write an object from a file or bytes, replacing any old one; readers never see a part of it."""
-        self._ask(lambda: self._store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2))
+        size = len(source) if isinstance(source, bytes) else source.stat().st_size
+        store = self._client(min(size, PART_BYTES), sending=True)
+        self._ask(lambda: store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2), size)
 
     def fetch(self, name: str, path: Path, size: int, sha256: str) -> None:
         """Write an object into a new file. Raises IncompleteStoreError: it is missing, or has other content."""
-        path.parent.mkdir(parents=True, exist_ok=True)
 
         def fetch() -> None:
             digest = hashlib.sha256()
-            with path.open("wb") as file:
-                answer = self._store.get(name)
+            path.unlink(missing_ok=True)
+            with open_own(path, "xb") as file:
+                answer = self._client(size).get(name)
                 for block in answer.stream(PART_BYTES) if answer.meta["size"] == size else ():
                     digest.update(block)
                     file.write(block)
@@ -154,34 +177,68 @@ class Objects:
                 )
 
         try:
-            self._ask(fetch)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._ask(fetch, size)
         except FileNotFoundError:
             raise IncompleteStoreError(f"{self.url}/{name} is missing; {CURE}") from None
+        except OSError as error:
+            if error.errno not in NO_FILE:
+                raise
+            raise IncompleteStoreError(f"{self.url}/{name} can be no file: {error.strerror}; {CURE}") from error
 
     def listing(self) -> set[str]:
-        """Return the names of all objects."""
-        return self._ask(lambda: {one["path"] for batch in self._store.list(chunk_size=1000) for one in batch})
+        """Return the names of all objects; `bad_names` gets those that are no path, which obstore refuses to list."""
+        bucket, prefix = self._address
+
+        def listed() -> dict[str, int]:
+            return {one["path"]: one["size"] for batch in self._client(0).list(chunk_size=1000) for one in batch}
+
+        try:
+            self._sizes = self._ask(listed)
+        except IncompleteStoreError as error:
+            try:
+                names = all_names(bucket, f"{prefix}/" if prefix else "", self.endpoint, REQUEST_S)
+            except KeyError:
+                raise error from None
+            except OSError as refused:
+                raise self.explain(refused) from refused
+            self._sizes = dict.fromkeys(names, 0)
+            self.bad_names = [name for name in names if name and not PATH.fullmatch(name.removesuffix("/"))]
+        return set(self._sizes)
 
     def explain(self, error: BaseException) -> UnreachableError:
         """Return the error of an answer of the bucket, with advice."""
         advice = _advice(error, _LASTING | _PASSING) or _first_line(error)
         return UnreachableError(f"{self.url}{f' at {self.endpoint}' if self.endpoint else ''}: {advice}")
 
-    def _ask(self, work: Callable[[], Answer]) -> Answer:
-        """Do ``work``, again after a failure that may pass. Raises FileNotFoundError: there is no such object."""
+    def _ask(self, work: Callable[[], Answer], size: int = 0) -> Answer:
+        """Do ``work`` on so many bytes, again after a failure that may pass, in about twice the time of a request.
+
+        Raises FileNotFoundError: there is no such object; IncompleteStoreError: its name or content is not valid.
+        """
+        from obstore.exceptions import InvalidPathError
+
+        end = time.monotonic() + 2 * _seconds(size)
         for pause_s in (*PAUSES_S, None):
             try:
                 return work()
+            except InvalidPathError as error:
+                raise IncompleteStoreError(f"{self.url} has an object of a bad name: {_first_line(error)}") from error
             except (self._errors, FileNotFoundError, IncompleteStoreError) as error:
                 is_lasting = _advice(error, _LASTING) is not None
                 if isinstance(error, FileNotFoundError) and not is_lasting:
                     raise
-                if pause_s is None or is_lasting:
+                if pause_s is None or is_lasting or time.monotonic() + pause_s > end:
                     if isinstance(error, IncompleteStoreError):
                         raise
                     raise self.explain(error) from error
                 time.sleep(pause_s)
         raise AssertionError("unreachable")
+
+
+def _seconds(size: int) -> int:
+    """Return the longest time of a request with so many bytes, at most a quarter of an hour."""
+    return min(REQUEST_S * (1 + max(size, 0) // REQUEST_BYTES), LONGEST_S)
 
 
 def _endpoint() -> str:

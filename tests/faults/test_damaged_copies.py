@@ -26,12 +26,11 @@ def test_a_flipped_bit_in_metadata_is_not_sent(
 
     After that command the rest is sent, and a pull gives every file as it was.
     """
-    objects = Objects(bucket)
-    for flip in each_kind(aimed_flips(whole), 1):
-        out = whole.copy(tmp_path / "damaged")
+    for number, flip in enumerate(each_kind(aimed_flips(whole), 1)):
+        out, place = whole.copy(tmp_path / "damaged"), f"{bucket}/{number}"
         flip.apply(out)
-        command_line("push", out, bucket).refused(1, f"{flip.uri}.*{CURE}")
-        assert f"{flip.uri}/manifest.json" not in objects.listing(), flip
+        command_line("push", out, place).refused(1, f"{flip.uri}.*{CURE}")
+        assert f"{flip.uri}/manifest.json" not in Objects(place).listing(), flip
         shutil.rmtree(out)
     assert command_line("push", whole.out, bucket).code == 0
     assert command_line("pull", bucket, tmp_path / "again").code == 0

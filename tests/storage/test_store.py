@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 from unittest.mock import Mock
@@ -331,7 +332,7 @@ def test_a_lock_is_held_by_one_or_shared(tmp_path: Path) -> None:
         assert (first, second, third) == (True, True, False)
     path.unlink()
     path.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(ArchiveError, match="cannot lock"), locked(path):
+    with pytest.raises(ArchiveError, match=r"a\.lock is a link"), locked(path):
         pass
 
 
@@ -464,7 +465,8 @@ def test_links_out_of_an_archive_are_refused(tmp_path: Path, what: str) -> None:
     with pytest.raises((ArchiveError, IncompleteStoreError), match=r"link|is missing"):
         archive.find("mosaic", ref.key)
     assert problems(archive)
-    archive.discard(ref.uri)
+    with suppress(ArchiveError):
+        archive.discard(ref.uri)
     assert (tmp_path / "elsewhere").exists()
 
 

@@ -84,7 +84,7 @@ CASES = {
     "broken settings": (2, "survey broken.toml", "broken.toml.*line 1"),
     "settings not in UTF-8": (2, "survey latin.toml", "latin.toml.*utf-8"),
     "budget 0": (2, SURVEY + "field.png --budget 0", "above 0 and at most 1, got '0'"),
-    "scene as settings": (2, "survey field.png", "a scene is given as --scene field.png"),
+    "scene as settings": (2, "survey field.png", "a scene is given as: spectralzoom survey --scene field.png"),
     # training
     "empty folder to train on": (1, TRAIN + "empty", "holds no scene"),
     "no labels at all": (1, TRAIN + "bare", "no labels; training needs them.* labels/001.png"),

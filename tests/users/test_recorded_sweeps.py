@@ -362,8 +362,14 @@ POSITIONS = {"fewer rows": range(95), "lines far apart": range(0, 9 * 96, 9)}  #
 BAD = {  # flags, and the message
     "fewer rows": ("", "has 95 rows for scan, fewer than its 96 lines; give one row for each line"),
     "lines far apart": ("", "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px"),
-    "a frame of other bands": ("--white two.hdr", r"is \(64, 2\) \(sample, band\), the cube \(64, 3\); give one"),
-    "frames exchanged": ("--dark scan.white.hdr --white scan.dark.hdr", "is nowhere brighter than its dark frame"),
+    "a frame of other bands": (
+        "--white two.hdr",
+        "has 2 bands from 640 to 550 nm, the cube 3 bands from 640 to 460 nm; give a",
+    ),
+    "frames exchanged": (
+        "--dark scan.white.hdr --white scan.dark.hdr",
+        "white frame is not brighter than the dark one",
+    ),
     "no such table": ("--pointing nowhere.csv", "there is no pointing table .*nowhere.csv"),
     "no such recording": ("--sweeps nowhere", "there is no recording nowhere; check the name"),
     "an archive among them": ("--out .", "--out = '.' is the folder of the sweeps, and would hide them; choose"),

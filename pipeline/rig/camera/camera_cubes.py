@@ -17,14 +17,13 @@ from spectralzoom.pipeline.envi_headers import parse_envi_header
 from spectralzoom.pipeline.errors import RigError, SceneError, ShapeError
 from spectralzoom.pipeline.exposures import Taken, match_exposures, taken_with
 from spectralzoom.pipeline.frame_indices import FRAME_INDEX, LineTimes, parse_frame_index, times_of_lines
-from spectralzoom.pipeline.signal.calibrate import find_bad_elements
+from spectralzoom.pipeline.signal.calibrate import check_frames, find_bad_elements
 from spectralzoom.pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[A-Za-z_]*", re.IGNORECASE)
 
 Read = Callable[[str], bytes]  # the content of a file by its name
-LEAST_LIT = 0.5  # fraction of the elements whose white is above their dark
 FRAMES_FOR_STUCK = 8  # fewer frames cannot tell an element that never changes from a quiet one
 
 
@@ -154,7 +153,12 @@ def mean_frame(lines: NDArray[np.integer]) -> MeanFrame:
 
 
 def as_references(
-    dark: MeanFrame, white: MeanFrame, *, white_reference: ArrayLike = 1.0, exposure_ms: float | None = None
+    dark: MeanFrame,
+    white: MeanFrame,
+    *,
+    white_reference: ArrayLike = 1.0,
+    exposure_ms: float | None = None,
+    full_scale_dn: float | None = None,
 ) -> tuple[References, list[str]]:
     """Join dark and white into the references of a sweep, and return notes.
 
@@ -165,18 +169,14 @@ def as_references(
     """
     if dark.mean.shape != white.mean.shape:
         raise RigError(f"dark is {dark.mean.shape} (sample, band), white {white.mean.shape}; take both anew")
-    lit = np.count_nonzero(white.mean > dark.mean) / dark.mean.size
-    if lit < LEAST_LIT:
-        raise RigError(
-            f"white is above dark in {100 * lit:.0f} % of the elements; are they swapped, or was the lamp off?"
-        )
     values = np.broadcast_to(np.asarray(white_reference, np.float32), dark.mean.shape[1]).copy()
-    found = References(dark.mean, white.mean, values, find_bad_elements(dark.mean, white.mean) | dark.stuck)
     stated = {kind: (one.mean, one.taken) for kind, one in (("dark", dark), ("white", white)) if one.taken.exposures}
-    if exposure_ms is None or not stated:
-        return found, []
     try:
-        white_ms, notes = match_exposures(stated, Taken(), np.array([exposure_ms]), stated=True)
+        notes = check_frames("", dark.mean, white.mean, full_scale_dn)
+        found = References(dark.mean, white.mean, values, find_bad_elements(dark.mean, white.mean) | dark.stuck)
+        if exposure_ms is not None and stated:
+            white_ms, more = match_exposures(stated, Taken(), np.array([exposure_ms]), stated=True)
+            found, notes = replace(found, exposure_ms=white_ms), [*notes, *more]
     except SceneError as error:
         raise RigError(f"{error}; take both again") from error
-    return replace(found, exposure_ms=white_ms), notes
+    return found, notes

@@ -144,6 +144,7 @@ class RasterScene:
     class_names: tuple[str, ...] = ()
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     class_values: tuple[int, ...] = ()  # number of each class in maps, 0 to 254; empty: 0, 1, 2, ...
+    zero_class: str = ""  # class of the number 0, or of black, in the label file; empty if it is none
     filled_px: int = 0  # pixels that came without a value in a band
     missing: NDArray[np.bool_] | None = None  # (y, x) pixels without a value in most bands; None: no such pixel
     geobox: GeoBox | None = None  # place of the pixels on the earth; None where the scene's file has none

@@ -49,7 +49,6 @@ class Decision:
     tolerance: float
     unit: Unit
     asked: str
-    px_bands: int  # numbers of all sweeps, from which costs are estimated
 
     @property
     def chosen(self) -> dict[Effect, str]:
@@ -65,16 +64,6 @@ class Decision:
     def error(self) -> float:
         """Bound on the change of any number by all that is left out or cheapened; above the tolerance only if asked."""
         return math.fsum(one.option.error for one in self.taken)
-
-    @property
-    def cost_ns(self) -> float:
-        """Return cost per px and band of what is on [ns]."""
-        return math.fsum(one.option.cost_ns for one in self.taken)
-
-    @property
-    def exact_cost_ns(self) -> float:
-        """Return cost per px and band of everything that the rig has, exact [ns]."""
-        return math.fsum(one.menu.exact.cost_ns for one in self.taken if one.menu.present)
 
 
 def decide(
@@ -99,10 +88,8 @@ def decide(
         settled[menu.name] or Treatment(menu, options[menu.name], _reason(menu, options[menu.name], tolerance, named))
         for menu in menus
     ]
-    every = [probes] if isinstance(probes, Probe) else probes
-    lines = sum(sweep.lines for probe in every for sweep in probe.sweeps)
-    px_bands = lines * rig.camera.samples * len(every[0].wavelength_nm)
-    return Decision(tuple(taken), tolerance, every[0].unit, asked, px_bands)
+    first = probes if isinstance(probes, Probe) else probes[0]
+    return Decision(tuple(taken), tolerance, first.unit, asked)
 
 
 def named_effects(asked: str, known: Sequence[str]) -> frozenset[str] | None:
@@ -193,7 +180,7 @@ def list_effects(decision: Decision) -> list[dict[str, Any]]:
     """Return one plain row for every effect, in the order of the chain.
 
     ``bound`` is on the change of any stored number, with the factor of safety, in ``unit``: 0 where exact or absent,
-    None where there is none. ``cost_s`` are estimated CPU seconds of all sweeps. ``reason`` is that of `Treatment`.
+    None where there is none. ``cost_ns`` is the usual cost of a px and band. ``reason`` is that of `Treatment`.
     ``left_out`` is the bound on leaving it out, and ``magnitude`` the words of that bound.
     """
     return [
@@ -202,7 +189,7 @@ def list_effects(decision: Decision) -> list[dict[str, Any]]:
             "state": "on" if one.is_on else "off",
             "variant": one.option.variant if one.is_on else None,
             "bound": _finite(one.option.error),
-            "cost_s": one.option.cost_ns * 1e-9 * decision.px_bands,
+            "cost_ns": one.option.cost_ns,
             "reason": one.reason,
             "left_out": _finite(one.menu.off.error),
             "magnitude": one.menu.off.why,
@@ -213,8 +200,7 @@ def list_effects(decision: Decision) -> list[dict[str, Any]]:
 
 
 def sum_up(decision: Decision) -> dict[str, Any]:
-    """Return the totals: bound beside tolerance, and CPU seconds saved, without rays that every simulation takes."""
-    cost, exact = (ns * 1e-9 * decision.px_bands for ns in (decision.cost_ns, decision.exact_cost_ns))
+    """Return the totals: bound beside tolerance, and the number of effects that are on and off."""
     return {
         "asked": decision.asked,
         "tolerance": _finite(decision.tolerance),
@@ -223,9 +209,6 @@ def sum_up(decision: Decision) -> dict[str, Any]:
         "within": decision.error <= decision.tolerance,
         "on": sum(one.is_on for one in decision.taken),
         "off": sum(not one.is_on for one in decision.taken),
-        "cost_s": cost,
-        "exact_cost_s": exact,
-        "saved_s": exact - cost,
     }
 
 

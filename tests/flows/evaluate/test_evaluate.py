@@ -68,6 +68,7 @@ def test_frames_trained_on_are_left_out(data: Path, tmp_path: Path):
     assert 0 < brief["plain"]["multiply_adds_a_pixel"] < brief["weights"]["multiply_adds_a_pixel"]
     assert content["frames"] == content["weights"][0]["frames"] == ["003"]
     assert set(split["validation"]) <= set(split["train"])
+    assert {*split["validated"]} == {*scene_at(data, *split["validation"]).content}
     assert content["left_out"] == sorted(split["train"])
     with pytest.raises(SceneError, match="frames trained on are refused"):
         evaluate_weights(str(data), EvaluateFlags(weights=(out,), frames=tuple(split["train"])))
@@ -97,12 +98,63 @@ def test_each_fold_is_judged_on_its_own_frames(data: Path, tmp_path: Path):
     assert [weights["frames"] for weights in alone["weights"]] == [[], ["001"]]
 
 
-def test_scores_of_validation_frames_have_a_note(data: Path, tmp_path: Path):
-    """The training chose by them, so that their scores may be too good."""
+def test_validation_frames_are_in_no_headline(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The training chose by them; the headline is that of the held-out frames alone."""
     split = {"validation": {"002": scene_at(data, "002").key}}
     weights = (write_weights(tmp_path / "w.safetensors", split=split),)
-    content = evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))
+    content = run_evaluate(str(data), EvaluateFlags(weights=weights, fractions=""), Console())
     assert "thresholds by 002: scores of these" in " ".join(content["data_notes"])
+    assert (content["headline"], content["frames"]) == ("held out", ["001", "003"])
+    alone = evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions="", frames=("001", "003")))
+    assert (content["brief"], content["support"]) == (alone["brief"], alone["support"])
+    (one,) = content["apart"].values()
+    assert one["frames"] == ["002"]
+    assert f"validation: mIoU {100 * one['rows'][-1]['miou']:.1f} of 1 frame" in capsys.readouterr().out
+
+
+def test_validation_frames_alone_have_no_headline(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The files' content identifies them, whatever bands are read and whatever their names are."""
+    scene = scene_at(data, "002")
+    split = {"validation": {"other": "in other bands"}, "validated": [*scene.content]}
+    flags = EvaluateFlags(
+        weights=(write_weights(tmp_path / "w.safetensors", split=split),), fractions="", frames=("002",)
+    )
+    content = run_evaluate(str(data), flags, Console())
+    assert (content["headline"], content["brief"], content["rows"]) == (None, {}, [])
+    assert [*content["apart"]] == ["validation"]
+    shown = capsys.readouterr().out
+    assert shown.startswith("no mIoU: no frame was held out")
+    assert "validation: mIoU " in shown
+
+
+def test_folds_have_their_own_validation_frames(data: Path, tmp_path: Path):
+    """A frame that one fold chose by is held out for another."""
+    splits = [{"validation": {name: scene_at(data, name).key}} for name in ("001", "002")]
+    weights = tuple(write_weights(tmp_path / f"{n}.safetensors", n, split=one) for n, one in enumerate(splits))
+    content = evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))
+    assert content["frames"] == list(FRAMES)
+    assert content["apart"]["validation"]["frames"] == ["001", "002"]
+    first = evaluate_weights(str(data), EvaluateFlags(weights=weights[:1], fractions="", frames=("002", "003")))
+    assert content["rows"][0]["by_weights"][0] == first["rows"][0]["miou"]
+
+
+def test_untrained_pixels_are_in_no_headline_beside_held_out_frames(data: Path, tmp_path: Path):
+    """They are no forecast for other scenes."""
+    scene = scene_at(data)
+    half = np.arange(scene.shape[0])[:, None] < np.full(scene.shape, 12)
+    weights = (write_weights(tmp_path / "w.safetensors", split={"taught": _content(scene, half)}),)
+    content = evaluate_weights(str(data), EvaluateFlags(weights=weights, fractions=""))
+    assert (content["headline"], content["frames"]) == ("held out", ["002", "003"])
+    assert content["apart"]["untrained pixels of training frames"]["frames"] == ["001"]
+
+
+@pytest.mark.parametrize(("held", "words"), [(("003",), "--frames 003$"), ((), "train .* --hold-out 003 -o FILE")])
+def test_the_refusal_of_training_frames_says_what_to_do(data: Path, tmp_path: Path, held: tuple[str], words: str):
+    """It names the frames that were held out, or how to hold some out."""
+    split = {"train": {name: scene_at(data, name).key for name in ("001", "002")}, "held_out": held}
+    weights = (write_weights(tmp_path / "w.safetensors", split=split),)
+    with pytest.raises(SceneError, match=words):
+        evaluate_weights(str(data), EvaluateFlags(weights=weights, frames=("001",)))
 
 
 def test_trained_pixels_of_a_frame_are_left_out(data: Path, tmp_path: Path):
@@ -111,6 +163,7 @@ def test_trained_pixels_of_a_frame_are_left_out(data: Path, tmp_path: Path):
     half = np.arange(scene.shape[0])[:, None] < np.full(scene.shape, 12)
     weights = (write_weights(tmp_path / "w.safetensors", split={"taught": _content(scene, half)}),)
     content = evaluate_weights(str(data), EvaluateFlags(weights=weights, frames=("001",), **QUICK))
+    assert content["headline"] == "untrained pixels of training frames"
     assert sum(content["support"].values()) == 12 * 40
     assert any(note.startswith("trained pixels are left out of 001: ") for note in content["data_notes"])
 
@@ -177,7 +230,7 @@ def test_one_frame_alone_has_overall_and_average_accuracy_and_kappa(
     assert row["average_accuracy"] == average_accuracy(counts)
     assert row["kappa"] == kappa(counts)
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("mIoU: w.safetensors ", "overall", "average", "kappa", "MACs"))
+    assert all(word in shown for word in ("mIoU, held out: w.safetensors ", "overall", "average", "kappa", "MACs"))
 
 
 def test_miou_of_frames_comes_from_their_summed_counts():

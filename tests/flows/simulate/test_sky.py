@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from spectralzoom.flows.cli.simulate_command import open_simulation
 from spectralzoom.flows.field import open_field
 from spectralzoom.flows.plan import plan_survey
 from spectralzoom.flows.settings.settings import load_settings
@@ -47,12 +48,14 @@ def test_a_sky_is_a_fraction_of_the_light() -> None:
     np.testing.assert_array_equal(overcast.electrons, clear.electrons / 8)
 
 
-def test_a_field_at_night_is_noted() -> None:
-    """The sun is 15 degrees below the horizon at the start of the survey."""
+def test_a_field_at_night_has_a_warning(tmp_path: Path) -> None:
+    """The sun is 15 degrees below the horizon at the start of the survey; a simulation has it as its first note."""
     noon, night = ({"sky": {"started": f"2026-06-01T{hour}:00:00Z"}} for hour in (12, "00"))
-    assert open_scene(load_settings(None, SMALL | noon))[1] == ()
-    (note,) = open_scene(load_settings(None, SMALL | night))[1]
-    assert note == "the sun is 15 degrees below the horizon at sky.started: the field is dark"
+    dark = "the sun is 15 degrees below the horizon at sky.started: the field is dark"
+    for started, warned in ((noon, ()), (night, (dark,))):
+        settings = load_settings(None, SMALL | started | {"out": str(tmp_path)})
+        assert open_simulation(settings)[1] == warned
+        assert (dark in open_field(settings, planning=True).warnings) == bool(warned)
 
 
 def test_scans_expose_longer_under_clouds(tmp_path: Path) -> None:

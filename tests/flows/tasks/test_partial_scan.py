@@ -179,7 +179,7 @@ def test_a_prior_map_read_in_swaths_equals_the_whole_one(
     """Every second pixel is read, with the neighbours in the reader's window; each age belongs to its pixel."""
     reader = TemporalReader(TemporalSizes(2, 4, width=8, coarse_width=4)).eval()
     torch.nn.init.normal_(reader.leave.weight, std=0.3)
-    monkeypatch.setattr(extent_choice, "load_reader", lambda path: reader)
+    monkeypatch.setattr(extent_choice, "load_reader", lambda path, described: reader)
     rng = np.random.default_rng(1)
     probabilities = np.log(rng.dirichlet(np.ones(2), (95, 63))).astype(np.float32)
     images = probabilities, rng.uniform(1, 9, (95, 63)).astype(np.float32), np.ones((95, 63), np.float32)

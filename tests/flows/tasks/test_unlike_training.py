@@ -16,11 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from spectralzoom.flows.publish.receipt_table import finding_rows
 from spectralzoom.flows.settings.model_flags import TrainFlags
 from spectralzoom.flows.settings.settings import load_settings
 from spectralzoom.flows.survey_command import run_survey
-from spectralzoom.flows.tasks.survey_model import beyond_training, training_note
+from spectralzoom.flows.tasks.survey_model import beyond_training, training_warning
 from spectralzoom.flows.training.train import train_weights
 from spectralzoom.flows.training.train_scenes import TrainRequest
 from spectralzoom.models.evaluation.unlike_scenes import TrainingSpectra
@@ -50,9 +49,9 @@ def test_spectra_unlike_the_training_are_noted_for_every_source(
     published = survey_png(tmp_path / "a", console, **unlike)
     receipt: Any = published.receipt
     assert receipt["unlike"]["mean"] > 100
-    assert "expected" not in receipt
+    assert "miou" not in receipt["expected"]
     words = r"the scene is unlike the training \(its .* lies? \d+\.\d times as far from it as any part .* rest\): "
-    (note,) = [row for label, row in finding_rows(receipt) if label == "note"]
+    (note,) = receipt["warnings"]
     for text in (note, console.file.getvalue(), (published.folder / "report.html").read_text(encoding="utf-8")):
         assert len(re.findall(words + "the map may be wrong with confidence", text)) == 1
 
@@ -67,7 +66,7 @@ def test_spectra_like_the_training_have_no_note(survey_png: Survey, weights: Pat
 def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, seen: TrainedOn = SEEN, **flags: Any) -> tuple[str, ...]:
     scene: Any = SimpleNamespace(wavelength_nm=np.array(nm), shape=(96, 128), light_fraction=1.0)
     found = beyond_training(load_settings(None, flags), scene, describe_weights(weights), seen)
-    return training_note(found, weights)
+    return training_warning(found, weights)
 
 
 @given(st.integers(96, 300), st.floats(3.0, 100.0))

@@ -189,7 +189,9 @@ def test_trained_pixels_are_not_judged(out: Path, tmp_path: Path) -> None:
     content = evaluate_weights(cube, replace(flags, labels=asked["labels"], bands="0-2"))
     assert sum(content["support"].values()) == 30 * 40
     assert "trained pixels are left out of cube" in " ".join(content["data_notes"])
-    with pytest.raises(SceneError, match=r"w.safetensors was trained on these labels.*or by other labelled pixels"):
+    with pytest.raises(
+        SceneError, match=r"w.safetensors was trained on these labels.*or by pixels that the training had no label of"
+    ):
         evaluate_weights(cube, replace(flags, labels=str(tmp_path / "some.npy")))
 
 
@@ -226,9 +228,11 @@ def test_surveys_warn_of_unlike_scenes(factor: float, bands: list[int], note: st
     train_weights(_request(tmp_path / "cube.npy", out, **choices))
     np.save(tmp_path / "other.npy", factor * values[..., : len(bands)])
     asked = {"scene": str(tmp_path / "other.npy"), "wavelengths": bands, "source": "raster", "weights": str(out)}
-    notes = " ".join(open_field(load_settings(None, asked | {"out": str(tmp_path / "a")})).notes)
-    assert re.search(note, notes)
-    assert bool(note) == ("of the training" in notes)
+    settings = load_settings(None, asked | {"out": str(tmp_path / "a")})
+    for planning in (False, True):
+        notes = " ".join(open_field(settings, planning=planning).warnings)
+        assert re.search(note, notes)
+        assert bool(note) == ("of the training" in notes)
 
 
 def test_weights_for_short_exposures_have_scan_performance(folder: Path, out: Path):

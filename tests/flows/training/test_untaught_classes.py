@@ -112,10 +112,10 @@ def test_evaluation_and_surveys_name_classes_that_weights_never_draw(tmp_path: P
     train_weights(other)
     content = evaluate_weights(str(folder), EvaluateFlags(weights=(fold.out, other.out), fractions="0.5"))
     assert content["frames"] == ["001", "002"]
-    assert f"a.safetensors: {NOTE}" in content["data_notes"]
-    assert not any(note.startswith("b.safetensors") for note in content["data_notes"])
+    assert f"a.safetensors: {NOTE}" in content["warnings"]
+    assert not any(note.startswith("b.safetensors") for note in content["warnings"])
     assert content["support"]["weed"] == 9
     assert {row["per_class_iou"]["weed"] for row in content["rows"]} == {0.0}
     asked = {"scene": str(folder / "001.npy"), "source": "raster", "weights": str(fold.out), "out": str(tmp_path / "o")}
-    notes = " ".join(open_field(load_settings(None, asked)).notes)
-    assert "classes without a training pixel, which are never drawn: weed" in notes
+    warned = " ".join(open_field(load_settings(None, asked)).warnings)
+    assert "classes without a training pixel, which are never drawn: weed" in warned

@@ -116,6 +116,33 @@ def test_an_empty_map_has_no_expected_score():
     assert np.isnan(told.error)
 
 
+@given(st.integers(1, 5), st.integers(0, 3000), st.floats(0, 1), st.integers(1, 8), SEEDS)
+def test_the_error_of_a_value_between_0_and_1_is_at_most_half(
+    classes: int, pixels: int, sure: float, step: int, seed: int
+) -> None:
+    """Fields of one pixel, of one class, and of classes without a pixel, by slow and by quick scans."""
+    fractions = np.random.default_rng(seed).dirichlet(np.full(classes, 0.3))
+    counts = pixels * np.diag(fractions) * sure + pixels * np.outer(fractions, fractions) * (1 - sure)
+    for exposure_ms in (3.0, 100.0):
+        told = expected_score(counts, np.zeros(classes), LEAST_ERROR, step, exposure_ms)
+        assert told.error <= 0.5 or (pixels == 0 and np.isnan(told.error))
+
+
+@pytest.mark.parametrize(
+    ("shape", "told"), [((0, 9), False), ((1, 1), False), ((16, 16), False), ((3, 200), False), ((45, 45), True)]
+)
+def test_few_pixels_have_no_expected_score(shape: tuple[int, int], told: bool) -> None:
+    """Those without probabilities do not count, in a map of one class and in one of several."""
+    rng = np.random.default_rng(3)
+    for sure in (0.0, 60.0):
+        said = rng.normal(size=(*shape, CLASSES)) + np.array([sure, 0, 0, 0])
+        said = np.concatenate([said, np.full((100, shape[1], CLASSES), np.nan)])
+        found = _scores().expected(
+            expected_counts([said - np.log(np.exp(said).sum(-1, keepdims=True))], CLASSES), 1, 16
+        )
+        assert (found is not None) == told
+
+
 def test_the_error_of_one_scene_is_the_least_error():
     """A single map is corrected by itself, which must not count as an error of 0."""
     assert error_of_passes([_scored(1)], 1, 100.0) == LEAST_ERROR

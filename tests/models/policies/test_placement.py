@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -71,7 +72,7 @@ def test_cascade_table_finds_the_highest_gain_within_a_loss(loss: float, gain: f
     """Gain and fraction are interpolated by the logarithm of the gain; below the least loss there is none."""
     table = placement.CascadeTable((0.01, 0.02, 0.03, 0.04), (-0.1, 0.0, 0.2, 0.3), (0.9, 0.5, 0.3, 0.1))
     assert table.within(loss) == pytest.approx(gain)
-    assert table.fraction_at(gain) == pytest.approx(fraction)
+    assert table.fractions_at(gain) == pytest.approx([fraction] * 3)
     assert table.within(-0.5) is None
 
 
@@ -80,3 +81,13 @@ def test_a_worse_row_ends_the_search() -> None:
     found = placement.CascadeTable((0.01, 0.02, 0.03), (0.0, 0.5, 0.1), (0.9, 0.5, 0.3)).within(0.2)
     assert found is not None
     assert 0.01 < found < 0.02
+
+
+def test_cascade_table_keeps_the_range_of_its_scenes() -> None:
+    """Three scenes of 1, 2 and 4 patches above 0.2 give their median, fewest and most; a record keeps all columns."""
+    none = np.zeros((2, 8), np.uint8)
+    gains = [np.where(np.arange(4) < count, 0.3, 0.0) for count in (2, 4, 1)]
+    scenes = [placement.ReadTwice(none, none, gain, none, SceneGrid(2, 8, 2)) for gain in gains]
+    table = placement.CascadeTable.read(asdict(placement.CascadeTable.judged(scenes, 2)))
+    assert table.fractions_at(0.2) == pytest.approx([0.5, 0.25, 1.0])
+    assert table.fractions_at(0.45) == [0, 0, 0]

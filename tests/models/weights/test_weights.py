@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,10 @@ def test_saving_twice_gives_equal_files(saved: Path, tmp_path: Path):
 
 def test_the_error_of_a_missing_file_says_how_to_make_one(tmp_path: Path):
     """The error names the path and the training command."""
-    with pytest.raises(WeightsError, match=r"no weights at .*gone.safetensors; train some with: spectralzoom train"):
+    with pytest.raises(
+        WeightsError,
+        match=r"no weights at .*gone.safetensors; give others as --weights, or train some with: spectralzoom train",
+    ):
         load_weights(tmp_path / "gone.safetensors")
 
 
@@ -208,7 +212,9 @@ def test_a_flipped_bit_of_a_tensor_is_found(saved: Path):
     raw = bytearray(saved.read_bytes())
     raw[-4] ^= 1
     saved.write_bytes(raw)
-    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written; restore"):
+    with pytest.raises(
+        WeightsError, match=r"is damaged, or changed while it was read: tensor \S+ is not what was written; restore"
+    ):
         load_weights(saved)
 
 
@@ -221,3 +227,54 @@ def test_a_header_of_petabytes_is_refused(saved: Path):
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
     with pytest.raises(WeightsError, match=r"cannot read .*w\.safetensors: .*; restore a copy"):
         load_weights(saved)
+
+
+BEYOND: dict[str, dict[str, Any]] = {
+    "temperature is 0,": {"calibration": {"temperature": 0}},
+    "temperature is -1.0,": {"calibration": {"temperature": -1.0}},
+    "temperature is nan,": {"calibration": {"temperature": float("nan")}},
+    "temperature is 1e+30,": {"calibration": {"temperature": 1e30}},
+    "temperature is 'warm',": {"calibration": {"temperature": "warm"}},
+    "temperature is None,": {"calibration": {"temperature": None}},
+    "temperature is True,": {"calibration": {"temperature": True}},
+    "calibration is 3,": {"calibration": 3},
+    "split is ": {"split": ["001"]},
+    "class_values is 700,": {"class_values": [0, 700]},
+    "plain classifier is 4,": {"plain": 4},
+    "day is 0,": {"trained_on": {"day": [0, 20]}},
+    "wavelength_nm is inf,": {"trained_on": {"wavelength_nm": [400.0, float("inf")]}},
+    "exposures_ms is 0,": {"scans": {"exposures_ms": [0, 10.0]}},
+    "exposures_ms is None,": {"scans": {"by_law": {"mine": {"exposures_ms": [None]}}}},
+    "per_class_iou is 7.5,": {"scans": {"per_class_iou": {"day": [[0.5, 7.5]]}}},
+    "least_gain is 0.0,": {"cascade": {"least_gain": [0.0, 0.1]}},
+    "miou is -2,": {"validation": {"all": {"miou": -2}}},
+}
+
+
+@pytest.mark.parametrize("words", BEYOND)
+def test_numbers_beyond_their_range_are_refused(saved: Path, words: str):
+    """One message names the number, also where a description has its hash."""
+    _rewritten(saved, {**_about(saved), "record": BEYOND[words]})
+    with pytest.raises(WeightsError, match=rf"cannot read .*w\.safetensors: its {re.escape(words)}.*; restore a copy"):
+        describe_weights(saved)
+
+
+def test_corrections_of_scores_have_ranges(saved: Path):
+    """A line spacing of 0 and a bias that is not finite are refused."""
+    good = {"scenes": 2, "steps": [1], "exposures_ms": [3.0], "bias": [[[0.1] * 3]], "error": [[0.1]]}
+    about = _about(saved)
+    described = {**about, "keys": {**about["keys"], "map_scores": "0"}}
+    for change in ({"steps": [0]}, {"bias": [[[0.1, float("nan"), 0.1]]]}, {"error": [[-1.0]]}):
+        _rewritten(saved, {**described, "map_scores": good | change})
+        with pytest.raises(WeightsError, match=f"its {next(iter(change))} is .*, expected a number from"):
+            describe_weights(saved)
+    _rewritten(saved, {**described, "map_scores": good})
+    assert describe_weights(saved).map_scores is not None
+
+
+def test_scores_without_a_pixel_are_read(saved: Path):
+    """They are null or NaN; classes may have the names of other numbers."""
+    scans = {"steps": [1], "miou": [[float("nan")]], "spread": None, "per_class_iou": {"day": [[0.9]], "bias": [[0.1]]}}
+    record = {"scans": scans, "trained_on": {"day": None}, "validation": None, "split": {"train": {"day": "001"}}}
+    _rewritten(saved, {**_about(saved), "record": record})
+    assert describe_weights(saved).record["scans"]["steps"] == [1]

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from spectralzoom.pipeline.errors import PoseError, RigError, ShapeError
+from spectralzoom.pipeline.errors import PoseError, RigError, SceneError, ShapeError
 from spectralzoom.pipeline.geometry.mirror import mirror_throughput
-from spectralzoom.pipeline.signal.calibrate import calibrate, find_bad_elements, full_scale_notes, number_values
+from spectralzoom.pipeline.signal.calibrate import calibrate, check_frames, find_bad_elements, number_values
 from spectralzoom.pipeline.source import References
 
 
@@ -210,13 +210,31 @@ def test_bands_without_light_have_no_dead_elements() -> None:
     assert not find_bad_elements(dark, white)[:, :4].any()
 
 
-def test_a_white_frame_at_full_scale_is_noted() -> None:
-    """The note has the fraction of elements. Values below full scale, or beyond it in scaled frames, are not noted."""
-    white = np.full((10, 10), 4095.0)
-    white[:, :5] = 4094.4
-    (note,) = full_scale_notes(white, 4095)
-    assert "at full scale in 50 % of the elements" in note
-    assert full_scale_notes(white, 4000) == []
+@pytest.mark.parametrize(
+    ("most", "camera"), [(4095.0, 4095), (1023.0, None), (255.0, 4095), (65535.0, None), (3000.0, 3000)]
+)
+def test_a_white_frame_at_full_scale_is_noted(most: float, camera: float | None) -> None:
+    """The full scale is that of the camera, or of any number of bits; the note has the fraction of elements."""
+    white = np.full((10, 10), most)
+    white[:, :5] -= 0.6
+    (note,) = check_frames("scan: ", np.full(white.shape, 60.0), white, camera)
+    assert "scan: the white frame is at full scale" in note
+    assert "in 50 % of the elements" in note
+    assert check_frames("scan: ", np.full(white.shape, 60.0), white - 2, camera) == []
+
+
+@pytest.mark.parametrize("hot", [0, 1])
+def test_frames_without_light_between_them_are_refused(hot: int) -> None:
+    """Exchanged frames, equal ones and two dark ones have none; an unlit part of a white frame may lie below dark."""
+    dark, white = simulated()
+    white[:hot, 0] = 60000
+    for one in (dark, dark[::-1]):
+        with pytest.raises(SceneError, match="scan: the white frame is not brighter than the dark one"):
+            check_frames("scan: ", one, dark)
+    with pytest.raises(SceneError, match=r"not brighter than the dark one \(\d % of its elements are\); exchange them"):
+        check_frames("scan: ", white, dark)
+    white[:, :7] = dark[:, :7] - 10
+    assert check_frames("scan: ", dark, white) == []
 
 
 def test_too_many_bad_elements_are_refused() -> None:

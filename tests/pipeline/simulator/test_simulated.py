@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -206,3 +206,39 @@ def test_band_response_smooths_the_white_reference() -> None:
     np.testing.assert_array_equal(plain, scene.white_reference)
     assert wide.min() > plain.min() + 0.05
     np.testing.assert_allclose(wide.mean(), plain.mean(), atol=0.02)
+
+
+class Counted(SimulatedSource):
+    """A source whose work is counted in place of time: of a line 1 for each effect that is on, times its step."""
+
+    work: ClassVar = [0.0]
+
+    def render(self, sweep: Sweep, lines: range) -> Any:
+        """Count the work of some lines."""
+        assert lines.stop <= sweep.lines
+        self.work[0] += len(lines) * len(self.chosen) * sweep.step
+        return np.zeros(0)
+
+
+FEW, MANY = effects_on("slit"), effects_on("slit", "shot", "dark-current", "prnu")
+
+
+@pytest.mark.parametrize(
+    ("lines", "steps", "saved"),
+    [
+        ((40,), (1,), 3 * 40),
+        ((400,), (1,), 3 * 400),
+        ((100, 3, 1), (1, 1, 1), 3 * 104),
+        ((1,), (2,), 3 * 2),
+        ((60, 30), (2, 1), 3 * (60 * 2 + 30 * 1)),
+        ((30, 30, 30), (4, 2, 1), 3 * 30 * 7),
+        ((), (), 0),
+        ((0, 12), (1, 1), 3 * 12),
+    ],
+)
+def test_saved_time_is_that_of_all_lines(lines: tuple[int, ...], steps: tuple[int, ...], saved: float) -> None:
+    """It grows with lines and effects; sweeps with dearer lines count by how many they have."""
+    sweeps = [replace(SWEEP, name=str(n), lines=n, step=step) for n, step in zip(lines, steps, strict=True)]
+    source = Counted(image_scene(np.ones((4, 4, 1)), CAMERA, np.array([500.0])), Rig(CAMERA), chosen=FEW)
+    assert source.saved_seconds(MANY, sweeps, lambda: source.work[0]) == pytest.approx(saved)
+    assert source.saved_seconds(FEW, sweeps, lambda: source.work[0]) == 0

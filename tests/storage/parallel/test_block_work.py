@@ -21,11 +21,11 @@ from unittest.mock import Mock
 import pytest
 from dask.distributed import LocalCluster
 
-from spectralzoom.pipeline.errors import SettingsError, ShapeError, WorkerError
+from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError, WorkerError
 from spectralzoom.storage.parallel import pool as pool_module
 from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
 from spectralzoom.storage.remote.worker_stores import FetchingWork
-from spectralzoom.storage.store import Archive, Ref
+from spectralzoom.storage.store import Archive, Ref, digest_of
 from tests.storage.small_archive import make_store
 
 ROOT = Path(__file__).parents[3]
@@ -193,10 +193,22 @@ def test_workers_without_the_archive_fetch_stores_from_a_bucket(
     there = (store.path / "data.bin").read_bytes()
     work = ReadStore(store).read
     assert run_blocks(work, range(3), WorkerPool(elsewhere.scheduler, bucket=bucket)) == [b"[", b'"', b"c"]
+    digest = digest_of(store.path)
     shutil.rmtree(archive.root)
-    elsewhere_work = pickle.loads(pickle.dumps(FetchingWork(work, (store,), bucket)))
+    elsewhere_work = pickle.loads(pickle.dumps(FetchingWork(work, {store: digest}, bucket)))
     assert [elsewhere_work(item) for item in range(3)] == [b"[", b'"', b"c"]
     assert (store.path / "data.bin").read_bytes() == there
+
+
+def test_a_worker_with_other_bytes_is_refused(bucket: str, tmp_path: Path) -> None:
+    """Its folder, or the bucket, has a store of the same key from another machine: both digests are named."""
+    archive = Archive.open(tmp_path / "archive")
+    store = make_store(archive, "capture", {}, [])
+    work = FetchingWork(ReadStore(store).read, {store: "0123456789ab"}, bucket)
+    with pytest.raises(
+        IncompleteStoreError, match=rf"has digest {digest_of(store.path)}, .* survey 0123456789ab; remove"
+    ):
+        work(0)
 
 
 @pytest.mark.parametrize(

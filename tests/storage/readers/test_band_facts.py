@@ -7,12 +7,14 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import rasterio
 import scipy.io
 import spectral
 import xarray as xr
+import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.enums import ColorInterp
@@ -54,13 +56,12 @@ def centres(bands: Bands) -> list[float] | None:
         ("6605 Ångström", 660.5),
         ("Band 7 - 455 nm", 455),
         ("Band 300 (900 nm)", 900),
-        ("nir 842.5", 842.5),
-        ("R_550", 550),
-        ("RedEdge-705", 705),
+        ("B4, central wavelength 665 nm", 665),
+        ("reflectance at 0.7um", 700),
     ],
 )
 def test_a_band_name_gives_one_length(name: str, nm: float) -> None:
-    """The number of a band is no length; numbers alone follow a known word."""
+    """The number of a band is no length; a length has its unit."""
     assert centres(bands_of_names([name], "a.tif")) == pytest.approx([nm])
 
 
@@ -71,11 +72,22 @@ def test_a_band_name_gives_one_length(name: str, nm: float) -> None:
         *("490 nm (455-515 nm)", "Band 300 - 455 nm", "B2 (490 nm, 65 nm)", "Green 560 (27 nm)", "FWHM 20, 450 nm"),
         *("S2A_B04_665", "Band 560", "2019", "short wave infrared", "red minus nir"),
         *("Blue: 455 - 515 nm", "450 nm (0.45 um)", "455:515 nm", "min 455 max 515 nm"),
-        *("0.455 < 0.515 um", "Blue 455-515"),
+        *("0.455 < 0.515 um", "Blue 455-515", "R_550", "X350.5", "nir 842.5", "450", "232", "1050.0"),
+        *(
+            "Red Edge 4",
+            "rededge 20m",
+            "SWIR 20m",
+            "B5 red edge",
+            "minus red",
+            "redness",
+            "vegetation red edge",
+            "red2",
+        ),
+        *("bandwidth 300 nm", "FWHM: 250 nm", ">450 nm", "450 nm ±", "NIR (infrared)", "blue aerosol", "infrared"),
     ],
 )
 def test_a_doubtful_band_name_is_named(name: str) -> None:
-    """Ranges, several lengths, widths, counted bands, years and two colours are not guessed."""
+    """Ranges, several lengths, widths, numbers without a unit and words that are not in the table are not guessed."""
     bands = bands_of_names([name], "a.tif")
     assert centres(bands) is None
     assert repr(name) in bands.notes[0]
@@ -87,7 +99,10 @@ def test_a_doubtful_band_name_is_named(name: str) -> None:
         (["blue", "green", "red", "nir"], [460, 550, 640, 800]),
         (["Band 1 Blue", "b2_GREEN", "R", "near-infrared"], [460, 550, 640, 800]),
         (["coastal", "Red edge 1", "RedEdge 3", "swir22"], [443, 705, 783, 2200]),
-        (["X350.5", "X360.2"], [350.5, 360.2]),
+        (["Blue band", "2: Green", "channel 3 (red)", "Near Infrared"], [460, 550, 640, 800]),
+        (["rededge071", "nir08", "nir09", "cirrus"], [705, 865, 945, 1375]),
+        (["X350.5", "X360.2"], None),
+        (["red", "green", "red edge 20m"], None),
         (["450 nm", "mask", "660 nm"], [450, np.nan, 660]),
         (["B04", "Band 8"], None),
         (["350", "351", "352"], None),
@@ -377,7 +392,8 @@ def test_init_leaves_out_bands_without_values(tmp_path: Path) -> None:
 COORDINATES: dict[str, Any] = {
     "Angstrom": {"wavelength": ("band", [4500.0, 5500], {"units": "Angstrom"})},
     "a name with a unit": {"center_wavelength_um": ("band", [0.45, 0.55])},
-    "the axis": {"band": ("band", [450.0, 550.0])},
+    "the axis": {"band": ("band", [450.0, 550.0], {"units": "nm"})},
+    **{f"the axis with {key}": {"band": ("band", [0.45, 0.55], {key: "um"})} for key in ("unit", "Units", "UNIT")},
     "names": {"band": ("band", ["450 nm", "550 nm"])},
 }
 
@@ -388,6 +404,101 @@ def test_arrays_follow_the_same_rules(tmp_path: Path, case: str) -> None:
     cube = xr.Dataset({"r": (("y", "x", "band"), np.ones((3, 4, 2)))}, COORDINATES[case])
     cube.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
     assert load_scene_file(tmp_path / "a.nc").wavelength_nm.tolist() == pytest.approx([450, 550])
+
+
+def test_an_axis_without_a_unit_is_asked_for(tmp_path: Path) -> None:
+    """Its numbers may be years or days; the message names it. Numbers that count the bands are not named."""
+    for numbers, words in (([2018, 2022], "coordinate band has no unit of a length"), ([1, 2], "nothing says")):
+        cube = xr.Dataset({"r": (("y", "x", "band"), np.ones((3, 4, 2)))}, {"band": ("band", numbers)})
+        cube.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+        with pytest.raises(WavelengthError, match=words):
+            load_scene_file(tmp_path / "a.nc")
+
+
+def units_of(cases: dict[str, Any]) -> list[Any]:
+    return [pytest.param(*case, id=name) for name, case in cases.items()]
+
+
+@pytest.mark.parametrize(
+    ("fields", "names", "words"),
+    units_of(
+        {
+            "a colour": ({"wavelength": "450, 850"}, ["blue", "red"], "band 1 is 850 nm by wavelength, .* 'red'"),
+            "a length": ({"wavelength": "450, 850"}, ["450 nm", "Band 2 (800 nm)"], r"'Band 2 \(800 nm\)'"),
+            "listed names": ({"wavelength": "450, 850", "band names": "nir, blue"}, [None, None], "so in 2 bands"),
+            "another list": (
+                {"wavelength": "450, 850", "centre wavelengths": "450 950"},
+                ["", ""],
+                "centre wavelengths",
+            ),
+            "rounded": ({"wavelength": "447.6, 853"}, ["0.45 um", "Band 2 (850 nm)"], None),
+            "fitting": ({"wavelength": "492, 704"}, ["Blue", "red edge 1"], None),
+            "unknown": ({"wavelength": "492, 704"}, ["B02", "thermal"], None),
+        }
+    ),
+)
+def test_a_stated_length_wins_over_a_name_with_a_note(fields: dict[str, str], names: Any, words: str | None) -> None:
+    """The note names band, number and name; names that only round the number, or say nothing, give none."""
+    bands = bands_of_fields({**fields, "wavelength units": "nm"}, names, "a.tif")
+    assert centres(bands) == [float(one) for one in fields["wavelength"].split(",")]
+    assert len(bands.notes) == (words is not None)
+    assert words is None or re.search(words, bands.notes[0])
+
+
+@pytest.mark.parametrize(
+    ("units", "nm"),
+    [
+        (["nm", "nm", ""], [450, 550, 650]),
+        (["nm", "Nanometers", "nm"], [450, 550, 650]),
+        (["", "", ""], [450, 550, 650]),
+        (["nm", "um", "nm"], None),
+    ],
+)
+def test_bands_that_state_a_unit_decide(units: list[str], nm: list[float] | None) -> None:
+    """A band without a tag beside others has their unit; different units are asked for."""
+    bands = bands_of_fields({"wavelength": ["450", "550", "650"], "wavelength_units": units}, [None] * 3, "a.tif")
+    assert centres(bands) == nm
+    assert (nm is None) == ("wavelength is left out: it has several units" in bands.notes)
+
+
+def test_a_band_without_tags_is_left_out_beside_others(tmp_path: Path) -> None:
+    """The three that state a wavelength keep theirs."""
+    with write(tmp_path / "a.tif") as file:
+        for band, centre in enumerate(NM[:3]):
+            file.update_tags(band + 1, wavelength=f"{centre}", wavelength_units="nm")
+    assert load_scene_file(tmp_path / "a.tif").wavelength_nm.tolist() == NM[:3]
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((5, 6, 4), r"axis 0 \(from 0\) of \(5, 6, 4\) has 5.*numpy.moveaxis\(cube, 0, -1\)"),
+        ((6, 5, 4), r"axis 1 .*permute \[1 3 2\] or numpy.moveaxis\(cube, 1, -1\)"),
+        ((5, 5, 4), None),
+        ((6, 7, 4), None),
+    ],
+)
+@pytest.mark.parametrize("kind", ["mat", "7.3", "h5", "zarr", "flag"])
+def test_the_axis_that_fits_the_wavelengths_is_named(tmp_path: Path, kind: str, shape: Any, words: str | None) -> None:
+    """Of every format without names of axes; two axes of this size, or none, are not named."""
+    cube, nm, path, flag = np.ones(shape), np.linspace(450, 650, 5), tmp_path / f"a.{kind}", None
+    if kind == "mat":
+        scipy.io.savemat(path, {"cube": cube, "wavelength": nm})
+    elif kind == "zarr":
+        group = zarr.open_group(path, mode="w")
+        group.create_array("cube", data=cube)
+        group.create_array("wavelength", data=nm)
+    elif kind == "flag":
+        path, flag = tmp_path / "a.npy", nm.tolist()
+        np.save(path, cube)
+    else:
+        path = tmp_path / ("a.mat" if kind == "7.3" else "a.h5")
+        with h5py.File(path, "w") as file:
+            file["cube"], file["wavelength"] = (cube.T, nm[None].T) if kind == "7.3" else (cube, nm)
+    with pytest.raises(WavelengthError) as refused:
+        load_scene_file(path, wavelengths=flag)
+    assert re.search(words or "5", str(refused.value))
+    assert ("so if these are the bands" in str(refused.value)) == (words is not None)
 
 
 def test_vectors_of_matlab_are_wavelengths_widths_and_bad_bands(tmp_path: Path) -> None:

@@ -73,6 +73,10 @@ def assert_true(recording: Recording, truth: Sequence[NDArray[np.floating]] = (T
         ({"exposure ms": 10, "integration time (s)": 0.01}, {"t_int (milliseconds)": 5}),
         ({"description": "{Camera, Integration time = 10 ms}"}, {"description": "{Exposure: 5,0 ms, Gain: high}"}),
         ({"shutter speed": "1/100 s"}, {"shutter speed": "1/200"}),
+        ({MS: 10}, {"exposure": 5000, "exposure units": "us"}),
+        ({"integration_time": 0.01, "integration_time_unit": "s"}, {"exposure time": 5, "units of exposure": "[ms]"}),
+        ({"tint": 10_000, "tint units": "microseconds"}, {"tint": 5}),
+        ({"Camera.Exposure": 10, "camera exposure unit": "ms"}, {"exposure_time": 0.005, "exposure unit": "sec"}),
     ],
 )
 def test_values_are_scaled_by_the_stated_exposures(tmp_path: Path, cube: Header, white: Header) -> None:
@@ -91,6 +95,7 @@ def test_values_are_scaled_by_the_stated_exposures(tmp_path: Path, cube: Header,
         ({"gain (x)": 1}, {"gain": "2x"}, 2),
         ({"analog gain": 13.9, "digital gain": 0}, {"analog gain": 13.9, "digital gain": 0}, 1),
         ({"gain": "high"}, {"gain": "high"}, 1),
+        ({"gain": 3, "gain units": "dB"}, {"analog gain": 1, "gain": 0, "gain unit": "dB"}, 10 ** (-3 / 20)),
     ],
 )
 def test_values_are_scaled_by_the_stated_gains(tmp_path: Path, cube: Header, white: Header, gain: float) -> None:
@@ -224,6 +229,17 @@ REFUSED: dict[str, tuple[Header, Header, str]] = {
     "speed without a unit": ({"shutter speed": 100}, {"shutter speed": 200}, "shutter speed = 200, scan.hdr with 100"),
     "one unit": ({"exposure": 10}, {"exposure": "5 ms"}, "with exposure = 5 ms, scan.hdr with 10 (no unit); give a"),
     "area": ({";AOI left": 0}, {";AOI left": 480}, "with aoi left = 480, scan.hdr with 0; give a frame taken"),
+    "raw gain": ({"raw gain": 120}, {"raw_gain": 240}, "with raw gain = 240, scan.hdr with 120; give a frame taken"),
+    "hardware binning": ({"HW_Bin": "2x2"}, {"hw bin": "1x1"}, "with hw bin = 1, 1, scan.hdr with 2, 2; give a frame"),
+    "accumulations": ({"accumulations": 4}, {"accumulations": 1}, "with accumulations = 1, scan.hdr with 4; give"),
+    "columns": ({"himg": "{1, 8}"}, {"himg": "{9, 16}"}, "with himg = 9, 16, scan.hdr with 1, 8; give a frame"),
+    "unit of its own": (
+        {"exposure": 10, "exposure units": "ticks"},
+        {"exposure": 5, "exposure units": "ticks"},
+        "ticks",
+    ),
+    "a thousand times": ({MS: 10}, {MS: 5000}, "they differ more than 100 times; correct the number or its unit"),
+    "a thousand times without a unit": ({"exposure": 10}, {"exposure": 8000}, "they differ more than 100 times"),
     "detectors": (
         {"tint1": 10, "tint2": 4},
         {"tint1": 5, "tint2": 4},
@@ -298,7 +314,7 @@ def test_an_overexposed_white_frame_is_still_named(tmp_path: Path) -> None:
     folder = write_taken(tmp_path / "a", (5, {MS: 5}), (20, {MS: 20}), {MS: 5})
     values = np.minimum(numbers(np.ones((1, SAMPLES, BANDS)) * 2, 20), 4095)
     write(folder / "scan.white.img", values, **{MS: 20})
-    assert any("at full scale in 1e+02 % of the elements" in note for note in open_recording(folder).notes)
+    assert any("at full scale (4095 DN) in 1e+02 % of the elements" in note for note in open_recording(folder).notes)
 
 
 def test_real_headers_are_read(real_data: Path) -> None:
@@ -309,7 +325,189 @@ def test_real_headers_are_read(real_data: Path) -> None:
         return taken_with(name, header.fields, header.settings)
 
     fenix = taken("specim_fenix_cal__Radiometric_8x2_1x1.hdr")
-    assert (fenix.exposures, fenix.frame) == ({"1": 28.0, "2": 7.9992}, {"binning": "8, 2", "binning2": "1, 1"})
+    assert fenix.exposures == {"1": 28.0, "2": 7.9992}
+    assert {key: fenix.frame[key] for key in ("binning", "binning2", "vimg1")} == {
+        "binning": "8, 2",
+        "binning2": "1, 1",
+        "vimg1": "1, 87",
+    }
+    assert set(fenix.others) >= {"trigger mode1", "sensorid", "pixelmatching left"}
+    assert not [key for key in fenix.others if re.search("path|date|sensor type|interleave|samples", key)]
     headwall = taken("headwall_mvx__darkReference.hdr")
     assert headwall.exposures == {"": 100.0033437}
     assert headwall.gains == {"analog gain": (13.8999996, ""), "digital gain": (0.0, "")}
+
+
+@pytest.mark.parametrize(
+    ("key", "of_cube", "of_white"),
+    [
+        ("trigger mode", "Internal", "External"),
+        ("HDR", "on", "off"),
+        ("frame averaging", 4, 1),
+        ("nd filter", 0.3, 0.6),
+        ("Serial Number", "G4-426", "G4-427"),
+        ("bit depth", 12, 16),
+        ("sensor exposure register", 120, 240),
+        ("lens", "8 mm", "23 mm"),
+        ("readout speed", "fast", "slow"),
+        ("sensorid", 3500015, 3500016),
+        ("filter position", 2, 3),
+        ("lamp current", "2.1 A", "1.9 A"),
+        ("line rate", 100, 50),
+        ("swir temperature", 147, 168),
+        ("calibration state", "factory", "field"),
+    ],
+)
+def test_an_unknown_setting_that_differs_is_named(tmp_path: Path, key: str, of_cube: object, of_white: object) -> None:
+    """A note has its key and both values; the same value, or a header without the key, has no note."""
+    for white, count in ((of_white, 1), (of_cube, 0), (None, 0)):
+        folder = write_taken(tmp_path / f"{white}", (10, {MS: 10, key: of_cube}), (10, {MS: 10, key: white}), {MS: 10})
+        notes = [note for note in open_recording(folder).notes if "differ in" in note]
+        assert len(notes) == count
+        assert all(f"{key.lower()} " in note and "scan.white.hdr" in note for note in notes)
+
+
+ORDINARY = {  # keys of ordinary headers, by format or value no settings: values of a cube and of its frames
+    "acquisition date": ("2024-05-01", "2024-05-02"),
+    "start time": ("UTC TIME: 15:41:28", "UTC TIME: 15:40:00"),
+    "description": ("{field 3}", "{File [Imported into ENVI]}"),
+    "file name": ("scan_1.raw", "white_1.raw"),
+    "calibration pack": ("C:/a.scp", "C:/b.scp"),
+    "y start": (100, 0),
+    "default bands": ("{3, 2, 1}", "{1, 2, 3}"),
+    "sensor type": ("FX10", "Unknown"),
+    "exposure units": ("ms", "milliseconds"),
+}
+
+
+def test_ordinary_headers_are_not_noted(tmp_path: Path) -> None:
+    """Layout, dates, texts and paths may differ; so may the light of a dark frame."""
+    cube, frame = ({key: values[place] for key, values in ORDINARY.items()} for place in (0, 1))
+    dark = {**frame, "lamp": "off", "shutter": "closed", "shutter state": "closed", MS: 10}
+    lit = {"lamp": "on", "shutter": "open", "shutter state": "open", MS: 10}
+    recording = open_recording(write_taken(tmp_path / "a", (10, {**cube, **lit}), (10, {**frame, **lit}), dark))
+    assert_true(recording)
+    assert not [note for note in recording.notes if re.search("differ in|does not|scaled", note)]
+
+
+def test_parts_with_their_bands_in_another_order_are_refused(tmp_path: Path) -> None:
+    """Bands of one cube have one order."""
+    folder = write_folder(tmp_path / "a", {})
+    header = folder / "raw_6.hdr"
+    header.write_text(header.read_text().replace("{500, 600, 700}", "{700, 600, 500}"))
+    with pytest.raises(SceneError, match=r"raw_6\.hdr has the bands of raw_0\.hdr in another order; name these parts"):
+        open_cube_source(folder)
+
+
+LEVELS = np.array([1.0, 2.0, 3.0, 4.0, 5.0])  # of white, by band
+FRAMES: dict[str, tuple[list[int], list[float], str]] = {  # bands of the frames, their wavelengths, and a note
+    "same": ([0, 1, 2], [500, 600, 700], ""),
+    "rounded": ([0, 1, 2], [500.4, 599.8, 700.02], ""),
+    "reversed": (
+        [2, 1, 0],
+        [700, 600, 500],
+        "has 3 bands from 700 to 500 nm, the cube 3 bands from 500 to 700 nm: its",
+    ),
+    "shuffled": ([1, 2, 0], [600, 700, 500], "its bands are read in the order of the cube's wavelengths"),
+    "window of a larger frame": (
+        [3, 0, 1, 2, 4],
+        [400, 500, 600, 700, 800],
+        "has 5 bands from 400 to 800 nm, the cube",
+    ),
+    "larger and reversed": ([4, 2, 1, 0, 3], [800, 700, 600, 500, 400], "its bands are read in the order"),
+    "another calibration": (
+        [0, 1, 2],
+        [515, 615, 715],
+        "has wavelengths up to 15 nm off those of the cube: the nearest",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FRAMES)
+@pytest.mark.parametrize("unit", ["nm", "Micrometers"])
+def test_bands_of_frames_are_those_of_the_cube(tmp_path: Path, case: str, unit: str) -> None:
+    """Frames with the cube's bands in another order, or with more bands, are read by wavelength, with a note."""
+    bands, nm, note = FRAMES[case]
+    scale = 1 if unit == "nm" else 1e-3
+    stated = {"wavelength units": unit, "wavelength": "{" + ", ".join(f"{scale * one:g}" for one in nm) + "}", MS: 10}
+    raw = numbers(TRUTH * LEVELS[:3], 10)
+    write(tmp_path / "scan.img", raw, **NM, **{MS: 10})
+    white = np.broadcast_to(LEVELS[bands], (1, SAMPLES, len(bands)))
+    listed = "{" + ", ".join(f"{1 + band}" for band in bands) + "}"
+    write(tmp_path / "scan.white.img", numbers(white, 10), **stated, white_reference=listed)
+    header = tmp_path / "scan.white.hdr"
+    header.write_text(header.read_text().replace("white reference", "white_reference"))
+    write(tmp_path / "scan.dark.img", numbers(white, 0), **stated)
+    recording = open_recording(tmp_path)
+    assert_true(recording, [TRUTH * np.array([1, 2, 3])])
+    notes = [one for one in recording.notes if "bands" in one]
+    assert (len(notes) == 2 and all(note in one for one in notes)) if note else not notes
+
+
+@pytest.mark.parametrize(
+    ("wavelengths", "more", "message"),
+    [
+        ([600, 700, 800], {}, "has 3 bands from 600 to 800 nm, the cube 3 bands from 500 to 700 nm; give a frame with"),
+        ([500, 600], {}, "has 2 bands from 500 to 600 nm, the cube 3 bands"),
+        ([550, 555, 560, 565], {}, "has 4 bands from 550 to 565 nm"),
+        ([500, 600, 700], {"fwhm": "{10, 10, 10}"}, "has bands 2 times as wide (fwhm) as the cube"),
+    ],
+)
+@pytest.mark.parametrize("scene", [False, True])
+def test_frames_of_other_bands_are_refused(
+    tmp_path: Path, wavelengths: list[float], more: Header, message: str, scene: bool
+) -> None:
+    """The message has the bands of both, for a recording and for a folder as a scene."""
+    stated = {"wavelength units": "nm", "wavelength": "{" + ", ".join(map(str, wavelengths)) + "}", **more}
+    names = ("raw_0", "whiteReference", "darkReference") if scene else ("scan.img", "scan.white.img", "scan.dark.img")
+    write(tmp_path / names[0], numbers(TRUTH, 10), **NM, fwhm="{5, 5, 5}")
+    frame = np.ones((1, SAMPLES, len(wavelengths)))
+    for name, ms in zip(names[1:], (10, 0), strict=True):
+        write(tmp_path / name, numbers(frame, ms), **stated)
+    with pytest.raises(SceneError, match=re.escape(message)):
+        (open_cube_source if scene else open_recording)(tmp_path)
+
+
+def test_a_scene_folder_names_saturated_and_exchanged_frames(tmp_path: Path) -> None:
+    """The same check as that of recordings."""
+    folder = write_folder(tmp_path / "a", {";Exposure (ms)": 10})
+    write(folder / "whiteReference", np.full((1, SAMPLES, BANDS), 4095, np.uint16), **{";Exposure (ms)": 10})
+    assert any("white frame is at full scale (4095 DN)" in note for note in open_cube_source(folder).notes)
+    write(folder / "whiteReference", numbers(np.ones((1, SAMPLES, BANDS)), 0), **{";Exposure (ms)": 10})
+    write(folder / "darkReference", numbers(np.ones((1, SAMPLES, BANDS)), 10), **{";Exposure (ms)": 10})
+    with pytest.raises(SceneError, match="the white frame is not brighter than the dark one"):
+        open_cube_source(folder)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_lines_of_a_scene_folder_below_dark_are_left_out(tmp_path: Path, lost: int) -> None:
+    """A dropped frame of 0 has no value; more than a tenth of them are refused."""
+    folder = write_folder(tmp_path / "a", {";Exposure (ms)": 5})
+    raw = numbers(TRUTH[6:], 10)
+    raw[2 : 2 + lost] = 0
+    write(folder / "raw_6", raw, **NM, **{";Exposure (ms)": 10})
+    if lost == 2:
+        with pytest.raises(
+            SceneError, match=r"2 of 12 lines cannot be used, .*: 2 darker than the dark frame \(the first"
+        ):
+            load_scene_file(folder)
+        return
+    scene = load_scene_file(folder)
+    assert np.isnan(scene.values[8]).all()
+    assert np.isfinite(np.delete(scene.values, 8, axis=0)).all()
+    assert any(
+        "1 of 12 lines are left out: 1 darker than the dark frame (the first is line 8)" in n for n in scene.provenance
+    )
+
+
+def test_settings_of_the_frames_alone_are_compared(tmp_path: Path) -> None:
+    """A cube that states none says nothing on them."""
+    white = {MS: 10, "accumulations": 4, "trigger mode": "external"}
+    folder = write_taken(tmp_path / "a", (10, {MS: 10}), (10, white), {**white, "trigger mode": "internal"})
+    notes = open_recording(folder).notes
+    assert any("white frame scan.white.hdr differ in trigger mode internal and external" in note for note in notes)
+    folder = write_taken(tmp_path / "b", (10, {MS: 10}), (10, white), {**white, "accumulations": 1})
+    with pytest.raises(
+        SceneError, match=r"scan\.white\.hdr was taken with accumulations = 4, the dark frame .* with 1"
+    ):
+        open_recording(folder)

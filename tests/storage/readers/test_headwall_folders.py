@@ -123,14 +123,17 @@ def test_folders_without_lines_are_refused(tmp_path: Path, lines: NDArray[np.uin
 
 
 def test_folders_and_pipes_are_ignored_as_parts(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """A folder named like a part and a pipe named like an index are ignored; a pipe as header is refused."""
+    """A folder named like a part and other pipes are ignored; a pipe as index, which is read, or header is refused."""
     write_part(tmp_path, "raw_0", lines[:5])
     (tmp_path / "raw_5").mkdir()
-    os.mkfifo(tmp_path / "frameIndex_0.txt")
+    os.mkfifo(tmp_path / "frameIndex.txt")
     assert open_cube_source(tmp_path).shape[0] == 5
+    os.mkfifo(tmp_path / "frameIndex_0.txt")
+    with pytest.raises(SceneError, match=r"frameIndex_0\.txt is no file"):
+        open_cube_source(tmp_path)
     os.mkfifo(tmp_path / "pipe.hdr")
     (tmp_path / "pipe").touch()
-    with pytest.raises(SceneError, match="is no file; name an ENVI header"):
+    with pytest.raises(SceneError, match="is no file; move it elsewhere"):
         open_cube_source(tmp_path / "pipe.hdr")
 
 

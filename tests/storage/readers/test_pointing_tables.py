@@ -112,7 +112,10 @@ def test_a_table_describes_several_cubes_or_sweeps(tmp_path: Path) -> None:
             "angle_deg,time\n0,0\n1,0.2\n2,0.2\n",
             "row 4: time = 0.2, expected a time after that of the line before [s]; correct the table",
         ),
-        ("angle_deg\n0\nnan\n2\n", "row 3: angle_deg = nan, expected a number; set valid = 0 where it is not known"),
+        (
+            "angle_deg\n0\nnan\n2\n",
+            "1 of 3 lines cannot be used, more than a tenth: row 3: angle_deg = nan, expected a",
+        ),
         ("angle_deg,time\n0,0\n1,\n2,1\n", "row 3: time = nan, expected a number"),
         ("angle_deg,exposure_ms\n0,1\n1,0\n2,1\n", "row 3: exposure_ms = 0, expected a time above 0 ms"),
         ("angle_deg,valid\n0,1\n1,2\n2,1\n", "row 3: valid = 2, expected 0 or 1"),
@@ -124,6 +127,66 @@ def test_unusable_tables_are_refused(tmp_path: Path, text: str, message: str) ->
     """Columns, cells, numbers of rows, range, order and unknown values are checked; the first wrong row is named."""
     with pytest.raises(SceneError, match=re.escape(message)):
         load_pointing(_table(tmp_path, text), "cube", 3)
+
+
+@pytest.mark.parametrize(
+    ("header", "good", "bad", "why"),
+    [
+        (
+            "angle_deg,exposure_ms",
+            "0.1,10",
+            "0.1,0",
+            "row 9: exposure_ms = 0 (the first of 2 such rows), expected a time",
+        ),
+        ("angle_deg,exposure_ms", "0.1,10", "0.1,-3", "exposure_ms = -3"),
+        ("angle_deg,exposure_ms", "0.1,10", "0.1,", "exposure_ms = nan"),
+        ("angle_deg,exposure_ms", "0.1,10", "0.1,10000", "exposure_ms = 10000"),
+        ("angle_deg,exposure_ms", "0.1,10", "0.1,inf", "exposure_ms = inf"),
+        (
+            "mirror_x,mirror_y",
+            "0.5,0.1",
+            "0.8,0.8",
+            "row 9: mirror_x = 0.8, mirror_y = 0.8 (the first of 2 such rows), bey",
+        ),
+        (
+            "mirror_x,mirror_y",
+            "0.5,0.1",
+            ",0.1",
+            "mirror_x = nan, mirror_y = 0.1 (the first of 2 such rows), expected a num",
+        ),
+        ("angle_x_deg,angle_y_deg", "1,2", "1,88", "angle_y_deg = 88"),
+        ("position_px", "7", "nan", "position_px = nan"),
+    ],
+)
+def test_lines_that_cannot_be_are_left_out_up_to_a_tenth(
+    tmp_path: Path, header: str, good: str, bad: str, why: str
+) -> None:
+    """They are named by their first row, and have the position and exposure of their neighbours."""
+    rows = [good] * 30
+    rows[7] = rows[20] = bad
+    found = load_pointing(_table(tmp_path, "\n".join([header, *rows])), "c", 30)
+    assert np.flatnonzero(~found.valid).tolist() == [7, 20]
+    assert np.isfinite(found.position).all()
+    np.testing.assert_allclose(found.position, found.position[:1].repeat(30, axis=0))
+    assert found.exposure_ms is None or (found.exposure_ms == 10).all()
+    (note,) = found.notes
+    assert "2 of 30 lines are left out: row 9: " in note
+    assert why in note
+    rows[1] = rows[2] = bad
+    with pytest.raises(
+        SceneError, match=r"4 of 30 lines cannot be used, more than a tenth: row 3: .*; correct the table"
+    ):
+        load_pointing(_table(tmp_path, "\n".join([header, *rows])), "c", 30)
+
+
+def test_exposures_of_lines_may_differ(tmp_path: Path) -> None:
+    """Those of 1 ms among 10 ms are exposures."""
+    rows = ["0.1,10"] * 30
+    rows[7] = "0.1,1"
+    found = load_pointing(_table(tmp_path, "\n".join(["angle_deg,exposure_ms", *rows])), "c", 30)
+    assert found.valid.all()
+    assert found.exposure_ms is not None
+    assert found.exposure_ms[7] == 1
 
 
 def test_pointing_is_found_by_the_cubes_name(tmp_path: Path) -> None:

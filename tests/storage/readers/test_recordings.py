@@ -93,6 +93,41 @@ def test_recordings_open_from_folders_runs_and_archives(tmp_path: Path, archive:
         open_recording(runs[0], CAMERA)
 
 
+def write_changed(folder: Path, changed: dict[int, dict[str, float]]) -> Path:
+    """Write a raw cube of 80 lines, some of which have other facts."""
+    source = simulated()
+    header = SweepHeader(FULL, source.references(FULL), source.wavelength_nm, np.full(3, 5.0), "sim")
+    with RawCubeWriter(folder / "scan-0.zarr", header) as cube:
+        cube.write([replace(line, **changed.get(line.number, {})) for line in source.lines(FULL)])
+    return folder / "scan-0.zarr"
+
+
+@pytest.mark.parametrize(
+    "fault", [{"exposure_ms": 0.0}, {"exposure_ms": np.nan}, {"exposure_ms": -5.0}, {"mirror_y": 1.5}]
+)
+def test_lines_of_a_raw_cube_that_cannot_be_are_left_out(tmp_path: Path, fault: dict[str, float]) -> None:
+    """Up to a tenth of the lines, with a note; their exposures are the usual one."""
+    recording = open_recording(write_changed(tmp_path / "a", {line: dict(fault) for line in (3, 70)}), CAMERA)
+    (sweep,) = recording.sweeps
+    assert np.flatnonzero(~sweep.valid_line).tolist() == [3, 70]
+    assert (sweep.exposure_ms == CAMERA.exposure_ms).all()
+    (note,) = recording.notes
+    assert note.startswith("scan-0.zarr: 2 of 80 lines are left out: 2 ")
+    assert "(the first is line 3)" in note
+    with pytest.raises(SceneError, match="80 of 80 lines cannot be used, more than a tenth"):
+        open_recording(write_changed(tmp_path / "b", {line: dict(fault) for line in range(80)}), CAMERA)
+
+
+def test_lines_of_a_raw_cube_with_other_exposures_are_scaled(tmp_path: Path) -> None:
+    """White without an exposure of its own has the usual one, and notes say so."""
+    recording = open_recording(write_changed(tmp_path / "a", {7: {"exposure_ms": CAMERA.exposure_ms / 10}}), CAMERA)
+    assert recording.sweeps[0].references.exposure_ms == CAMERA.exposure_ms
+    assert recording.notes == (
+        "scan-0.zarr: white is taken to have 100 ms",
+        "scan-0.zarr: lines of 10 to 100 ms are scaled to the exposure of white",
+    )
+
+
 @pytest.mark.parametrize("copied", [False, True])
 def test_a_lost_chunk_of_a_raw_cube_is_reported(tmp_path: Path, archive: Archive, copied: bool) -> None:
     """In a store and in a folder without a manifest, zarr would read zeros in its place."""

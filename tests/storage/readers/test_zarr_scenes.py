@@ -1,9 +1,8 @@
-"""Zarr stores as scenes: known dims are read; raw cubes, pickles, outside links and huge claims are refused."""
+"""Zarr stores as scenes: known dims are read; raw cubes, pickles, and huge claims are refused."""
 
 from __future__ import annotations
 
 import json
-import os
 import pickle
 from pathlib import Path
 from typing import Any
@@ -125,33 +124,6 @@ def test_damaged_zarr_stores_are_refused(tmp_path: Path, cube: NDArray[np.uint16
         load_scene_file(path, wavelengths=NM.tolist())
 
 
-def test_links_out_of_a_store_are_refused(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Links to other places and pipes are refused before one is read; a link to the store itself is allowed."""
-    (tmp_path / "secret").mkdir()
-    (tmp_path / "secret" / "key").write_bytes(b"secret")
-    path = tmp_path / "a.zarr"
-    zarr.create_array(path, data=cube)
-    chunk = next(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")
-    whole = chunk.read_bytes()
-    for target in (tmp_path / "secret" / "key", Path("../../../../secret/key"), Path("/dev/zero"), tmp_path / "none"):
-        chunk.unlink()
-        chunk.symlink_to(target)
-        with pytest.raises(SceneError, match="is a link out of its folder"):
-            open_cube_source(path)
-    chunk.unlink()
-    os.mkfifo(chunk)
-    with pytest.raises(SceneError, match="is no file; take it out of the store"):
-        open_cube_source(path)
-    chunk.unlink()
-    chunk.write_bytes(whole)
-    (path / "more").symlink_to(tmp_path / "secret")
-    with pytest.raises(SceneError, match="is a link out of its folder"):
-        open_cube_source(path)
-    (path / "more").unlink()
-    (tmp_path / "linked.zarr").symlink_to(path)
-    np.testing.assert_array_equal(open_cube_source(tmp_path / "linked.zarr").read(0, 7), cube)
-
-
 def test_names_in_consolidated_metadata_are_not_followed(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     """Only arrays inside of the store are read, whatever its consolidated metadata list; names are no paths."""
     path, other = tmp_path / "a.zarr", tmp_path / "other.zarr"
@@ -189,3 +161,49 @@ def test_chunks_must_fit_into_memory(tmp_path: Path, cube: NDArray[np.uint16], m
     monkeypatch.setattr("spectralzoom.storage.readers.cube_sources.machine_bytes", lambda: cube.nbytes - 1)
     with pytest.raises(SceneError, match="reading it takes about"):
         open_cube_source(tmp_path / "a.zarr")
+
+
+def _with_fill(path: Path, version: int, kind: str, key: str, fill: Any) -> Path:
+    """Write a store whose no-data value ``fill`` stands as ``key`` in the metadata or the attributes."""
+    group = zarr.open_group(path, mode="w", zarr_format=version)  # type: ignore[arg-type]
+    about = {} if key == "fill_value" else {key: fill}
+    group.create_array("cube", data=np.arange(60).reshape(4, 5, 3).astype(kind), attributes=about)
+    if key == "fill_value":
+        metadata = path / "cube" / ("zarr.json" if version == 3 else ".zarray")
+        metadata.write_text(json.dumps(json.loads(metadata.read_text()) | {key: fill}))
+    return path
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("kind", ["f4", "f8", "i2"])
+@pytest.mark.parametrize("key", ["_FillValue", "missing_value", "fill_value"])
+def test_a_fill_value_that_is_no_number_is_named(tmp_path: Path, version: int, kind: str, key: str) -> None:
+    """The message has its key and value."""
+    path = _with_fill(tmp_path / "a.zarr", version, kind, key, "minus one")
+    with pytest.raises(SceneError, match=rf"cube.* has {key} = 'minus one', expected a number; correct it"):
+        open_cube_source(path)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize(("kind", "fill"), [("f4", "7"), ("f8", "7.0"), ("i2", "7"), ("f8", "AAAAAAAAHEA=")])
+def test_a_fill_value_may_be_the_text_of_a_number(tmp_path: Path, version: int, kind: str, fill: str) -> None:
+    """In decimals, or as xarray encodes a double."""
+    path = _with_fill(tmp_path / "a.zarr", version, kind, "_FillValue", fill)
+    scene = load_scene_file(path, wavelengths=[450, 550, 650])
+    assert np.flatnonzero(np.isnan(scene.values)).tolist() == [7]
+
+
+@pytest.mark.parametrize("fill", ["", "none", "NaN"])
+def test_a_fill_value_of_none_is_none(tmp_path: Path, fill: str) -> None:
+    """Such a text states no number, so that every value counts."""
+    path = _with_fill(tmp_path / "a.zarr", 3, "f4", "_FillValue", fill)
+    assert np.isfinite(load_scene_file(path, wavelengths=[450, 550, 650]).values).all()
+
+
+def test_fill_values_by_other_names_are_noted(tmp_path: Path) -> None:
+    """They are not applied, and neither is a range in words."""
+    path = _with_fill(tmp_path / "a.zarr", 3, "f4", "Data_Ignore_Value", -1)
+    zarr.open_group(path, mode="r+")["cube"].attrs["valid_range"] = "0 to 9"
+    notes = open_cube_source(path).notes
+    assert "its Data_Ignore_Value = -1 is not applied: only numbers in _FillValue are" in notes
+    assert "its valid_range = 0 to 9 is not applied: only numbers are" in notes

@@ -10,9 +10,11 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
 from threading import Barrier
+from time import monotonic
 from typing import Any
 
 import pytest
@@ -22,10 +24,11 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 from spectralzoom.flows.cli.main import main
 from spectralzoom.pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from spectralzoom.storage.remote import objects as requests
+from spectralzoom.storage.remote.all_names import signed
 from spectralzoom.storage.remote.bucket import Copied, pull, push
 from spectralzoom.storage.remote.objects import Objects, UnreachableError
 from spectralzoom.storage.runs import clear_up, verify_everything
-from spectralzoom.storage.store import Archive, Ref, is_cleared, manifest_text
+from spectralzoom.storage.store import Archive, Ref, digest_of, is_cleared, manifest_text
 from tests.faulty_proxy import FAULTS, Choose, faulty_proxy
 from tests.storage.small_archive import make_store, publish_receipt, small_survey
 
@@ -361,8 +364,8 @@ def test_gc_works_on_a_copy(archive: Archive, bucket: str, tmp_path: Path) -> No
         ({"../../../x": [1, ""]}, "no file of this folder"),
         ({"/etc/x": [1, ""]}, "no file of this folder"),
         ({"a": [-1, ""]}, "has changed"),
-        ({"a": [1, ""], "a/b": [1, ""]}, "has changed|cannot write to the archive"),
-        ({"n" * 300: [1, ""]}, "cannot write to the archive"),
+        ({"a": [1, ""], "a/b": [1, ""]}, "has changed|can be no file"),
+        ({"n" * 300: [1, ""]}, "can be no file: File name too long"),
     ],
 )
 def test_a_hostile_manifest_is_refused(bucket: str, tmp_path: Path, files: dict[str, Any], words: str) -> None:
@@ -462,3 +465,206 @@ def test_errors_of_a_bucket_are_explained(bucket: str, answer: str, words: str) 
     from obstore.exceptions import GenericError
 
     assert words in str(Objects(bucket).explain(GenericError(answer)))
+
+
+# --- two machines with other bytes ------------------------------------------------------------------------------------
+
+
+def other_mosaics(folder: Path) -> tuple[Archive, Archive]:
+    """Return two archives with a run each, over stores of the same keys, of which the mosaics differ."""
+    archives = Archive.open(folder / "one"), Archive.open(folder / "two")
+    for number, archive in enumerate(archives):
+
+        def build(part: Path, number: int = number) -> None:
+            (part / "data.bin").write_bytes(bytes([number]))
+
+        raw = make_store(archive, "sweeps", {}, [])
+        mosaic, _ = archive.produce("mosaic", build, version=1, params={}, inputs=[raw])
+        drawn = make_store(archive, "draw", {}, [mosaic])  # before its inputs, by name
+        run = publish_receipt(archive, {}, drawn)
+        run.rename(run.with_name(f"2026010{number + 1}T000000-farm"))
+        make_store(archive, "alone", {"machine": number}, [])
+    return archives
+
+
+def test_a_push_onto_other_bytes_is_an_error_with_both_sides(bucket: str, tmp_path: Path) -> None:
+    """Neither the run nor the map of the second machine is sent, but all that does not rest on the mosaic is."""
+    one, two = other_mosaics(tmp_path)
+    send(one, bucket)
+    drawn = one.refs("draw")[0].uri
+    digests = [str(digest_of(archive.root / drawn))[:12] for archive in (two, one)]
+    run = "runs/20260102T000000-farm"
+    both = f"made of {drawn} with digest {digests[0]}, but {bucket} has another {drawn}, with digest {digests[1]}"
+    for _ in range(2):
+        with pytest.raises(IncompleteStoreError, match=f"cannot be copied to {bucket}: it was {both}; two machines"):
+            send(two, bucket)
+        there = {name.rpartition("/")[0] for name in Objects(bucket).listing() if name.endswith("manifest.json")}
+        assert two.refs("alone")[0].uri in there
+        assert run not in there
+    copy, _ = fetch(bucket, tmp_path / "copy")
+    assert problems(copy.root) == []
+    assert [one.name for one in copy.runs()] == ["20260101T000000-farm"]
+
+
+def test_a_pull_onto_other_bytes_is_an_error_with_both_sides(bucket: str, tmp_path: Path) -> None:
+    """The run of the bucket does not appear beside this archive's own mosaic."""
+    one, two = other_mosaics(tmp_path)
+    send(one, bucket)
+    for run in (None, "20260101T000000-farm"):
+        with pytest.raises(IncompleteStoreError, match=f"cannot be copied to {two.root}: .* {two.root} has another"):
+            fetch(bucket, two.root, run)
+        assert [one.name for one in two.runs()] == ["20260102T000000-farm"]
+    assert two.is_there(one.refs("alone")[0].uri)
+    assert problems(two.root) == []
+
+
+def test_two_machines_with_other_bytes_push_at_the_same_time(bucket: str, tmp_path: Path, broken: Broken) -> None:
+    """Two processes find an empty bucket: one run arrives with its own stores, the other machine gets an error."""
+    together, listed = Barrier(2), count()
+
+    def meet(method: str, path: str) -> str | None:
+        if method == "GET" and "list-type" in path and next(listed) < 2:
+            together.wait(60)
+        return None
+
+    broken(meet)
+    roots = [archive.root for archive in other_mosaics(tmp_path)]
+    script = "import sys; from spectralzoom.flows.cli.main import main; main(sys.argv[1:])"
+    commands = [[sys.executable, "-c", script, "push", str(root), bucket] for root in roots]
+    processes = [
+        subprocess.Popen(words, cwd=Path(__file__).parents[3], stderr=subprocess.PIPE, text=True) for words in commands
+    ]
+    ended = [(process.communicate()[1], process.returncode) for process in processes]
+    assert sorted(code for _, code in ended) in ([0, 1], [1, 1])
+    assert all("two machines made it" in text for text, code in ended if code)
+    copy, _ = fetch(bucket, tmp_path / "copy")
+    assert problems(copy.root) == []
+    assert len(copy.runs()) <= 1
+
+
+def test_equal_stores_of_two_machines_are_no_conflict(bucket: str, tmp_path: Path) -> None:
+    """They were made at other times, and one of them again."""
+    machines = [Archive.open(tmp_path / name) for name in ("one", "two")]
+    for number, machine in enumerate(machines):
+        small = small_survey(machine)
+        machine.clear(small.mosaic)
+        small_survey(machine, named=False)
+        small.run.rename(small.run.with_name(f"2026010{number + 1}T000000-farm"))
+        send(machine, bucket)
+    copy, _ = fetch(bucket, tmp_path / "copy")
+    assert len(copy.runs()) == 2
+    assert problems(copy.root) == []
+
+
+# --- order, names and time of requests --------------------------------------------------------------------------------
+
+
+def test_a_pull_killed_anywhere_leaves_no_store_before_its_inputs(bucket: str, tmp_path: Path, broken: Broken) -> None:
+    """It ends at each object in turn: verify finds no store or run that lacks an input."""
+    one, _ = other_mosaics(tmp_path)
+    send(one, bucket)
+    asked, last = count(), [0]
+
+    def end(method: str, path: str) -> str | None:
+        return "reset" if "list-type" not in path and next(asked) >= last[0] else None
+
+    broken(end)
+    for last[0] in range(12):
+        asked = count()
+        try:
+            there, _ = fetch(bucket, tmp_path / f"there{last[0]}")
+        except ArchiveError:
+            there = Archive.open(tmp_path / f"there{last[0]}")
+        assert problems(there.root) == []
+    asked = count(-100)
+    assert len(fetch(bucket, tmp_path / "there0")[0].runs()) == 1
+
+
+BAD_NAMES = [
+    "stages//x/manifest.json",
+    "runs/../y",
+    "stages/a\x01/k/manifest.json",
+    "runs/2026\x7f/receipt.json",
+    "./x",
+]
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_an_object_of_a_bad_name_is_named_and_the_rest_is_pulled(
+    archive: Archive, bucket: str, tmp_path: Path, s3_server: str, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The names of a bucket need not be paths; push works on, too."""
+    import boto3
+
+    send(archive, bucket)
+    client = boto3.client("s3", endpoint_url=s3_server)
+    prefix = bucket.removeprefix("s3://surveys/")
+    client.put_object(Bucket="surveys", Key=f"{prefix}/{name}", Body=b"")
+    there, fetched = fetch(bucket, tmp_path / "there")
+    assert contents(there.root) == contents(archive.root)
+    assert fetched.bad_names == [name]
+    assert send(archive, bucket).bad_names == [name]
+    with pytest.raises(SystemExit) as ended:
+        main(["pull", bucket, str(tmp_path / "again")])
+    assert ended.value.code == 3
+    assert "a name that no client can ask for: remove it" in capsys.readouterr().out
+    client.delete_object(Bucket="surveys", Key=f"{prefix}/{name}")
+    client.close()
+
+
+def test_requests_are_signed_as_botocore_signs_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With and without a session token, at AWS and at another server."""
+    from botocore.auth import S3SigV4Auth
+    from botocore.awsrequest import AWSRequest
+    from botocore.credentials import Credentials
+
+    now = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+    for endpoint, token in (("", None), ("http://127.0.0.1:9000", "a token/+=")):
+        for name, value in {
+            "AWS_ACCESS_KEY_ID": "key",
+            "AWS_SECRET_ACCESS_KEY": "sec/ret",
+            "AWS_REGION": "eu-x-1",
+        }.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv("AWS_SESSION_TOKEN", token or "")
+        query = {"prefix": "a b/ü/", "list-type": "2", "continuation-token": "x+/=="}
+        made = signed("bucket", query, endpoint, now)
+        theirs = AWSRequest("GET", made.full_url, headers={"X-Amz-Content-SHA256": hashlib.sha256(b"").hexdigest()})
+        theirs.context["timestamp"] = "20260304T050607Z"
+        auth = S3SigV4Auth(Credentials("key", "sec/ret", token), "s3", "eu-x-1")
+        monkeypatch.setattr("botocore.auth.get_current_datetime", lambda: now.replace(tzinfo=None))
+        auth.add_auth(theirs)
+        assert made.get_header("Authorization") == theirs.headers["Authorization"]
+
+
+def test_the_rest_of_a_bucket_with_a_damaged_store_is_pulled(bucket: str, tmp_path: Path) -> None:
+    """The error names the store; the run that rests on it is left out, another one comes."""
+    one = Archive.open(tmp_path / "one")
+    bad, good = small_survey(one, seed=1), small_survey(one, seed=2)
+    send(one, bucket)
+    name = next(name for name in Objects(bucket).listing() if bad.mosaic.uri in name and name.endswith("data.bin"))
+    Objects(bucket).write(name, b"x")
+    with pytest.raises(IncompleteStoreError, match=rf"{name} has changed .*\. All that does not rest on it was copied"):
+        fetch(bucket, tmp_path / "there")
+    there = Archive.open(tmp_path / "there")
+    assert [run.name for run in there.runs()] == [good.run.name]
+    assert problems(there.root) == []
+
+
+@pytest.mark.parametrize(("method", "part"), [("GET", "list-type"), ("PUT", "data.bin"), ("PUT", "manifest.json")])
+def test_a_stalled_request_is_given_up_in_time(
+    archive: Archive, bucket: str, broken: Broken, monkeypatch: pytest.MonkeyPatch, method: str, part: str
+) -> None:
+    """The limit holds for a request with all its repetitions; here it is a tenth of the real one."""
+    monkeypatch.setattr(requests, "REQUEST_S", 1)
+    broken(lambda by, path: "stall" if by == method and part in path else None)
+    began = monotonic()
+    with pytest.raises(UnreachableError, match="it does not answer: check the network"):
+        send(archive, bucket)
+    assert 1 < monotonic() - began < 6
+
+
+def test_a_larger_request_may_take_longer() -> None:
+    """At least 26 kB/s; an absurd size has a limit too."""
+    limits = [requests._seconds(size) for size in (0, 10_000, 1 << 20, requests.PART_BYTES, 1 << 60, -5)]
+    assert limits == [10, 10, 50, 330, 900, 10]
