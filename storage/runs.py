@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 
 from spectralzoom.pipeline.errors import ArchiveError, NoRunError, SettingsError, list_some
 from spectralzoom.pipeline.words import is_name, moment_of
+from spectralzoom.storage.receipts import receipt_problem
 from spectralzoom.storage.store import (
     CAPTURED,
     LATEST,
@@ -124,8 +125,10 @@ def read_run(folder: Path, digests: Callable[[Path], str | None] = digest_of) ->
         problem = f"{RECEIPT} {found}" if found else None
         try:
             receipt = {} if problem else json.loads(read_own(folder / RECEIPT))
+            if wrong := receipt_problem(receipt) if receipt else None:
+                receipt, problem = {}, f"{RECEIPT}: {wrong}"
         except (OSError, ValueError, RecursionError) as error:
-            problem = f"{RECEIPT} cannot be read: {error}"
+            receipt, problem = {}, f"{RECEIPT} cannot be read: {error}"
     root = folder.parents[1]
     problem = problem or next(iter(conflicts(facts, lambda uri: digests(root / uri), str(root))), None)
     return Run(folder, facts, _as(dict, receipt), problem)
@@ -226,6 +229,8 @@ def verify_everything(
         done += listed_bytes(manifest)
         with refusals(archive.root, "read the archive", every=True):
             problems = list(problems_of(archive.root / uri, every_byte=True))
+            if not problems and uri.startswith("runs/"):
+                problems += filter(None, [read_run(archive.root / uri).problem])
         if is_known(archive.root / uri) or uri in named:  # else gc has removed it since
             found += [Finding(uri, problem, "broken") for problem in problems] or [Finding(uri, None)]
     what = "expected a folder with a manifest; take it out of the archive"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,8 +18,8 @@ from spectralzoom.flows.publish.receipt import load_receipt
 from spectralzoom.flows.settings.flags import check_outside
 from spectralzoom.flows.tasks.scores import warnings_of
 from spectralzoom.flows.terminal.processes import writing
-from spectralzoom.flows.terminal.progress import show_warnings
-from spectralzoom.pipeline.errors import SettingsError
+from spectralzoom.flows.terminal.progress import show_text, show_warnings
+from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from spectralzoom.pipeline.ground.georeference import crs_name
 from spectralzoom.storage.export.image_files import Layer, merged_layer, write_cog
 from spectralzoom.storage.store import Archive
@@ -34,7 +35,7 @@ def export_merged(archive: str | Path, out: Path, console: Console) -> dict[str,
     """
     opened = Archive.open(archive, create=False, write=False)
     path = check_outside(out, opened.root) / MERGED
-    runs, left_out = _newest_runs(opened)
+    runs, left_out = _newest_runs(opened, partial(show_text, console=console))
     if not runs:
         raise SettingsError(f"no run of {opened.name} has a CRS, so there is nothing to merge; export runs one by one")
     layers = [map_layers(run)[0] for run in runs]
@@ -53,11 +54,18 @@ def export_merged(archive: str | Path, out: Path, console: Console) -> dict[str,
     return {"warnings": warned, "file": str(path), "runs": [run.id for run in runs]}
 
 
-def _newest_runs(archive: Archive) -> tuple[list[ExportedRun], list[str]]:
-    """Return the newest run with a CRS of each scene, the newest first, and the names of those without a CRS."""
+def _newest_runs(archive: Archive, note: Callable[[str], None]) -> tuple[list[ExportedRun], list[str]]:
+    """Return the newest run with a CRS of each scene, the newest first, and the names of those without a CRS.
+
+    ``note`` gets the damage of each run that is left out.
+    """
     newest: dict[str, ExportedRun] = {}
     for folder in reversed(archive.runs()):
-        run = ExportedRun(archive, folder, load_receipt(folder))
+        try:
+            run = ExportedRun(archive, folder, load_receipt(folder))
+        except (IncompleteStoreError, ShapeError) as error:
+            note(f"note: left out: {error}")
+            continue
         newest.setdefault(str(run.receipt["settings"]["scene"]), run)
     runs = [run for run in newest.values() if run.geobox is not None]
     return runs, [run.id for run in newest.values() if run.geobox is None]

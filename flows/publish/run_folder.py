@@ -21,7 +21,7 @@ from spectralzoom.flows.products import Control, Products
 from spectralzoom.flows.publish.field_map import field_map
 from spectralzoom.flows.publish.findings import PLOTS_FILE, find_out, map_warnings, plots_csv
 from spectralzoom.flows.publish.quicklook import QuicklookData, draw_quicklook, thinned
-from spectralzoom.flows.publish.receipt import Facts, Receipt, build_receipt
+from spectralzoom.flows.publish.receipt import Receipt, build_receipt
 from spectralzoom.flows.publish.report import render_report
 from spectralzoom.flows.settings.load import anchor_paths
 from spectralzoom.flows.settings.values import KEEP_SIGNAL, RASTER
@@ -39,6 +39,7 @@ from spectralzoom.pipeline.words import moment_of
 from spectralzoom.storage.arrays.class_maps import ProbabilityStore, load_class_map
 from spectralzoom.storage.arrays.layout import open_group, read_array
 from spectralzoom.storage.arrays.mosaics import choose_bands, open_mosaic
+from spectralzoom.storage.receipts import Facts
 from spectralzoom.storage.runs import RECEIPT
 from spectralzoom.storage.whole_files import to_json, write_new
 

@@ -362,5 +362,5 @@ def _run_with_cubes(address: str | Path) -> tuple[Archive, Run, list[Path]] | No
         stores = [archive.locate(uri) for uri in stores_of_lines(run.products, archive.is_there)]
         if cubes := [path for store in stores for path in sorted(store.glob("*.zarr"))]:
             return archive, run, cubes
-    which = f"the run {name}" if name else "no run"
-    raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")
+    which = f"the run {name} has no" if name else "no run has"
+    raise ArchiveError(f"{archive.name}: {which} raw cubes; survey into the archive first, or name another run")
