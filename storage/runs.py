@@ -1,6 +1,6 @@
 """Read the runs of an archive with their receipts, verify every byte, and clear up.
 
-A damaged manifest gives a record with a ``problem``; values of another type than expected are ignored. Stores are
+A damaged manifest, or a receipt with a value that is not valid, gives a record with a ``problem``. Stores are
 removed before their inputs, each in one step, so that the archive stays valid wherever this is killed.
 """
 
@@ -82,18 +82,17 @@ class Run:
     @property
     def settings(self) -> dict[str, Any]:
         """Return the settings of the survey, from the receipt or else, rounded, from the manifest."""
-        return dict(_as(dict, self.receipt.get("settings")) or self.facts["settings"])
+        return dict(self.receipt.get("settings") or self.facts["settings"])
 
     @property
     def products(self) -> dict[str, str]:
         """Names and addresses of its products."""
-        products = _as(dict, self.receipt.get("products"))
-        return {name: uri for name, uri in products.items() if isinstance(uri, str)}
+        return dict(self.receipt.get("products") or {})
 
     @property
     def stages(self) -> list[dict[str, Any]]:
         """Its stages, each with name, key, state and costs."""
-        return [row for row in _as(list, self.receipt.get("stages")) if isinstance(row, dict)]
+        return list(self.receipt.get("stages") or ())
 
     @property
     def acquired(self) -> str | None:
@@ -103,17 +102,12 @@ class Run:
     @property
     def created(self) -> str:
         """When it was published, ISO 8601 in UTC."""
-        return str(self.facts["created"] or _as(str, self.receipt.get("finished")))
+        return str(self.facts["created"] or self.receipt.get("finished", ""))
 
     @property
     def in_future(self) -> bool:
         """Return whether it was published later than now, by a clock that is or was wrong."""
         return lies_ahead(self.folder.name, self.created)
-
-
-def _as(kind: Any, value: Any) -> Any:
-    """Return a value of this type, or an empty one."""
-    return value if isinstance(value, kind) else kind()
 
 
 def read_run(folder: Path, digests: Callable[[Path], str | None] = digest_of) -> Run:
@@ -125,13 +119,13 @@ def read_run(folder: Path, digests: Callable[[Path], str | None] = digest_of) ->
         problem = f"{RECEIPT} {found}" if found else None
         try:
             receipt = {} if problem else json.loads(read_own(folder / RECEIPT))
-            if wrong := receipt_problem(receipt) if receipt else None:
+            if wrong := receipt_problem(receipt):
                 receipt, problem = {}, f"{RECEIPT}: {wrong}"
         except (OSError, ValueError, RecursionError) as error:
             receipt, problem = {}, f"{RECEIPT} cannot be read: {error}"
     root = folder.parents[1]
     problem = problem or next(iter(conflicts(facts, lambda uri: digests(root / uri), str(root))), None)
-    return Run(folder, facts, _as(dict, receipt), problem)
+    return Run(folder, facts, receipt, problem)
 
 
 class Catalogue(NamedTuple):

@@ -16,14 +16,16 @@ from spectralzoom.flows.settings.rules import OF_THE_PLAN
 from spectralzoom.flows.settings.settings import Settings, to_state
 from spectralzoom.flows.settings.values import ALWAYS, RECORDED
 from spectralzoom.flows.tasks.scores import score_of, warnings_of
-from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points, known_number
+from spectralzoom.flows.terminal.figures import DASH, counted, format_bytes, format_points
 from spectralzoom.flows.terminal.processes import DONE, FAILED, PARTLY
 from spectralzoom.flows.terminal.progress import StageProgress, put_out, show_text, stderr, table
+from spectralzoom.pipeline.errors import shortened
 from spectralzoom.storage.runs import Catalogue, Finding, Run, clear_up, verify_everything
 from spectralzoom.storage.store import Archive, descendants
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "own", "state", "stage", "what")  # never folded
+MOST_SHOWN = 60  # characters of a scene, a seed and a budget
 MOST_ROWS = 20  # stores of a stage, removals
 
 
@@ -209,7 +211,7 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     columns: Sequence[str] = ("run", "scene", "seed", "budget", "mIoU", "own", "state")
     runs = map(_shown_run, content["runs"])
     console.print(table(columns, runs, title="Runs", left=2, whole=WHOLE) if content["runs"] else "no runs")
-    if any(run["training_scene"] and known_number(run["miou"]) is not None for run in content["runs"]):
+    if any(run["training_scene"] and run["miou"] is not None for run in content["runs"]):
         console.print("* on a scene that the weights were trained on", highlight=False)
     if any(run["warnings"] for run in content["runs"]):
         console.print("! with a warning about its map: spectralzoom explain ARCHIVE RUN", highlight=False)
@@ -222,12 +224,12 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
 
 
 def _shown_run(run: Mapping[str, Any]) -> list[str]:
-    miou = known_number(run["miou"])
-    asked = [DASH if run[name] is None else str(run[name]) for name in ("seed", "budget")]
+    miou = run["miou"]
+    asked = [DASH if run[name] is None else shortened(str(run[name]), MOST_SHOWN) for name in ("seed", "budget")]
     state = run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]"
     marks = ("" if run["training_scene"] is None or miou is None else "*") + "!" * bool(run["warnings"])
     return [
-        *map(escape, (run["id"], PurePath(str(run["scene"] or DASH)).name, *asked)),
+        *map(escape, (run["id"], shortened(PurePath(str(run["scene"] or DASH)).name, MOST_SHOWN), *asked)),
         format_points(miou) + marks,
         format_bytes(run["own_bytes"]),
         state,

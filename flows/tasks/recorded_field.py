@@ -15,7 +15,6 @@ from spectralzoom.flows.settings.settings import MOST_STEP, Settings, parse_sett
 from spectralzoom.flows.settings.values import ALWAYS, AUTO, BUILT_IN_SCENES, RECORDED
 from spectralzoom.flows.tasks.scene import unlit_scene
 from spectralzoom.flows.tasks.visit import time_of_visit
-from spectralzoom.flows.terminal.figures import known_number
 from spectralzoom.pipeline.capture.recorded import Recording
 from spectralzoom.pipeline.capture.recorded_passes import sweeps_as_taken
 from spectralzoom.pipeline.capture.straight_scans import EDGE_PX, covered_field
@@ -149,7 +148,7 @@ def recorded_scene(settings: Settings, recording: Recording) -> tuple[RasterScen
 def _pixel_of(run: Run) -> float | None:
     """Return the side of a pixel on the ground of a run without a pose; None where it knows none."""
     known = (run.receipt.get("field") or {}).get("ground_pixel_m")
-    return None if run.settings.get("pose") is not None else known_number(known)
+    return None if run.settings.get("pose") is not None else known
 
 
 def _field_shape(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from spectralzoom.flows.terminal.figures import format_count, format_points, known_number, spaced
+from spectralzoom.flows.terminal.figures import format_count, format_points, spaced
 
 MOST_ERROR = 0.1  # standard deviation of an expected mIoU, above which it is not shown
 
@@ -25,20 +25,13 @@ def warnings_of(receipt: Mapping[str, Any]) -> list[str]:
 
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
     """Return ``miou`` and ``overall_accuracy`` of a run's map, 0..1; None without labels."""
-    accuracy = receipt.get("accuracy")
-    if not isinstance(accuracy, Mapping):
-        return {"miou": None, "overall_accuracy": None}
-    return {name: known_number(accuracy.get(name)) for name in ("miou", "overall_accuracy")}
-
-
-def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
-    table = one.get("per_class_iou")
-    return {str(name): known_number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
+    accuracy = receipt.get("accuracy") or {}
+    return {name: accuracy.get(name) for name in ("miou", "overall_accuracy")}
 
 
 def format_worst_class(accuracy: Mapping[str, Any]) -> str:
     """Return the class with the lowest IoU in a sentence; empty without labels."""
-    known = {name: iou for name, iou in _by_class(accuracy).items() if iou is not None}
+    known = {name: iou for name, iou in accuracy["per_class_iou"].items() if iou is not None}
     if not known:
         return ""
     worst = min(known, key=lambda name: known[name])
@@ -62,7 +55,7 @@ def error_matrix(accuracy: Mapping[str, Any]) -> dict[str, list[Any]] | None:
     if not (counts := accuracy.get("confusion")):
         return None
     size = len(counts)
-    names = list(_by_class(accuracy))
+    names = list(accuracy["per_class_iou"])
     label, mapped = [sum(row) for row in counts], [sum(row[one] for row in counts) for one in range(size)]
     columns = [one for one in range(size) if label[one]]
     rows = [

@@ -96,7 +96,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def known_number(value: object) -> float | None:
-    """Return a number of a receipt; None for any other value."""
+    """Return a number of a weights' record; None for any other value."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
