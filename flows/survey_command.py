@@ -160,7 +160,7 @@ def _prefect_server(out: str) -> Iterator[None]:
             raise ServerUnavailable(
                 f"no Prefect server answers at {named}, which PREFECT_API_URL names ({why}): start it, or unset that"
             )
-        with configured(home, BOUNDED | QUIET):
+        with configured(home, usual=BOUNDED | QUIET):
             yield
         return
     with locked(root / ".locks" / "prefect.lock", wait=False) as is_held:

@@ -110,8 +110,9 @@ def _earlier_run(plan: SurveyPlan) -> Run | None:
     for run in (read_run(one) for one in reversed(folders) if run_stem(field.name) in one.name):
         if (run.receipt.get("survey"), run.settings.get("seed")) == (field.name, settings.seed):
             kept = run.receipt.get("kept")
-            same = isinstance(kept, dict) and all(kept.get(name) == alike[name] for name in ("asked", "of_patches"))
-            if same and isinstance(kept.get("patches"), int):
+            if not isinstance(kept, dict) or not isinstance(kept.get("patches"), int):
+                continue
+            if all(kept.get(name) == alike[name] for name in ("asked", "of_patches")):
                 return run
     return None
 

@@ -82,7 +82,7 @@ def serve(
         deployments = [survey_deployment(file, settings, schedule) for file, settings in served.items()]
         deployments += [reprocess_deployment(out) for out in archives if hold(out, "serve")]  # one serve has it
         if (pages := os.environ.get("PREFECT_API_URL")) is not None:
-            held.enter_context(configured(home, **{"api.url": pages}))
+            held.enter_context(configured(home, {"api.url": pages}))
         elif hold(next(iter(archives)), "prefect"):
             pages = held.enter_context(local_server(home, port, schedules=True))
             show_text(f"the password of Prefect's pages is in {home / 'password'}")

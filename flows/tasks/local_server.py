@@ -47,7 +47,7 @@ class ServerUnavailable(SettingsError):  # noqa: N818 - a survey runs without it
 
 
 @contextmanager
-def configured(home: Path, usual: Mapping[str, Any] = QUIET, **own: Any) -> Iterator[None]:
+def configured(home: Path, own: Mapping[str, Any] | None = None, usual: Mapping[str, Any] = QUIET) -> Iterator[None]:
     """Configure Prefect for a block, which passes it on to its processes: ``usual``, with ``home`` for its files.
 
     Settings of the user are kept, but for ``own``. Raises as `close_folder`.
@@ -58,7 +58,7 @@ def configured(home: Path, usual: Mapping[str, Any] = QUIET, **own: Any) -> Iter
 
     close_folder(home)
     try:
-        with temporary_settings(own | {"flows.heartbeat_frequency": None}, {**usual, "home": home}):
+        with temporary_settings({**(own or {}), "flows.heartbeat_frequency": None}, {**usual, "home": home}):
             yield
     finally:
         if not is_chosen:
@@ -97,7 +97,7 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
             "server.concurrency.lease_storage": "prefect.server.concurrency.lease_storage.filesystem",
             **(place_pages() if schedules else {"server.ui.enabled": False}),
         }
-        with configured(home, **own), _running(listening, schedules=schedules):
+        with configured(home, own), _running(listening, schedules=schedules):
             yield f"{pages}/api"
 
 

@@ -270,6 +270,8 @@ def _lists(
     """Yield key, (band,) numbers and unit of each list of a kind; ``notes`` say why others are left out."""
     units = {letters(key).removesuffix("s"): value for key, value in fields.items() if "unit" in key.lower()}
     of_kind = [value for key, value in units.items() if kind.fullmatch(key.removesuffix("unit"))]
+    bare = units.get("unit", "")  # of the values, unless it is one of lengths
+    of_kind += [bare] * all(_plain_text(one) in _UNSAID or scale_nm(one) for one in _words(bare))
     for key in sorted(fields, key=len):
         if (known := kind.fullmatch(letters(key))) is None:
             continue

@@ -76,8 +76,8 @@ def readings(weights: Weights, examples: Sequence[tuple[Example, np.random.Gener
         grid = SceneGrid(*example.shape, weights.config.patch)
         gain = score_patches("gain", coarse_prediction_of_columns(weights, columns, grid, usual))
         found.append([float((gain >= least).mean()) for least in LEAST_GAINS])
-    columns = {"fraction": np.median(found, axis=0), "fewest": np.min(found, axis=0), "most": np.max(found, axis=0)}
-    return {name: one.round(4).tolist() for name, one in columns.items()}
+    ends = {"fraction": np.median(found, axis=0), "fewest": np.min(found, axis=0), "most": np.max(found, axis=0)}
+    return {name: one.round(4).tolist() for name, one in ends.items()}
 
 
 def write(parts: dict[str, dict[str, Any]], path: Path = SHIPPED) -> None:

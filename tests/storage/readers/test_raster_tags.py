@@ -11,6 +11,7 @@ import rasterio
 from PIL import Image
 
 from spectralzoom.storage.readers.labels import load_codes
+from spectralzoom.storage.readers.open_cubes import open_cube_source
 from spectralzoom.storage.readers.scene_files import load_scene_file
 
 VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
@@ -60,3 +61,14 @@ def test_a_mask_of_all_pixels_is_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scene.values, picture)
     assert "every pixel is transparent or masked: the mask is left out" in scene.provenance
     assert load_codes(tmp_path / "a.png").values.min() >= 0
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("um", 1e-3), ("Nanometers", 1.0), ("reflectance", 1.0)])
+def test_a_bare_unit_counts_if_it_is_a_length(tmp_path: Path, unit: str, scale: float) -> None:
+    """The key is unit, Units or similar; another unit is that of the values."""
+    with write(tmp_path / "a.tif") as file:
+        for band, nm in enumerate(NM, 1):
+            file.update_tags(band, wavelength=nm * scale, **{"Units" if band % 2 else "unit": unit})
+    source = open_cube_source(tmp_path / "a.tif")
+    np.testing.assert_allclose(source.bands.wavelength_nm, NM)
+    assert any("have no unit" in note for note in source.notes) == (unit == "reflectance")
