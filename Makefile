@@ -90,7 +90,7 @@ faults: $(BIN)/.ok-dev
 
 DEFECTS ?=
 
-# Applies sixty seeded defects to copies of the source, one at a time, and prints the share that a test catches
+# Applies ninety seeded defects to copies of the source, one at a time, and prints the share that a test catches
 # (DEFECTS="--only archive" selects some). Twenty minutes.
 defects: $(BIN)/.ok-dev
 	$(BIN)/python tests/defects $(DEFECTS)
