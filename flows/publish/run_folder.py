@@ -111,7 +111,7 @@ def make_receipt(
         accuracy=None if products.accuracy is None else load_accuracy(products.accuracy),
         training_scene=seen_in_training(field.scene, field.described),
         effects=effects.get("effects"),
-        effects_total=effects and {**effects["total"], SAVED_S: stores.total(SAVED_S)},
+        effects_total={**effects["total"], SAVED_S: stores.total(SAVED_S)} if effects else None,
         products={**places, **{name: f"{uri}/{name}" for name in files}},
         control=None if control is None else control_figures(control),
         **find_out(plan, products),
