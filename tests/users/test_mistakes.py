@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,31 @@ CASES = {
     "broken settings": (2, "survey broken.toml", "broken.toml.*line 1"),
     "settings not in UTF-8": (2, "survey latin.toml", "latin.toml.*utf-8"),
     "budget 0": (2, SURVEY + "field.png --budget 0", "above 0 and at most 1, got '0'"),
+    "settings as a scene": (
+        2,
+        "survey --scene north.toml",
+        "no scene; give settings as: spectralzoom survey north.toml",
+    ),
+    "plan of settings as a scene": (2, "plan --scene 'a b.TOML'", "as: spectralzoom survey 'a b.TOML'$"),
+    "description as a scene": (2, "survey --scene bad_key/scene.toml", "no scene; give its scene: --scene bad_key$"),
+    "description as settings": (2, "survey bad_key/scene.toml", "describes a scene: give the scene's file as --scene"),
+    "built-in scene as settings": (2, "survey farm", "as: spectralzoom survey --scene farm$"),
+    "served scene": (2, "serve scouting --every 1h", "as: spectralzoom survey --scene scouting$"),
+    "picture that is gone": (2, "plan 'no field.png'", "as: spectralzoom survey --scene 'no field.png'$"),
+    "micrometres": (2, SURVEY + "cube.npy --wavelengths .46,.55,.64,.7,.8", "if it means 460 nm, write 460$"),
+    "one of micrometres": (2, SURVEY + "cube.npy --wavelengths 460,550,.64,700,800", "if it means 640 nm, write 640$"),
+    "a stated unit": (2, SURVEY + "cube.npy --wavelengths '0.705 µm,1,2,3,4'", "without a unit.* write 705$"),
+    "nm as a unit": (2, SURVEY + "cube.npy --wavelengths '460 nm,550,640,700,800'", "if it means 460 nm, write 460$"),
+    "metres": (
+        2,
+        SURVEY + "cube.npy --wavelengths 5e-7,1,2,3,4",
+        "of nm from 150 to 30000, without a unit, got '5e-7'$",
+    ),
+    "weights that are gone": (
+        1,
+        SURVEY.replace("w.saf", "gone.saf") + "field.png",
+        "gone.*give others as --weights, or",
+    ),
     "scene as settings": (2, "survey field.png", "a scene is given as: spectralzoom survey --scene field.png"),
     # training
     "empty folder to train on": (1, TRAIN + "empty", "holds no scene"),
@@ -129,7 +155,7 @@ def test_mistakes_are_one_message(case: str, files: Path, command_line: Any, mon
     code, words, message = CASES[case]
     monkeypatch.chdir(files)
     before = sorted(files.rglob("*"))
-    command_line(*words.split()).refused(code, message)
+    command_line(*shlex.split(words)).refused(code, message)
     assert sorted(files.rglob("*")) == before
 
 

@@ -31,7 +31,7 @@ BAD = {
     "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "no such schedule: .*Invalid timezone"),
     "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
     "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
-    "no name": (("gone (1)",), "--every 30m", 2, "name must be a name of letters, digits"),
+    "no name": (("(-)",), "--every 30m", 2, "name must be a name of at most 255 characters with a letter or digit"),
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
     "limit": (("north",), "--every 30m --limit 0", 2, "Invalid value .*--limit.* >= 1"),
 }
@@ -43,7 +43,7 @@ def test_refused_before_serving(case: str, field_file: Callable[..., Path], tmp_
     names, words, code, message = BAD[case]
     field_file("north")
     field_file("gone", scene="gone.png")
-    field_file("gone (1)")
+    field_file("(-)")
     given = [word.replace("_", " ") for word in words.split()]
     command_line("serve", *(tmp_path / f"{name}.toml" for name in names), *given).refused(code, message)
     assert not (tmp_path / "archive" / ".prefect").exists()

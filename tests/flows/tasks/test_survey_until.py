@@ -90,10 +90,10 @@ def test_a_mosaic_for_labelling_needs_no_weights(command_line: CommandLine, tmp_
 
 
 def test_a_map_of_own_sweeps_needs_weights(command_line: CommandLine, tmp_path: Path) -> None:
-    """The message says how to train some, and that a mosaic needs none; its advice is enough for a rig."""
+    """The message says how to train some, and that a mosaic needs none; its advice is enough."""
     field = write_pushbroom(tmp_path / "drone", np.full((8, 8, 3), 900, np.uint16)) / "scan.hdr"
     ended = command_line("survey", "--sweeps", str(field), "--engine", "plain", "--out", tmp_path / "a")
-    ended.refused(2, "--weights is missing.*one pass needs none: --until mosaic --scan-step 1$")
+    ended.refused(2, "--weights is missing.*A mosaic needs none: --until mosaic$")
     rig = load_settings(None, {"source": "rig", "scene": "field", "until": "mosaic"})
     assert [rig.ends_unread, rig.but(scan_step=1).ends_unread] == [False, True]
 
