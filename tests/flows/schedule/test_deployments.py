@@ -227,7 +227,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
     """
     from prefect.deployments import run_deployment
 
-    names = ("north", "south")
+    names = ("stopped", "paused")  # of no other test: a run of an earlier serve would be cancelled
     files = [field_file(name, source="raster", budget=None) for name in names]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
     words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "spectralzoom.flows.cli.main"]
@@ -239,7 +239,7 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
         try:
             for name in names:
                 wait_for(f"survey/{name}")
-            run: Any = run_deployment("survey/north", timeout=PATIENCE_S, poll_interval=0.5)
+            run: Any = run_deployment("survey/stopped", timeout=PATIENCE_S, poll_interval=0.5)
             assert run.state.is_completed()
             process.terminate()
             assert process.wait(PATIENCE_S) == 0
@@ -248,12 +248,12 @@ def test_sigterm_ends_serve_after_a_run(field_file: Callable[..., Path], tmp_pat
         finally:
             process.kill()
     lines = (tmp_path / "said").read_text().splitlines()
-    began, ended = (one for one in lines if one.startswith("survey-north-20"))
+    began, ended = (one for one in lines if one.startswith("survey-stopped-20"))
     said = [line.split()[0] for line in lines if line not in (began, ended, STOPPING)]  # where it takes its time
     assert said == ["serving", "stopped:"]
     assert began.endswith("Z: started")
     wanted = rf"{began.removesuffix('started')}completed after [\d.]+ s\. {re.escape(run.state.message)}"
     assert re.fullmatch(wanted, ended), ended
     assert run.name == began.removesuffix(": started")
-    assert re.fullmatch(r"runs/\S+-north: The score is not known: .*", run.state.message)
+    assert re.fullmatch(r"runs/\S+-stopped: The score is not known: .*", run.state.message)
     assert len(settings_of(tmp_path / "archive")) == 1

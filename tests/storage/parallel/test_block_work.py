@@ -295,7 +295,7 @@ def end(started):
         one.wait()
 
 if __name__ == "__main__":
-    pool_module.ANSWER_S = 1.0
+    pool_module.ANSWER_S = 4.0  # a loaded machine takes seconds to answer
     with WorkerPool(sys.argv[1]).open() as pool:
         started = begin(pool)
         try:
@@ -320,7 +320,7 @@ def test_a_lost_scheduler_raises_one_error(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         at = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     with run_script(tmp_path, GONE, at) as started:
-        printed, said = started.communicate(timeout=60)
+        printed, said = started.communicate(timeout=300)
     gone = f"--scheduler {at}: the scheduler is gone. Start it again and repeat the command: finished stages are kept"
     assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 
