@@ -290,7 +290,7 @@ def check_frames(
     if not any(abs(most - scale) < 0.5 for scale in scales):
         return []
     full = 100 * float(np.mean(white[known] >= most - 0.5))
-    what = f"{where}the white frame is at full scale ({most:g} DN) in {full:.2g} % of the elements"
+    what = f"{where}the white frame is at full scale ({most:g} DN) in {full:.3g} % of the elements"
     return [f"{what}: if it is saturated, values there are too high, and a darker one is needed"]
 
 

@@ -314,7 +314,7 @@ def test_an_overexposed_white_frame_is_still_named(tmp_path: Path) -> None:
     folder = write_taken(tmp_path / "a", (5, {MS: 5}), (20, {MS: 20}), {MS: 5})
     values = np.minimum(numbers(np.ones((1, SAMPLES, BANDS)) * 2, 20), 4095)
     write(folder / "scan.white.img", values, **{MS: 20})
-    assert any("at full scale (4095 DN) in 1e+02 % of the elements" in note for note in open_recording(folder).notes)
+    assert any("at full scale (4095 DN) in 100 % of the elements" in note for note in open_recording(folder).notes)
 
 
 def test_real_headers_are_read(real_data: Path) -> None:
