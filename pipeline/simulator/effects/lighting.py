@@ -226,7 +226,7 @@ class Polarisation(Gain):
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")
         most = np.abs(_factors_between(incidence, rig, probe.wavelength_nm) - 1).max(axis=0)
         angles = f"{np.degrees(incidence.min()):.1f} to {np.degrees(incidence.max()):.1f} deg"
-        changed = f"{100 * most.max():.3g} % of the light at {probe.wavelength_nm[int(most.argmax())]:.0f} nm"
+        changed = f"{100 * most.max():.2g} % of the light at {probe.wavelength_nm[int(most.argmax())]:.0f} nm"
         return Bound(probe.scaled(most), f"{rig.mirror.coating} changes {changed}, at incidences from {angles}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
