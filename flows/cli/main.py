@@ -10,10 +10,11 @@ import io
 import logging
 import os
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 
-from cyclopts import App, CycloptsError, UnknownOptionError
+from cyclopts import App, CoercionError, CycloptsError, UnknownOptionError
 
 from spectralzoom.flows.terminal.processes import (
     TERMINATED,
@@ -97,6 +98,8 @@ def _run(arguments: list[str]) -> int:
             what = (
                 f"{what.partition('.')[0]}. Settings of tables have the name of the table: {flags}" if flags else what
             )
+        if isinstance(error, CoercionError) and error.argument is not None:
+            what = f"{what}. {_help_of(error.argument.name, app, error.command_chain or ())}"
         say(f"{what}; see {' '.join(('spectralzoom', *(error.command_chain or ())))} --help")
         return SettingsError.exit_code
     except KeyboardInterrupt as error:
@@ -111,6 +114,15 @@ def _run(arguments: list[str]) -> int:
         say(message)
         return code
     return code if isinstance(code, int) else 0
+
+
+def _help_of(flag: str, app: App, verb: Iterable[str]) -> str:
+    """Return a flag of a verb with its help, which says what it may be."""
+    for word in verb:
+        app = app[word]
+    described = app.assemble_argument_collection(parse_docstring=True)
+    text = next((str(one.parameter.help) for one in described if one.name == flag), "")
+    return f"{flag}: {text.rstrip('.')}"
 
 
 def _of_tables(word: str) -> str:

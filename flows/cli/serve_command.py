@@ -57,7 +57,7 @@ def serve(
     cron
         Due times of all fields: minute hour day month weekday, such as '0 6-20 * * *'.
     every
-        Or an interval: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
+        Interval between due times, in place of --cron: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
     timezone
         Time zone, such as Europe/Berlin; by default this machine's for --cron, and UTC for --every.
     out

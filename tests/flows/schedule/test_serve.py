@@ -33,6 +33,7 @@ BAD = {
     "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
     "no name": (("(-)",), "--every 30m", 2, "name must be a name of at most 255 characters with a letter or digit"),
     "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
+    "no unit": (("north",), "--every 5", 2, "--every: Interval between due times, .*: 30m, 2h, 1d; .*; see "),
     "limit": (("north",), "--every 30m --limit 0", 2, "Invalid value .*--limit.* >= 1"),
 }
 

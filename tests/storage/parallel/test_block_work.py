@@ -273,7 +273,6 @@ GONE = """
 import subprocess, sys, time
 from contextlib import suppress
 from spectralzoom.pipeline.errors import PipelineError, WorkerError
-from spectralzoom.storage.parallel import pool as pool_module
 from spectralzoom.storage.parallel.pool import WorkerPool, run_blocks
 from tests.storage.parallel.test_block_work import nap
 
@@ -295,7 +294,6 @@ def end(started):
         one.wait()
 
 if __name__ == "__main__":
-    pool_module.ANSWER_S = 4.0  # a loaded machine takes seconds to answer
     with WorkerPool(sys.argv[1]).open() as pool:
         started = begin(pool)
         try:
