@@ -33,6 +33,7 @@ _ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": f"{2**31 - 1}",
     "MALLOC_TOP_PAD_": f"{2**26}",
 }
+GONE = "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
 RESERVED_BYTES = 512 * 2**20  # a process before its first block: interpreter, torch, zarr
 
 Item = TypeVar("Item")
@@ -170,13 +171,16 @@ def _in_order(
     """Submit blocks in order, fewer than ``window`` ahead of the oldest unfinished one; yield results in order.
 
     An error is raised when the running blocks have ended. One of the types ``lost`` is raised at once: blocks of lost
-    workers may never end. ``alive``, called while the oldest does not end, raises without workers.
+    workers may never end. ``alive``, called while blocks do not end, raises one of them without workers.
     """
     running: deque[Future[Any]] = deque()
 
-    def oldest() -> Any:
-        while not wait([running[0]], timeout=ANSWER_S).done:
+    def end(blocks: Sequence[Future[Any]]) -> None:
+        while wait(blocks, timeout=ANSWER_S).not_done:
             alive()
+
+    def oldest() -> Any:
+        end([running[0]])
         return running.popleft().result()
 
     try:
@@ -189,7 +193,7 @@ def _in_order(
     except lost:
         raise
     except (Exception, GeneratorExit):
-        wait(running)
+        end(running)
         raise
 
 
@@ -214,7 +218,7 @@ def _run_away(pool: WorkerPool, make: Callable[[Any], Any], items: Sequence[Any]
         if isinstance(error, WorkerError):
             raise
         advice = (
-            "the scheduler is gone. Start it again and repeat the command: finished stages are kept"
+            GONE
             if isinstance(error, CancelledError) and pool.elsewhere
             else "workers died several times in the same block, perhaps out of memory. Use fewer --workers, or "
             "--scheduler threads"
@@ -259,13 +263,15 @@ class Cluster:
             self._own.close()
 
     def count(self) -> int:
-        """Return the number of blocks at a time. Raises WorkerError: there are no workers."""
+        """Return the number of blocks at a time. Raises WorkerError: there are no workers, or no scheduler."""
         try:
             self.client.wait_for_workers(1, timeout=ANSWER_S if self._own is None else RESTART_S)
         except TimeoutError:
             address = self.client.scheduler.address
             advice = f"start `dask worker {address}`" if self._own is None else "use --scheduler threads"
             raise WorkerError(f"{self.name} has no workers: expected at least one; {advice}") from None
+        except OSError:  # the connection is lost
+            raise WorkerError(f"{self.name}: {GONE}") from None
         return max(1, sum(int(threads) for threads in self.client.nthreads().values()))
 
 

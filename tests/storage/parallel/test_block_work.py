@@ -19,7 +19,8 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
-from dask.distributed import LocalCluster
+from dask.distributed import Client, LocalCluster
+from distributed.comm import CommClosedError
 
 from spectralzoom.pipeline.errors import IncompleteStoreError, SettingsError, ShapeError, WorkerError
 from spectralzoom.storage.parallel import pool as pool_module
@@ -267,6 +268,32 @@ def test_no_block_writes_after_an_error_is_raised(tmp_path: Path, processes: Wor
     left = sorted(path.name for path in tmp_path.iterdir())
     time.sleep(2 * STALE_S)
     assert sorted(path.name for path in tmp_path.iterdir()) == left
+
+
+def fail_or_stay(number: int) -> None:
+    """Fail in block 0; stay for some seconds in others."""
+    if number == 0:
+        raise ShapeError("no 0")
+    time.sleep(3)
+
+
+@pytest.mark.parametrize("items", [(1, 2), (0, 1)], ids=["in a block", "after an error of a block"])
+def test_nothing_waits_for_blocks_of_a_lost_scheduler(
+    elsewhere: WorkerPool, monkeypatch: pytest.MonkeyPatch, items: tuple[int, ...]
+) -> None:
+    """A lost connection, which dask reports in several ways, ends the wait: such blocks may never end."""
+    monkeypatch.setattr(pool_module, "ANSWER_S", 0.2)
+    answers = [None]
+    monkeypatch.setattr(Client, "wait_for_workers", lambda *_, **__: answers.pop() if answers else lose_connection())
+    began = time.monotonic()
+    with pytest.raises(WorkerError, match="the scheduler is gone"):
+        run_blocks(fail_or_stay, items, elsewhere)
+    assert time.monotonic() - began < 3
+
+
+def lose_connection() -> None:
+    """Raise dask's error of a connection that is closed."""
+    raise CommClosedError("in connect")
 
 
 GONE = """
